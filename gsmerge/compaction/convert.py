@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, 
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
-from gsmerge.io.formats.arrays import RESULT_COMMENT
-from gsmerge.io.formats.read import kept_comments
+from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, render_mode
+from gsmerge.io.formats.read import FileInfo, kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import DEPTHS, Contents, Format, NamedPhotos, find_format
 from gsmerge.io.formats.write import output_notes
@@ -95,7 +96,8 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     names = () if stored is None else stored.names
     photos = name_photos(_photo_folder(options, stored), names)
     notes += output_notes(options.output, gaussians.sh_degree, photos) + rounding_notes(options.output, gaussians)
-    comments = list(dict.fromkeys(comment for info in infos for comment in kept_comments(info)))
+    comments, mixed = _join_comments(infos, moves=options.placement.moves)
+    notes += mixed
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
@@ -108,6 +110,17 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         notes.append(f"{old} is of an earlier file of that name, not of this one: delete it")
     document = document_head() | {"inputs": read, "cameras": named_cameras, "left_out": left_out, "output": facts}
     return document | {"viewer_cameras": beside, "notes": notes}
+
+
+def _join_comments(infos: Sequence[FileInfo], *, moves: bool) -> tuple[list[str], list[str]]:
+    """Join the header comments of files that become one, which ``moves`` or not; also return notes."""
+    each = [[comment for comment in kept_comments(info) if not (moves and is_of_frame(comment))] for info in infos]
+    modes = {render_mode(comments) for comments in each}
+    if len(modes) == 1:
+        return list(dict.fromkeys(chain(*each))), []
+    words = " and ".join(sorted("none" if mode is None else mode for mode in modes))
+    note = f"the files ask viewers for different filters ({words}): the joined one asks for none"
+    return [comment for comment in dict.fromkeys(chain(*each)) if is_of_frame(comment)], [note]
 
 
 def conversion_line(document: dict[str, Any]) -> str:

@@ -30,6 +30,23 @@ class OtherContent:
     wrong: tuple[str, ...] | None = None  # the only endings of files that do not; None: all others
 
 
+_TRAIN = "train Gaussians on it, or let a model make them of the photos"
+_WRITE = "write its Gaussians as .ply: ns-export gaussian-splat for nerfstudio, option save_ply for gsplat's trainer"
+_EXPORT = "export the scene there, as .ply"
+FILM = "a film"
+_FILM = FILM, "cut it into frames, of which a model such as Depth Anything 3 makes a scene"
+# Files that programs and people have beside their scenes, by ending: what they are, and what to do
+FOREIGN: dict[str, tuple[str, str]] = {
+    **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"), _FILM),
+    **dict.fromkeys((".pt", ".pth", ".ckpt", ".pkl"), ("a checkpoint", _WRITE)),
+    **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".ptx"), ("a cloud of points", _TRAIN)),
+    **dict.fromkeys((".obj", ".fbx", ".stl", ".dae", ".off", ".blend", ".abc"), ("a mesh", _TRAIN)),
+    ".ssproj": ("a project of SuperSplat", _EXPORT),
+    ".psht": ("a project of Postshot", _EXPORT),
+    ".rad": ("levels of Spark", "name the .ply or .spz that they were made from"),
+    ".spx": ("a file of Reall3DViewer", "name the .ply that it was made from"),
+    ".splatv": ("splats that move", "name a .ply of one moment"),
+}
 # In the order of trial
 OTHER_CONTENTS = (
     OtherContent("a Git LFS pointer", r"version https://git-lfs\.github\.com/spec/", "fetch it with: git lfs pull"),
@@ -77,6 +94,9 @@ def check_first_bytes(path: Path, size: int) -> None:
     ending = path.suffix.lower()
     if size == 0 and ending in NO_TEXT:
         raise SceneError(path, "expected content, found an empty file", _AGAIN)
+    if ending in FOREIGN:
+        what, remedy = FOREIGN[ending]
+        raise SceneError(path, f"expected a scene, found {what}", remedy)
     start = read_start(path, _START)
     for row, pattern in zip(OTHER_CONTENTS, _PATTERNS, strict=True):
         match = pattern.match(start) if ending not in row.right and ending in (row.wrong or (ending,)) else None

@@ -10,11 +10,12 @@ from pathlib import Path, PurePath, PurePosixPath
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import walk_files
+from gsmerge.io.first_bytes import FILM, FOREIGN
 from gsmerge.types import StrPath
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 OTHER_PICTURES = frozenset({".heic", ".heif", ".avif", ".gif", ".jp2", ".jxl", ".exr", ".dng", ".raw", ".cr2", ".nef"})
-FILMS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
+FILMS = frozenset(ending for ending, (what, _) in FOREIGN.items() if what == FILM)
 _CUT = "cut it into the frames that the model saw: ffmpeg -i FILM photos/%05d.jpg"
 _MAX_PARTS = 16  # of a path, its name and the folders above, by which files are found
 _NAME_FOLDER = "name the folder of the photos with --images, or with --target-images those of held-out views"

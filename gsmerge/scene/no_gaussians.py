@@ -11,6 +11,7 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.npz_files import array_names, missing_of_depths
+from gsmerge.io.first_bytes import FOREIGN
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, list_images
@@ -104,6 +105,10 @@ def _content(folder: Path) -> tuple[str, str] | None:
     points = next((path for path in sorted(folder.glob("[!.]*.ply")) if header_content(path) == "other"), None)
     if points is not None:
         return f"points or a mesh in {points.name}", _NAME
+    foreign = next((path for path in sorted(folder.glob("[!.]*")) if path.suffix.lower() in FOREIGN), None)
+    if foreign is not None:
+        what, remedy = FOREIGN[foreign.suffix.lower()]
+        return f"{what} ({foreign.name})", remedy
     beside = any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.glob("[!.]*"))
     return _PHOTOS if beside or any(list_images(folder / place) for place in IMAGE_PLACES) else None
 

@@ -28,7 +28,7 @@ from gsmerge.geometry import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.read import read_depths
-from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.arrays import FLAT_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
@@ -124,8 +124,8 @@ class Loaded:
 
     @property
     def comments(self) -> tuple[str, ...]:
-        """Comments of the file's header that a result copies."""
-        return kept_comments(self.info)
+        """Comments of the file's header that a result copies, whose Gaussians are not flat."""
+        return tuple(comment for comment in kept_comments(self.info) if comment != FLAT_COMMENT)
 
     @property
     def recognised(self) -> dict[str, Any]:

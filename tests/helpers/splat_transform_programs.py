@@ -98,7 +98,7 @@ def write_set(
 def write_unbundled(folder: Path, columns: Columns, *, mip: bool = False) -> None:
     """Write a ``meta.json`` of version 2 with its textures."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, data in sog.sog_files(columns, mip=mip).items():
+    for name, data in sog.sog_files(columns, "mip" if mip else None).items():
         (folder / name).write_bytes(data)
 
 

@@ -19,8 +19,11 @@ LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
 RESULT_COMMENT = "gsmerge result"  # in its place in results of commands; as long, so that sizes stay the same
 RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
 NEW_VIEWS_COMMENT = "gsmerge new views"  # and the PSNR that new views of the input and of the result have, dB
-MAX_COPIED, MAX_COPIED_LINES = 100, 10  # characters of a comment that is copied to other files, and such comments
-MIP_COMMENT = f"{RENDER_COMMENT}: mip"
+MAX_COPIED = 100  # characters of a comment that is copied to other files
+MIP, FLAT = "mip", "2dgs"  # modes of rendering that are not plain: with a filter of their own; 2D Gaussians
+MIP_COMMENT, FLAT_COMMENT = f"{RENDER_COMMENT}: {MIP}", f"{RENDER_COMMENT}: {FLAT}"
+_MODE = re.compile(rf"{RENDER_COMMENT}: (\w+)|antialiased ([01])")  # Brush's and Postshot's
+_VERTICAL = re.compile(r"Vertical axis: [+-]?[xyz]", re.IGNORECASE)  # Brush's, of the file's frame
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -41,10 +44,26 @@ def sh_degree(num_higher: int) -> int:
 
 
 def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
-    """Return the header comments that copies of a file keep: short lines on how to render the Gaussians."""
+    """Return the header comments that copies of a file keep: how to render the Gaussians, and which axis is vertical.
+
+    Of several that say the same thing, the last one counts.
+    """
+    mode = render_mode(comments)
+    vertical = [line for line in comments if is_of_frame(line)]
+    return (*([] if mode is None else [f"{RENDER_COMMENT}: {mode}"]), *map(str, vertical[-1:]))
+
+
+def is_of_frame(comment: object) -> bool:
+    """Return whether a header comment says which axis is vertical."""
+    return isinstance(comment, str) and _VERTICAL.fullmatch(comment) is not None
+
+
+def render_mode(comments: Sequence[object]) -> str | None:
+    """Return how header comments ask viewers to render the Gaussians, ``MIP`` or ``FLAT``; None: plainly."""
     lines = (line for line in comments if isinstance(line, str) and len(line) <= MAX_COPIED)
-    kept = (line for line in lines if line.startswith(RENDER_COMMENT) and line.isascii() and line.isprintable())
-    return tuple(dict.fromkeys(kept))[:MAX_COPIED_LINES]
+    said = [match for match in map(_MODE.fullmatch, lines) if match is not None]
+    mode = (said[-1][1] or (MIP if said[-1][2] == "1" else "")).lower() if said else ""
+    return mode if mode in (MIP, FLAT) else None
 
 
 @dataclass(frozen=True)
@@ -207,8 +226,8 @@ def pack_rows(parts: Sequence[Packed]) -> PackedRows:
     return PackedRows(parts, np.dtype([(name, np.float32) for name in names]))
 
 
-def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:
-    """Describe packed Gaussians as a file's content; ``sizes``: bytes by attribute, ``mip``: antialiased."""
+def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], mode: str | None = None) -> StoredRows:
+    """Describe packed Gaussians as a file's content; ``sizes``: bytes by attribute, ``mode``: of rendering."""
     rows = pack_rows(parts)
     return StoredRows(
         rows=rows,
@@ -216,7 +235,7 @@ def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], *, mip:
         format="quantised",
         encoding="raw",
         sizes=sizes,
-        comments=(MIP_COMMENT,) if mip else (),
+        comments=() if mode is None else (f"{RENDER_COMMENT}: {mode}",),
     )
 
 

@@ -22,6 +22,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import ReadBudget, check_file, read_budget
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.columns import check_columns
+from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.types import Gaussians
@@ -64,6 +65,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
         notes += ["colours are r, g and b, and no scale is negative: scales are taken as activated, not as logarithms"]
     if arrays.SCALES[2] not in names:
         notes += [f"2D Gaussians of two scales: the third is {THIN:g} of the smaller one"]
+        comments += (arrays.FLAT_COMMENT,)
     return arrays.StoredRows(
         rows=rows,
         layout=_layout_name(names, _num_rest(path, names), compressed=compressed),
@@ -171,6 +173,8 @@ def open_ply(path: Path) -> PlyData:
         with path.open("rb") as file:
             start = file.read(MAX_HEADER_BYTES)
         if start[:4] not in (b"ply\n", b"ply\r"):
+            if path.suffix.lower() in IMAGE_SUFFIXES:
+                raise SceneError(path, "expected Gaussians, found a picture", "a model makes them of photos first")
             problem = "expected a PLY file, found one that does not start with the line 'ply'"
             raise SceneError(path, problem, "name the .ply")
         end, text = _check_header(start, budget)

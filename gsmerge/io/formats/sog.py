@@ -33,6 +33,7 @@ from gsmerge.types import Gaussians, to_float32
 
 MAX_DEGREE = 3
 VERSION = 2
+MODELS = {arrays.MIP: "antialiased", arrays.FLAT: "2dgs"}  # as splat-transform calls the modes of rendering
 GENERATOR = "gsmerge"
 # All that a writer makes
 FILES = (
@@ -96,7 +97,7 @@ class SogContent:
 
     packed: arrays.Packed
     sizes: dict[str, int]  # bytes of the textures by attribute
-    mip: bool  # whether its Gaussians are antialiased
+    mode: str | None  # of rendering; see arrays.render_mode
     num_bytes: int  # of all files
 
 
@@ -105,7 +106,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
     budget = read_budget(path)
     with _damage(path), open_archive(path) as archive:
         content = _read_content(_Bundle(archive, budget.file_bytes), budget)
-    return arrays.to_stored([content.packed], f".sog version {VERSION}", content.sizes, mip=content.mip)
+    return arrays.to_stored([content.packed], f".sog version {VERSION}", content.sizes, content.mode)
 
 
 def read_unbundled(path: Path) -> SogContent:
@@ -143,11 +144,12 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
     count = check_whole(meta["count"], "count", 1)
     bands = check_whole(meta["shN"]["bands"], "bands", 1, MAX_DEGREE) if meta.get("shN") else 0
     arrays.check_count(budget, count, (bands + 1) ** 2 - 1, PACKED_BYTES)
-    mip = meta.get("antialias") is True or meta.get("model") == "antialiased"
+    models = {model: mode for mode, model in MODELS.items()}
+    mode = models.get(str(meta.get("model")), arrays.MIP if meta.get("antialias") is True else None)
     packed = _read_packed(files, meta, count, budget)
     keys = [key for key in ("means", "scales", "quats", "sh0", "shN") if meta.get(key)]
     sizes = {key: sum(files.num_bytes(name) for name in meta[key]["files"]) for key in keys}
-    return SogContent(packed, sizes, mip, files.size)
+    return SogContent(packed, sizes, mode, files.size)
 
 
 def _image_size(data: bytes) -> tuple[int, int]:
@@ -226,14 +228,14 @@ def _read_palette(files: _Files, part: dict[str, Any], count: int, budget: ReadB
 
 
 def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.sog`` along a space-filling curve; ``comments`` may mark it as antialiased.
+    """Encode a ``.sog`` along a space-filling curve; ``comments`` may say how to render it.
 
     ValueError if there is NaN or inf.
     """
     columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        for name, data in sog_files(columns, mip=arrays.MIP_COMMENT in comments).items():
+        for name, data in sog_files(columns, arrays.render_mode(comments)).items():
             archive.writestr(new_member(name), data)
     return content.getvalue()
 
@@ -243,12 +245,13 @@ def file_order(gaussians: Gaussians) -> np.ndarray:
     return arrays.curve_order(arrays.to_columns(gaussians, MAX_DEGREE).means)
 
 
-def sog_files(columns: arrays.Columns, *, mip: bool = False) -> dict[str, bytes]:
+def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, bytes]:
     """Encode the files of a ``.sog`` by name: textures with the rows in their order, then ``meta.json``."""
     count = len(columns)
-    meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": GENERATOR}, "count": count, "antialias": mip}
-    if mip:
-        meta["model"] = "antialiased"  # as splat-transform says it
+    meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": GENERATOR}, "count": count}
+    meta["antialias"] = mode == arrays.MIP
+    if mode is not None:
+        meta["model"] = MODELS[mode]
     textures: dict[str, bytes] = {}
 
     def add(key: str, files: dict[str, bytes], **numbers: Any) -> None:

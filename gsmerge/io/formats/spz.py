@@ -93,7 +93,8 @@ def read_rows(path: Path) -> arrays.StoredRows:
     axes = _stored_axes(path, extensions) if header.flags & EXTENSIONS_FLAG else PLY_AXES
     turn = arrays.turner(_axes_turn(axes), header.num_higher)
     turned = replace(rows, unpack=lambda block: turn(rows.unpack(block)))
-    stored = arrays.to_stored([turned], f".spz version {header.version}", sizes, mip=bool(header.flags & MIP_FLAG))
+    mode = arrays.MIP if header.flags & MIP_FLAG else None
+    stored = arrays.to_stored([turned], f".spz version {header.version}", sizes, mode)
     notes = (f"the file says that its axes are {axes}: turned to {PLY_AXES}, those of a .ply",)
     return stored if axes == PLY_AXES else replace(stored, notes=notes)
 
@@ -309,7 +310,7 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
 
     ValueError if there is NaN or inf.
     """
-    header, parts = spz_columns(gaussians, MAX_DEGREE, mip=arrays.MIP_COMMENT in comments)
+    header, parts = spz_columns(gaussians, MAX_DEGREE, mip=arrays.render_mode(comments) == arrays.MIP)
     return gzip_bytes(b"".join([header, *(part.tobytes() for part in parts)]))
 
 

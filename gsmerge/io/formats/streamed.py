@@ -219,7 +219,7 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
             sizes[name] = sizes.get(name, 0) + size
     counts = " + ".join(f"{count:,}" for count in index.counts)
     name = f"Streamed SOG version {VERSION}, {counts} Gaussians at {len(index.levels)} level(s)"
-    rows = arrays.to_stored([content.packed for content in contents], name, sizes, mip=contents[0].mip)
+    rows = arrays.to_stored([content.packed for content in contents], name, sizes, contents[0].mode)
     return replace(rows, bytes_beside=sum(content.num_bytes for content in contents))
 
 

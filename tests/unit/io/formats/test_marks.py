@@ -1,0 +1,76 @@
+"""Marks of how viewers are to render Gaussians, and of the vertical axis: kept through formats and joins."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+from slow_readers import corners
+
+from gsmerge.compaction.convert import ConvertOptions, convert_files
+from gsmerge.io import kept_comments, read_gaussians, write_gaussians, write_ply
+from gsmerge.settings.placement import PlacementOptions
+
+
+def marked(path: Path, *comments: str) -> Path:
+    """A file of other programs with comments in its header."""
+    write_ply(path, corners())
+    head, rows = path.read_bytes().split(b"element vertex", 1)
+    more = b"".join(f"comment {comment}\n".encode() for comment in comments)
+    path.write_bytes(head + more + b"element vertex" + rows)
+    return path
+
+
+def marks(path: Path) -> list[str]:
+    return list(kept_comments(read_gaussians(path).info))
+
+
+@pytest.mark.parametrize(
+    ("comments", "expected"),
+    [
+        (("antialiased 1",), ["SplatRenderMode: mip"]), (("antialiased 0",), []),
+        (("SplatRenderMode: mip", "antialiased 0"), []), (("SplatRenderMode: 2dgs",), ["SplatRenderMode: 2dgs"]),
+        (("SplatRenderMode: default",), []), (("Vertical axis: z",), ["Vertical axis: z"]),
+        (("Vertical axis: z, or y",), []),
+    ],
+)  # fmt: skip
+def test_marks_of_other_programs_are_kept(comments: tuple[str, ...], expected: list[str], tmp_path: Path) -> None:
+    assert marks(marked(tmp_path / "a.ply", *comments)) == expected
+
+
+@pytest.mark.parametrize("mode", ["mip", "2dgs"])
+def test_a_sog_has_the_mode_as_its_model(mode: str, tmp_path: Path) -> None:
+    comments = [f"SplatRenderMode: {mode}"]
+    write_gaussians(tmp_path / "a.sog", corners(), comments=comments)
+    assert marks(tmp_path / "a.sog") == comments
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        meta = json.loads(archive.read("meta.json"))
+    assert meta["model"] == {"mip": "antialiased", "2dgs": "2dgs"}[mode]
+    assert meta["antialias"] is (mode == "mip")
+
+
+def test_gaussians_of_two_scales_are_marked_as_flat(tmp_path: Path) -> None:
+    path = marked(tmp_path / "a.ply")
+    head, rows = path.read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property")]
+    place, count = names.index("scale_2"), len(names)
+    kept = b"".join(rows[4 * i : 4 * i + 4] for i in range(len(rows) // 4) if i % count != place)
+    path.write_bytes(head.replace(b"property float scale_2\n", b"") + b"end_header\n" + kept)
+    assert marks(path) == ["SplatRenderMode: 2dgs"]
+
+
+def test_files_of_different_modes_are_joined_without_one(tmp_path: Path) -> None:
+    inputs = [marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z"), marked(tmp_path / "b.ply")]
+    document = convert_files(ConvertOptions(inputs, tmp_path / "both.ply"))
+    assert any("different filters (mip and none)" in note for note in document["notes"])
+    assert marks(tmp_path / "both.ply") == ["Vertical axis: z"]
+    convert_files(ConvertOptions([inputs[0], inputs[0]], tmp_path / "same.ply"))
+    assert marks(tmp_path / "same.ply") == ["SplatRenderMode: mip", "Vertical axis: z"]
+
+
+def test_a_turned_file_has_no_axis_of_the_former_frame(tmp_path: Path) -> None:
+    path = marked(tmp_path / "a.ply", "Vertical axis: z")
+    convert_files(ConvertOptions([path], tmp_path / "turned.ply", placement=PlacementOptions(rotate="90,0,0")))
+    assert marks(tmp_path / "turned.ply") == []
