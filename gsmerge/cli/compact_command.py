@@ -172,8 +172,9 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
     problems = [document["unmet"], *(doubts if args.strict else [])]
     if document["worse"] and not args.strict:
-        scored = document["psnr_input_views"]["after"] is not None or "fidelity" in document["choices"]
-        say_warning(f"{document['worse']}; {MORE}" if scored else document["worse"], quiet=args.silent)
+        own = document["psnr_input_views"]
+        lost = "fidelity" in document["choices"] or (own["after"] is not None and own["after"] < own["before"])
+        say_warning(f"{document['worse']}; {MORE}" if lost else document["worse"], quiet=args.silent)
     if any(problems):
         raise TargetError("; ".join(filter(None, problems)))
 

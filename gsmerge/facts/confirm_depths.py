@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsmerge.frame import scene_depth
 from gsmerge.geometry import camera_depths, nearest_views, project
 from gsmerge.kernels.elementary import log
 from gsmerge.runtime.threads import parallel_map
@@ -47,6 +48,7 @@ class Agreement:
     # Where most is contradicted, and where alone, as "left third of 4 of 7 views"; empty: nowhere more than elsewhere
     contradicted_part: str = field(default="", compare=False)
     alone_part: str = field(default="", compare=False)
+    from_one_point: bool = field(default=False, compare=False)  # no two views show things displaced by ``PIXELS``
 
     def to_dict(self) -> dict[str, float]:
         """Return the shares of the scene, for reports."""
@@ -61,6 +63,11 @@ class Agreement:
     @property
     def doubt(self) -> str | None:
         """Why a result will be poor and what would help, in one sentence; None where depth is sound."""
+        if self.from_one_point:
+            return (
+                "the photos stand at one point, as pieces of a panorama: none can confirm another's depth, and new"
+                " views from elsewhere show what the model made of it; photos from other places would help most"
+            )
         if self.confirmed >= POOR:
             return None
         problem = f"only {100 * self.confirmed:.0f} % of the pixels have a depth that another view confirms"
@@ -114,8 +121,16 @@ def confirm_depths(scene: Scene) -> Agreement | None:
 
     counts = np.stack(parallel_map(count, range(views)))  # [v,part,4], first the whole
     confirmed, contradicted, alone = counts[:, 0, 1:].sum(0) / counts[:, 0, 0].sum()
-    parts = (_worst_part(counts[:, 1:, kind], counts[:, 1:, 0]) for kind in (2, 3))
-    return Agreement(float(confirmed), float(contradicted), float(alone), *parts)
+    of_wrong, of_alone = (_worst_part(counts[:, 1:, kind], counts[:, 1:, 0]) for kind in (2, 3))
+    at_one = _stand_at_one_point(scene)
+    return Agreement(float(confirmed), float(contradicted), float(alone), of_wrong, of_alone, at_one)
+
+
+def _stand_at_one_point(scene: Scene) -> bool:
+    """Return whether the cameras' largest distance moves things in the middle of the depth by less than ``PIXELS``."""
+    cameras = scene.cameras
+    apart = np.linalg.norm(np.ptp(cameras.centres, axis=0))
+    return bool(apart * cameras.Ks[:, 0, 0].max() < PIXELS * scene_depth(scene))
 
 
 def _worst_part(poor: np.ndarray, pixels: np.ndarray) -> str:

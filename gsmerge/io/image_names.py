@@ -6,6 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePath, PurePosixPath
 
 from gsmerge.errors import SceneError
@@ -125,15 +126,27 @@ def check_photo_folder(path: Path) -> None:
         raise SceneError(path, "expected a folder of photos, found a film", _CUT)
     if not path.is_dir() or list_images(path):
         return
-    found = Counter(file.suffix.lower() for file in walk_files(path))
-    films, pictures = (sum(found[ending] for ending in endings) for endings in (FILMS, OTHER_PICTURES))
-    expected = f"expected photos, {', '.join(sorted(IMAGE_SUFFIXES))}"
-    if pictures:
+    what, remedy = _find_unread(walk_files(path)) or ("none", _NAME_FOLDER)
+    raise SceneError(path, f"expected photos, {', '.join(sorted(IMAGE_SUFFIXES))}, found {what}", remedy)
+
+
+def describe_unread(folder: Path, places: Sequence[str]) -> list[str]:
+    """Describe in a note the pictures and films in a folder, and in those of its ``places``, that are not read."""
+    for place in (*(folder / name for name in places), folder):
+        with suppress(OSError):
+            unread = _find_unread([path for path in place.iterdir() if path.is_file()])
+            if unread is not None:
+                return [f"{place} has {unread[0]}, which is not read: {unread[1]}"]
+    return []
+
+
+def _find_unread(files: Sequence[Path]) -> tuple[str, str] | None:
+    """Describe pictures or films among files that are not read, and what to do about them; None without any."""
+    found = Counter(file.suffix.lower() for file in files)
+    if pictures := sum(found[ending] for ending in OTHER_PICTURES):
         endings = " and ".join(sorted(ending for ending in found if ending in OTHER_PICTURES))
-        raise SceneError(
-            path, f"{expected}, found {pictures} {endings}", "convert them to .jpg or .png, with their names"
-        )
-    raise SceneError(path, f"{expected}, found {'a film' if films else 'none'}", _CUT if films else _NAME_FOLDER)
+        return f"{pictures} {endings}", "convert them to .jpg or .png, with their names"
+    return ("a film", _CUT) if any(found[ending] for ending in FILMS) else None
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

@@ -30,7 +30,7 @@ from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.read import read_depths
 from gsmerge.io.formats.arrays import FLAT_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
-from gsmerge.io.image_names import IMAGE_SUFFIXES
+from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
@@ -43,7 +43,7 @@ from gsmerge.scene.exporters import (
     find_exporter,
     make_hints,
 )
-from gsmerge.scene.files import SceneFiles, find_scene_files
+from gsmerge.scene.files import IMAGE_PLACES, SceneFiles, find_scene_files
 from gsmerge.scene.masks import NO_MASKS, Masks, check_masks
 from gsmerge.scene.photos import (
     SEEN_PLACE,
@@ -313,7 +313,10 @@ def _align(
     proposal = propose_photos(files, camera_file) if photos else None
     if proposal is None:
         inside = photos_inside(files, camera_file) if photos else ()
-        return _combine(ply, files, camera_file, ScenePhotos(inside), hints)
+        load = _combine(ply, files, camera_file, ScenePhotos(inside), hints)
+        searched = photos and "images" not in files.named and load.scene.images is None
+        unread = describe_unread(files.ply.parent, IMAGE_PLACES) if searched else []
+        return replace(load, notes=(*load.notes, *unread))
     load = _assign(ply, files, camera_file, proposal, hints)
     usual = proposal.folder
     seen = usual.parent / SEEN_PLACE

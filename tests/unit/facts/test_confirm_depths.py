@@ -156,3 +156,19 @@ def test_a_poor_scene_says_why() -> None:
     assert all(word in lonely for word in ("24 %", "34 %", "too few or too far apart"))
     assert wrong is not None
     assert all(word in wrong for word in ("34 %", "depth is wrong"))
+
+
+def test_photos_from_one_point_are_said_to_be_pieces_of_a_panorama(wall: Scene) -> None:
+    """Whatever their depths say of one another."""
+    cameras = wall.cameras
+    centre = cameras.centres[0]
+    turned = cameras.viewmats.copy()
+    turned[:, :3, 3] = -turned[:, :3, :3] @ centre
+    agreement = confirm_depths(replace(wall, cameras=replace(cameras, viewmats=turned)))
+    assert agreement is not None
+    assert agreement.from_one_point
+    assert agreement.doubt is not None
+    assert "panorama" in agreement.doubt
+    whole = confirm_depths(wall)
+    assert whole is not None
+    assert not whole.from_one_point

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -160,3 +161,15 @@ def test_hints_on_pixels_for_rows_that_have_none(tmp_path: Path, hints: dict[str
         folder = save(tmp_path / str(cameras), "voxels", cameras=cameras)
         with refuses(SceneError, "scene.ply", f"--hint {name}={value}"):
             load_scene(folder, **hints)
+
+
+@pytest.mark.parametrize(
+    ("place", "words"), [("walk.MP4", "a film"), ("images/a.heic", "1 .heic"), ("images/b.avif", "1 .avif")]
+)
+def test_a_scene_without_photos_says_what_beside_it_is_not_read(tiny_folder: Path, place: str, words: str) -> None:
+    shutil.rmtree(tiny_folder / "images")
+    path = tiny_folder / place
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"\0" * 20)
+    assert noted(load_scene(tiny_folder).notes, words, "not read")
+    assert not noted(load_scene(tiny_folder, images="none").notes, words)
