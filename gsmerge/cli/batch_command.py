@@ -149,8 +149,8 @@ def run_jobs(
             add(record)
             why = record["error"] or ""
             num_failed += record["status"] == FAILED
-            failed = f", {num_failed} failed" if num_failed and not why else ""
-            progress(f"{record[name]} {record['status']}{failed}", num_ended, why)
+            failed = f"{num_failed} failed, " if num_failed and not why else ""
+            progress(f"{failed}{record[name]} {record['status']}", num_ended, why)
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:

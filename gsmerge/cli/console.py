@@ -243,13 +243,17 @@ def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
 def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, str], None]]:
     """Show one bar for many runs on stderr, with the time left, and the last failure below it.
 
-    Without a terminal it prints a line for each run. Yields ``(text, done, failure) -> None``; ``failure`` is empty
-    after a run that succeeded.
+    Without a terminal it prints a line for each run. Yields ``(text, done, failure) -> None``, ``text`` the name of the
+    run and its status after the last space; ``failure`` is empty after a run that succeeded.
     """
     if _as_json.get():
-        yield lambda text, done, failure: _print_event(
-            {"scene": text, "done": done, "total": total, "error": failure or None}
-        )
+
+        def print_event(text: str, done: int, failure: str) -> None:
+            scene, _, status = text.rpartition(" ")
+            event = {"scene": scene, "status": status, "done": done, "total": total, "error": failure or None}
+            _print_event(event)
+
+        yield print_event
         return
     console = _terminal(quiet=quiet)
     if console is None:

@@ -377,7 +377,7 @@ _TABLE = (
         option("masks", Path, "Folder of images named as the photos, dark where a photo does not count. Default: masks "
                "beside the photos, and where these are transparent; none: without.", parser=named_or_none),
         option("protect", Path, "Folder of images named as the photos, white where a text or face has to stay sharp: "
-               "it counts four times."),
+               "it counts four times.", parser=named_or_none),
         option("hint", list[str], "How to read the file, where it is recognised wrongly: "
                f"{join_words(flat_settings(FileHints))}, such as order=none; may be repeated.", metavar="NAME=VALUE"),
         option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made from "

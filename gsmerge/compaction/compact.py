@@ -67,9 +67,10 @@ def compact(
         384
     """
     options = (options or CompactOptions()).with_settings(settings)
-    given = scene if isinstance(scene, str | PathLike) else ref(scene)
     with use_threads(options.threads), record_run(progress):
-        scene = as_scene(scene)
+        asked, scene = scene, as_scene(scene)
+        given: StrPath | ReferenceType[Scene] = asked if isinstance(asked, str | PathLike) else ref(asked)
+        del asked  # which may be freed
         if options.clean.crop is not None:
             scene = crop_scene(scene.numpy(), options.clean.crop)
         size = measure_size(scene)

@@ -18,7 +18,7 @@ from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, 
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
-from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, render_mode
+from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, upward_axis
 from gsmerge.io.formats.read import FileInfo, kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import DEPTHS, Contents, Format, NamedPhotos, find_format
@@ -79,7 +79,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         if len(gaussians) == 0:
             problem = f"expected Gaussians that are kept, found none of {count:,}"
             raise SceneError(options.inputs[0], problem, "look where the scene lies with gsmerge inspect")
-        frame = find_placement(options.placement, cameras)
+        frame = find_placement(options.placement, cameras, upward_axis(files[0].info.comments))
         gaussians, moved = place(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
         side = max(float(np.abs(gaussians.means).max()), float(gaussians.scales.max()))
         if options.placement.moves and not 1e-30 < side < 1e30:  # numbers in files are of 32 bits
@@ -96,7 +96,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     names = () if stored is None else stored.names
     photos = name_photos(_photo_folder(options, stored), names)
     notes += output_notes(options.output, gaussians.sh_degree, photos) + rounding_notes(options.output, gaussians)
-    comments, mixed = _join_comments(infos, moves=options.placement.moves)
+    comments, mixed = _join_comments(infos, chosen, moves=options.placement.moves)
     notes += mixed
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
@@ -112,15 +112,14 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     return document | {"viewer_cameras": beside, "notes": notes}
 
 
-def _join_comments(infos: Sequence[FileInfo], *, moves: bool) -> tuple[list[str], list[str]]:
-    """Join the header comments of files that become one, which ``moves`` or not; also return notes."""
+def _join_comments(infos: Sequence[FileInfo], chosen: Format, *, moves: bool) -> tuple[list[str], list[str]]:
+    """Join the header comments of files that become one, which ``moves`` or not; also return notes on what is lost."""
     each = [[comment for comment in kept_comments(info) if not (moves and is_of_frame(comment))] for info in infos]
-    modes = {render_mode(comments) for comments in each}
-    if len(modes) == 1:
-        return list(dict.fromkeys(chain(*each))), []
-    words = " and ".join(sorted("none" if mode is None else mode for mode in modes))
-    note = f"the files ask viewers for different filters ({words}): the joined one asks for none"
-    return [comment for comment in dict.fromkeys(chain(*each)) if is_of_frame(comment)], [note]
+    every = list(dict.fromkeys(chain(*each)))
+    kept = [comment for comment in every if all(comment in comments for comments in each)]
+    notes = [f"not all files are marked {comment!r}: the joined one is not" for comment in every if comment not in kept]
+    lost = [] if chosen.marks is None else [comment for comment in kept if comment not in chosen.marks]
+    return kept, [*notes, *(f"{chosen.ending} has no room for the mark {comment!r}" for comment in lost)]
 
 
 def conversion_line(document: dict[str, Any]) -> str:

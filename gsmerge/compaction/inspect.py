@@ -19,7 +19,7 @@ from gsmerge.facts.prepare import missing_notes
 from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.facts.support import count_views_in_world
 from gsmerge.frame import canonicalise
-from gsmerge.io import GaussianFile, file_notes
+from gsmerge.io import GaussianFile, file_notes, kept_comments
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
@@ -112,6 +112,7 @@ def _describe_file(ply: GaussianFile) -> dict[str, Any]:
     info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
     return {
         **{name: getattr(info, name) for name in _FILE_KEYS},
+        "marks": list(kept_comments(info)),
         "bytes": info.file_bytes,
         "extents": extents(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians),
         "num_opaque": int((opacities >= _OPAQUE).sum()),
@@ -225,6 +226,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
     lines = [
         f"file       {scene['path']}: {human_bytes(scene['bytes'])} ({parts})",
         f"layout     {scene['layout']}, {scene['format']}; opacity stored {_ENCODINGS[scene['opacity_encoding']]}",
+        f"marks      {'; '.join(scene['marks'])}" if scene["marks"] else "",
         f"exporter   {scene['exporter']}",
         f"ignored    {', '.join(ignored)}" if ignored else "",
         f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_transparent']:,} transparent,"

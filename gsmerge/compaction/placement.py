@@ -37,20 +37,27 @@ def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
     return replace(gaussians, shN=np.pad(gaussians.shN, ((0, 0), (0, missing), (0, 0))))
 
 
-def find_placement(options: PlacementOptions, cameras: Cameras | None) -> Similarity:
-    """Find the map from the frame of the scene to that of its file; the ``cameras`` determine the upward axis."""
+def find_placement(options: PlacementOptions, cameras: Cameras | None, marked: str | None = None) -> Similarity:
+    """Find the map from the frame of the scene to that of its file.
+
+    The upward axis is that of the ``cameras``, otherwise that which the file is ``marked`` with, otherwise -y.
+    """
     if not options.moves:
         return IDENTITY
     rotation = np.eye(3)
     if options.up is not None:
-        axis = np.zeros(3)
-        axis[AXES.index(options.up) // 2] = -1 if options.up[0] == "-" else 1
-        upward = np.array([0.0, -1.0, 0.0]) if cameras is None else -cameras.viewmats[:, 1, :3].sum(0)
-        rotation = turn_to(normalize(upward), axis)
+        upward = _axis(marked or "-y") if cameras is None else -cameras.viewmats[:, 1, :3].sum(0)
+        rotation = turn_to(normalize(upward), _axis(options.up))
     if options.rotate is not None:
         rotation = matmul(turn_by(np.array(parse_triple("rotate", options.rotate))), rotation)
     scale = 1.0 if options.scale is None else float(options.scale)
     return Similarity(rotation, scale, np.array(parse_triple("translate", options.translate)))
+
+
+def _axis(name: str) -> np.ndarray:
+    axis = np.zeros(3)
+    axis[AXES.index(name) // 2] = -1 if name[0] == "-" else 1
+    return axis
 
 
 def turn_to(start: np.ndarray, end: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from gsmerge.compaction.new_views import SIDE, NewViews, Trial
 from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
+from gsmerge.facts.views import scored_views
 from gsmerge.fit import Fitted
 from gsmerge.frame import scene_depth
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
@@ -277,14 +278,20 @@ def measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> fl
 
 
 def measure_protected(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PhotoScore | None:
-    """Score Gaussians of the world over the pixels that are protected; None where none of the scored views' are."""
-    if not prepared.reference.of_views or prepared.input_scene.importance is None:
+    """Score Gaussians of the world over the protected pixels, in views that have some; None where none has.
+
+    The share is that of all photos.
+    """
+    if not prepared.reference.of_views or prepared.input_scene.protected is None:
         return None
-    shown = prepared.result_views()
-    masks = None if shown.protected is None else shown.protected[list(plan.scored_views)]
-    if masks is None or not masks.any():
-        return None
-    return _score_photos("score", gaussians, shown, prepared, plan, list(masks))
+    with stage("score"):
+        shown = prepared.result_views()
+        assert shown.protected is not None
+        have = np.flatnonzero(shown.protected.any((1, 2))).tolist()
+        views = [have[i] for i in scored_views(len(have))]
+        near, masks = NEAR_PLANE * prepared.frame.unit, list(shown.protected[views])
+        score = score_photos(gaussians, scene_photos(shown), views, near=near, covered=masks)
+        return replace(score, share=float(shown.protected.mean()))
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ MAX_VIEWS = 10_000
 MAX_FILES = 100_000  # below a folder of photos
 MAX_PIXELS = 1 << 26  # of one image
 
-_ADDRESS = re.compile(r"(https?|s3|gs|ftp):/")  # of another machine
+_ADDRESS = re.compile(r"(https?|s3|gs|ftp|file):/")  # of another machine
 _FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20
 _FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # of 20 microseconds: 5 s, and 2 s for each MB
 _PARTS_PER_STEP = 4000  # parts of a TOML key, squared

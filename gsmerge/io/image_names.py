@@ -101,17 +101,22 @@ def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str, option: str
     return matches[0] if matches else None
 
 
-def match_masks(folder: Path, names: Sequence[str], option: str = "--masks") -> list[Path | None]:
+def match_masks(folder: Path, names: Sequence[str], option: str = "--masks") -> tuple[list[Path | None], list[str]]:
     """Find the mask of every view by the name of its photo, with or without extension; None for a view without.
 
-    SceneError, which names the ``option``, if the folder has no mask of any view, or two of one view.
+    Also returns a note on masks of no view. SceneError, which names the ``option``, if the folder has no mask of any
+    view, or two of one view.
     """
-    by_ending = _by_ending(folder, list_images(folder))
+    files = list_images(folder)
+    by_ending = _by_ending(folder, files)
     masks = [_lookup(folder, by_ending, name, option) for name in names]
     if not any(masks):
         problem = f"expected masks named as the photos, such as {PurePath(names[0]).stem}.png, found none of them"
         raise SceneError(folder, problem, f"rename them, or name another folder with {option}")
-    return masks
+    unused = [file.relative_to(folder).as_posix() for file in files if file not in masks]
+    some = ", ".join(unused[:3]) + ", ..." * (len(unused) > 3)
+    note = f"{option.removeprefix('--')}: {len(unused)} of {folder} have the name of no photo: {some}"
+    return masks, [note] if unused else []
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -121,9 +126,11 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def check_photo_folder(path: Path) -> None:
-    """Raise SceneError if a path is a film, or a folder without a photo that is read."""
+    """Raise SceneError if a path is a film or a picture, or a folder without a photo that is read."""
     if path.suffix.lower() in FILMS and path.is_file():
         raise SceneError(path, "expected a folder of photos, found a film", _CUT)
+    if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_PICTURES and path.is_file():
+        raise SceneError(path, "expected a folder of photos, found a picture", "name its folder")
     if not path.is_dir() or list_images(path):
         return
     what, remedy = _find_unread(walk_files(path)) or ("none", _NAME_FOLDER)

@@ -391,5 +391,7 @@ def drawing_line(document: Mapping[str, Any]) -> str:
         less_played = document["encoding"] != BY_FFMPEG[3][0] and document["pictures"][0].lower().endswith(".mp4")
         hint = ", which not all programs play: with ffmpeg on the PATH it would be H.264" if less_played else ""
         return f"{line}, {document['encoding']}{hint}"
-    count = len(document["pictures"])
-    return f"{count} picture{'' if count == 1 else 's'} of {len(document['views'])} views"
+    count, views = len(document["pictures"]), len(document["views"])
+    unit = document.get("depth_unit")
+    depth = "" if unit is None else f"; a step of depth is {unit:.4g} units of the scene"
+    return f"{count} picture{'' if count == 1 else 's'} of {views} view{'' if views == 1 else 's'}{depth}"

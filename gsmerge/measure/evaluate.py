@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -210,6 +211,11 @@ def evaluate(
         >>> evaluation.num_views
         {'context': 5}
     """
+    if isinstance(scene, str | os.PathLike):
+        raise TypeError("scene: expected a Scene, got a path; gsmerge.read_scene(path) reads it")
+    if not isinstance(results, Mapping):
+        got = type(results).__name__
+        raise TypeError(f"results: expected Gaussians by name, such as {{'small': result.gaussians}}, got {got}")
     cameras = cameras or {}
     options, lacking = _without_missing(EvaluateOptions()) if options is None else (options, ())
     if INPUT in results:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -32,7 +33,9 @@ def make_hints(values: dict[str, Any]) -> ReadHints:
     names = {field.name for field in fields(ReadHints)}
     unknown = sorted(values.keys() - names)
     if unknown:
-        raise ValueError(f"expected {join_words(map(repr, sorted(names)))}, got {unknown[0]!r}")
+        known = sorted({*names, "cameras", "images", "masks", "protect", "opacity"})
+        near = "".join(f"; perhaps {name}" for name in get_close_matches(unknown[0], known, 1))
+        raise ValueError(f"expected {join_words(map(repr, known))}, got {unknown[0]!r}{near}")
     return ReadHints(**values)
 
 

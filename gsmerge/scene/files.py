@@ -164,10 +164,12 @@ def find_scene_files(
             scene if they are numbered views or parts, see ``docs/reference/formats.md``.
     """
     path, given = Path(path), {"cameras": cameras, "images": images, "masks": masks}
+    if images is not None and images != NONE:
+        check_photo_folder(Path(images))
     named = frozenset(name for name, value in {**given, "protect": protect}.items() if value is not None)
     camera_path, image_path, mask_path = map(named_path, given.values())
-    protect = None if protect is None else Path(protect)
-    _check_pictures(image_path, masks=mask_path, protect=protect)
+    protect = named_path(protect)
+    _check_folders(masks=mask_path, protect=protect)
     if path.suffix.lower() == SUFFIX and not os.path.isdir(path):
         check_file(path)
         own = path if cameras is None and _HOLDS_VIEWS(path) else None
@@ -223,14 +225,11 @@ def _search_roots(path: Path, ply: Path, within: StrPath | None) -> list[Path]:
     return list(dict.fromkeys((Path(os.path.realpath(base)), folder, target, *above)))
 
 
-def _check_pictures(image_path: Path | None, **folders: Path | None) -> None:
-    """Raise SceneError for a named place of photos without any, or ``folders`` that are none, by option."""
+def _check_folders(**folders: Path | None) -> None:
+    """Raise SceneError for what is no folder, by option."""
     for option, path in folders.items():
         if path is not None and not path.is_dir():
-            what = "a file" if path.exists() else "no such folder"
-            raise SceneError(path, f"expected a folder of pictures for --{option}, found {what}")
-    if image_path is not None:
-        check_photo_folder(image_path)
+            raise SceneError(path, f"expected a folder of pictures for --{option}, found a file")
 
 
 def _list_between(folder: Path, top: Path) -> list[Path]:

@@ -72,8 +72,13 @@ class MaskFiles:
         """Read the brightness of a mask, which is as the photo's file or upright, and turn it upright."""
         photo = self.photos[view] if self.photos else None
         whole, turns = decode_levels(mask, photo), self.turns[view]
-        as_stored = photo is not None and turns % 2 and same_shape(image_size(photo), whole.shape[1::-1])
-        return turn_picture(whole, turns) if as_stored else whole
+        if photo is not None and turns % 2 and same_shape(image_size(photo), whole.shape[1::-1]):
+            whole = turn_picture(whole, turns)
+        if not same_shape(self.stored, whole.shape[1::-1]):
+            (width, height), (columns, lines) = self.stored, whole.shape[1::-1]
+            problem = f"expected a mask of its photo's shape, {width} x {height}, found {columns} x {lines}"
+            raise SceneError(mask, problem, "save it in the shape of the photo, upright as it is shown")
+        return whole
 
     def _reduce(self, levels: np.ndarray, view: int) -> np.ndarray:
         """Average the brightness of a mask over each pixel of the view."""
@@ -99,7 +104,10 @@ def read_masks(
     if paths:
         names = [path.as_posix() for path in paths if path is not None]
     masks, notes = _match_masks(files, names)
-    protecting = [None] * len(names) if files.protect is None else match_masks(files.protect, names, "--protect")
+    protecting: Sequence[Path | None] = [None] * len(names)
+    if files.protect is not None:
+        protecting, unused = match_masks(files.protect, names, "--protect")
+        notes += unused
     if paths:
         places = {path: i for i, path in enumerate(path for path in paths if path is not None)}
         masks, protecting = (
@@ -127,6 +135,8 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
     count = sum(mask is not None for mask in masks)
     share = 0.0 if importance is None else float((importance >= PROTECTED / 2).mean())
     photos = f"{count} photo{'' if count == 1 else 's'} of {len(masks)}"
+    if share == 0:
+        return f"protect: nothing is white in the pictures of {photos}, so nothing counts more"
     return f"protect: {100 * share:.1f} % of the photos' pixels count {PROTECTED:g} times, of {photos}"
 
 
@@ -135,7 +145,7 @@ def _match_masks(files: SceneFiles, names: Sequence[str]) -> tuple[Sequence[Path
     if files.masks is None:
         return [None] * len(names), []
     try:
-        return match_masks(files.masks, names), []
+        return match_masks(files.masks, names)
     except SceneError as error:
         if "masks" in files.named:
             raise

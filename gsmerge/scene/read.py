@@ -315,6 +315,7 @@ def _align(
         inside = photos_inside(files, camera_file) if photos else ()
         load = _combine(ply, files, camera_file, ScenePhotos(inside), hints)
         searched = photos and "images" not in files.named and load.scene.images is None
+        searched &= RESULT_COMMENT not in ply.info.comments  # beside which lie clips of it
         unread = describe_unread(files.ply.parent, IMAGE_PLACES) if searched else []
         return replace(load, notes=(*load.notes, *unread))
     load = _assign(ply, files, camera_file, proposal, hints)
@@ -397,8 +398,10 @@ def _combine(
         result = replace(result, cameras=cameras, images=images)
         notes += smaller
     size = photo_size(limited)
-    if (files.masks or files.protect) is not None and not (size and pictures is whole):
-        notes.append(f"masks are not used: {'the photos have bars' if size else 'there are no photos'}")
+    unused = [name for name in ("masks", "protect") if getattr(files, name) is not None]
+    if unused and not (size and pictures is whole):
+        why = "the photos have bars" if size else "there are no photos"
+        notes.append(f"pictures of {' and '.join(unused)} are not used: {why}")
     if pictures is not whole:  # files with bars are not read again
         return _make_load(ply, files, hints, result, notes, absent=photos.absent)
     large, masks, more = find_larger_and_masks(files, camera_file, photos, size, result.transform, result.cameras)

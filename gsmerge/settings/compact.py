@@ -22,6 +22,7 @@ from gsmerge.settings.stages import (
 )
 
 OURS = "gsmerge"  # the method that is no plugin
+OF_SCENE = ("cameras", "images", "masks", "protect", "opacity")  # arguments of reading a scene, not settings of a run
 EFFORT_NAMES = ("draft", "fast", "default", "best")  # what each means: gsmerge.plan
 CHECKPOINTS = ("auto", "shipped", "paper", "none")  # names that are no files
 # Settings under one name; what is set besides goes before. "paper": the superpixel merging paper's own chain: 12,000
@@ -152,6 +153,8 @@ class CompactOptions(Settings):
         unknown = sorted(settings.keys() - all_settings.keys())
         if unknown:
             near = "".join(f"; perhaps {name}" for name in get_close_matches(unknown[0], all_settings, 1))
+            if unknown[0] in OF_SCENE:
+                near = f": read_scene(path, {unknown[0]}=...) takes it"
             known = "" if near else f"; known: {', '.join(sorted(all_settings))}"
             raise ValueError(f"unknown setting {unknown[0]!r}{near or known}")
         return change_settings(self, {**RECIPES.get(str(settings.get("recipe")), {}), **settings})

@@ -154,6 +154,9 @@ class Setting:
             self._check(value)
 
     def _check(self, value: Any) -> None:
+        is_text = not self.choices and set(_parts(self.kind)) <= {str, NoneType}
+        if is_text and not isinstance(value, str | NoneType):
+            raise ValueError(f"{self.name}: expected a text, got {value!r}")
         free = any(kind not in (int, float, bool, NoneType) for kind in self.kinds)  # checked by the class itself
         if free or (self._fits(value) and self._in_range(value)):
             return

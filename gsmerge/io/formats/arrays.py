@@ -58,6 +58,15 @@ def is_of_frame(comment: object) -> bool:
     return isinstance(comment, str) and _VERTICAL.fullmatch(comment) is not None
 
 
+def upward_axis(comments: Sequence[object]) -> str | None:
+    """Return the axis that header comments call vertical, such as "z"; None without.
+
+    None of y, too: there programs mean -y, which is usual, by it.
+    """
+    axes = [str(comment).split()[-1].lower().removeprefix("+") for comment in comments if is_of_frame(comment)]
+    return axes[-1] if axes and axes[-1] != "y" else None
+
+
 def render_mode(comments: Sequence[object]) -> str | None:
     """Return how header comments ask viewers to render the Gaussians, ``MIP`` or ``FLAT``; None: plainly."""
     lines = (line for line in comments if isinstance(line, str) and len(line) <= MAX_COPIED)

@@ -22,7 +22,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import ReadBudget, check_file, read_budget
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.columns import check_columns
-from gsmerge.io.image_names import IMAGE_SUFFIXES
+from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_PICTURES
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.types import Gaussians
@@ -173,7 +173,7 @@ def open_ply(path: Path) -> PlyData:
         with path.open("rb") as file:
             start = file.read(MAX_HEADER_BYTES)
         if start[:4] not in (b"ply\n", b"ply\r"):
-            if path.suffix.lower() in IMAGE_SUFFIXES:
+            if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_PICTURES:
                 raise SceneError(path, "expected Gaussians, found a picture", "a model makes them of photos first")
             problem = "expected a PLY file, found one that does not start with the line 'ply'"
             raise SceneError(path, problem, "name the .ply")

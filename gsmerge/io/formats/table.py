@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats import ply
-from gsmerge.io.formats.arrays import StoredRows
+from gsmerge.io.formats.arrays import FLAT_COMMENT, MIP_COMMENT, StoredRows
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.settings.extend import SUFFIX
@@ -73,6 +73,7 @@ class Format:
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # as it holds them
     kept_as: str = ""  # ending of the format as which its Gaussians are read back, if that is another one
     columns: bool = False  # whether there is a choice which columns of INRIA's it has
+    marks: Sequence[str] | None = ()  # header comments of others that it keeps; None: all that copies keep
     lost: str = "{ending} has no room for harmonics above degree {degree}: left out"
 
     # Its files besides the one that the path names
@@ -105,14 +106,14 @@ _READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
 _USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
-    each=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes, columns=True,
+    each=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes, columns=True, marks=None,
     lost="harmonics above degree {degree} are left out: few programs read a .ply with them",
 )  # fmt: skip
 LEVELS = Format(
     INDEX, "levels of detail in chunks; written by splat-transform",
     _lazy("streamed.read_rows"), None, 3, require=_lazy("splat_transform.find_program"),
     write=_lazy("streamed.write_output"), finish=_lazy("streamed.remove_unused_chunks"), levels="inside",
-    round_means=_lazy("sog.round_means"), kept_as=".sog",
+    round_means=_lazy("sog.round_means"), kept_as=".sog", marks=(MIP_COMMENT, FLAT_COMMENT),
 )  # fmt: skip
 COLMAP = Format(
     POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0,
@@ -135,11 +136,11 @@ FILES = (  # of endings that end alike the longest first
     PLY,
     Format(
         ".spz", "Niantic's format; written as version 3", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3,
-        each=(17.0, 18.5, 18.9, 19.2), round_means=_lazy("spz.round_means"),
+        each=(17.0, 18.5, 18.9, 19.2), round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,),
     ),
     Format(
         ".sog", "WebP textures in a zip; rows in another order", _lazy("sog.read_rows"), _lazy("sog.sog_bytes"), 3,
-        each=_SOG, round_means=_lazy("sog.round_means"),
+        each=_SOG, round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
     ),
     Format(".splat", "antimatter15's format", _lazy("splat.read_rows"), _lazy("splat.splat_bytes"), 0, each=(32.0,)),
     Format(

@@ -114,7 +114,7 @@ def test_a_folder_of_other_masks_beside_the_photos_is_not_used(tiny_folder: Path
 def test_masks_without_photos_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
     write(tiny_folder / "masks" / tiny.names[0], half(tiny).astype(np.uint8) * 255)
     shutil.rmtree(tiny_folder / "images")
-    assert "masks are not used: there are no photos" in load_scene(tiny_folder).notes
+    assert "pictures of masks are not used: there are no photos" in load_scene(tiny_folder).notes
 
 
 def test_bright_pixels_count_by_their_opacity(tmp_path: Path) -> None:

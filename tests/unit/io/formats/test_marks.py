@@ -64,10 +64,37 @@ def test_gaussians_of_two_scales_are_marked_as_flat(tmp_path: Path) -> None:
 def test_files_of_different_modes_are_joined_without_one(tmp_path: Path) -> None:
     inputs = [marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z"), marked(tmp_path / "b.ply")]
     document = convert_files(ConvertOptions(inputs, tmp_path / "both.ply"))
-    assert any("different filters (mip and none)" in note for note in document["notes"])
-    assert marks(tmp_path / "both.ply") == ["Vertical axis: z"]
+    assert [note for note in document["notes"] if note.startswith("not all files are marked")] == [
+        "not all files are marked 'SplatRenderMode: mip': the joined one is not",
+        "not all files are marked 'Vertical axis: z': the joined one is not",
+    ]
+    assert marks(tmp_path / "both.ply") == []
     convert_files(ConvertOptions([inputs[0], inputs[0]], tmp_path / "same.ply"))
     assert marks(tmp_path / "same.ply") == ["SplatRenderMode: mip", "Vertical axis: z"]
+
+
+@pytest.mark.parametrize(
+    ("ending", "lost"),
+    [
+        (".glb", ["SplatRenderMode: mip", "Vertical axis: z"]), (".spz", ["Vertical axis: z"]),
+        (".splat", ["SplatRenderMode: mip", "Vertical axis: z"]), (".sog", ["Vertical axis: z"]), (".ply", []),
+    ],
+)  # fmt: skip
+def test_what_a_format_does_not_keep_is_said(ending: str, lost: list[str], tmp_path: Path) -> None:
+    path = marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z")
+    notes = convert_files(ConvertOptions([path], tmp_path / f"b{ending}"))["notes"]
+    assert [note for note in notes if "mark" in note] == [
+        f"{ending} has no room for the mark {mark!r}" for mark in lost
+    ]
+
+
+def test_upward_is_what_the_file_is_marked_with(tmp_path: Path) -> None:
+    path = marked(tmp_path / "a.ply", "Vertical axis: z")
+    convert_files(ConvertOptions([path], tmp_path / "y.ply", placement=PlacementOptions(up="y")))
+    before, after = (read_gaussians(file).gaussians.means for file in (path, tmp_path / "y.ply"))
+    assert abs(after[:, 1] - before[:, 2]).max() < 1e-5
+    convert_files(ConvertOptions([path], tmp_path / "z.ply", placement=PlacementOptions(up="z")))
+    assert abs(read_gaussians(tmp_path / "z.ply").gaussians.means - before).max() < 1e-5
 
 
 def test_a_turned_file_has_no_axis_of_the_former_frame(tmp_path: Path) -> None:
