@@ -356,7 +356,7 @@ def build_section(run: Run) -> str:
             entry("merge: features.means", merged.means, run.merged),
             entry("decode_merged: gaussians.scales", decoded.gaussians.scales, run.merged, 4),
             entry("fit_scene: gaussians.scales", fitted.gaussians.scales, children[0], 4),
-            entry("fill: gaussians.means", filled.gaussians.means, replaced[0]) + " (a new one)",
+            *[entry("fill: gaussians.means", filled.gaussians.means, row) + " (a new one)" for row in replaced[:1]],
         ]),
         text(
             "**Superpixels** follow colour borders in the photo, because a Gaussian has one colour.",
@@ -383,7 +383,8 @@ def build_section(run: Run) -> str:
         text(
             "**`fit_scene`** compares renders with the photos and changes all parameters. Half way it splits the",
             f"Gaussians with the largest errors, until there are {len(fitted.gaussians):,}; of the pixel's Gaussian",
-            f"{len(children)} are made. Patches of every photo stay out of the first steps, at half size, as a test:",
+            f"{len(children)} are made. Patches of photos stay out of the first steps, on a quarter of",
+            "pixels, as a test:",
             f"their PSNR rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
             say(
                 "so the fit is accepted. Otherwise colours alone would be fitted.",
@@ -391,7 +392,7 @@ def build_section(run: Run) -> str:
             ),
         ),
         text(
-            f"**`fill`** moves faint Gaussians, here {len(replaced)}, to where cameras between the photos see nothing.",
+            f"**`fill`** moves faint Gaussians, here {len(replaced)}, to where cameras between photos see nothing.",
         ),
     ])  # fmt: skip
 

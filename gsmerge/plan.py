@@ -21,7 +21,7 @@ from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
-from gsmerge.settings.fit import USUAL_SHARE, FitOptions
+from gsmerge.settings.fit import STEPS, USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
     AUTO_SHARE,
     SHARE,
@@ -75,7 +75,7 @@ class Effort:
 EFFORTS = {
     "draft": Effort(36, 1.0, 0, merges=False, refines=False, prunes=False, large_photos=False, report_views=2),
     "fast": Effort(55, 1.0, 0, refines=False, large_photos=False),
-    "default": Effort(320, 2.0, 0),
+    "default": Effort(STEPS, 2.0, 0),
     "best": Effort(1000, 3.0, 1),
 }
 

@@ -309,7 +309,7 @@ def block_options(
 ) -> CompactOptions:
     """Return the options of a block: those of the scene, with ``factor`` times the block's share of the Gaussians.
 
-    Cameras and exposures stay fixed. The block also gets its share of all steps, and of the steps on half-size photos,
+    Cameras and exposures stay fixed. The block also gets its share of all steps, and of the first ones of them,
     so each view is fitted as often as in one piece. ``most``: Gaussians of all blocks together; None: as many as
     ``superpixels`` and K give.
     """

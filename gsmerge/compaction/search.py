@@ -38,7 +38,7 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.segment import knee_count
 from gsmerge.types import Gaussians
 
-SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to tell tenths of a dB on clean scenes
+SHORT, LONG = 60, 300  # steps on samples of the photos: enough to find the knee; to tell tenths of a dB on clean scenes
 HOLDOUT = 0.1  # share of the photos' patches
 TRIED = "curve: what each count brings"  # progress
 RUNGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the usual count: where the scene's curve is measured

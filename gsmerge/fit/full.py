@@ -1,7 +1,7 @@
 """Gaussians -> fitted Gaussians: a short optimisation of all parameters, confined to a box about the start.
 
 One view per step: L1 of pixels and of their differences, and structural similarity, on a random
-background, half-size photos first, Adam with rates in units of each Gaussian's own size. Longer runs
+background, samples of the photos' pixels first, Adam with rates in units of each Gaussian's own size. Longer runs
 begin with fewer Gaussians than they may have and spend the rest where the error is.
 """
 
@@ -30,7 +30,7 @@ def fit_full(
 ) -> FitResult:
     """Fit all parameters of Gaussians to the photos of a run.
 
-    The result after the half-size steps is kept if it beats the start on held-out patches; otherwise the start is
+    The result after the first steps is kept if it beats the start on held-out patches; otherwise the start is
     returned. The full-size steps then use every patch. ``survey``: survey of the Gaussians, if made already; ``fixed``:
     mask ``[n]`` of Gaussians that stay unchanged.
     """

@@ -102,21 +102,22 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
 
     Pixels that count less are not held out; those that do not count at all have the weight ``HIDDEN``.
     """
+    return [training_weight(photos, view, share, seed) for view in range(len(photos))]
+
+
+def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.ndarray:
+    """Return the training weights ``[h,w]`` float32 of one view; see :func:`training_weights`."""
     size = max(1, min(PATCH, min(photos.height, photos.width) // 4))
-
-    def one_view(view: int) -> np.ndarray:
-        rows, columns = -(-photos.height // size), -(-photos.width // size)
-        random = np.random.default_rng([seed, view])
-        patches = random.random((rows, columns)) < share
-        if not patches.any():
-            patches[random.integers(rows), random.integers(columns)] = rows * columns > 1
-        full = np.repeat(np.repeat(~patches, size, 0), size, 1)[: photos.height, : photos.width]
-        if photos.weights is None:
-            return full.astype(np.float32)
-        weights = photos.weights[view]
-        return np.where(weights == 1, full.astype(np.float32), np.maximum(weights, HIDDEN))
-
-    return [one_view(view) for view in range(len(photos))]
+    rows, columns = -(-photos.height // size), -(-photos.width // size)
+    random = np.random.default_rng([seed, view])
+    patches = random.random((rows, columns)) < share
+    if not patches.any():
+        patches[random.integers(rows), random.integers(columns)] = rows * columns > 1
+    full = np.repeat(np.repeat(~patches, size, 0), size, 1)[: photos.height, : photos.width]
+    if photos.weights is None:
+        return full.astype(np.float32)
+    weights = photos.weights[view]
+    return np.where(weights == 1, full.astype(np.float32), np.maximum(weights, HIDDEN))
 
 
 def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:

@@ -11,7 +11,7 @@ from gsmerge.fit.outside import Outside
 from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
 
-HALF_COST = 0.4  # time of a step on photos of half the size, in steps: .3 to .6 on two captures
+SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, in steps: .3 to .6 on two captures
 HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewer
 
 
@@ -64,8 +64,8 @@ def record_fit(report: FitReport | None) -> None:
 def report_steps(step: int, steps: int, photos: float, half_part: float) -> None:
     """Report progress of the fit: the steps that are done, as their time counts, and PSNR (dB) of the last photos.
 
-    The first share ``half_part`` of the steps has photos of half their size, on which PSNR is higher, too.
+    The first share ``half_part`` of the steps draws samples of the photos.
     """
     half = half_part * steps
-    done, total = (count - (1 - HALF_COST) * min(count, half) for count in (step, steps))
-    report_progress(f"fit: {'half-size ' * (step <= half)}photos {photos:.1f} dB", round(done / total * steps), steps)
+    done, total = (count - (1 - SAMPLE_COST) * min(count, half) for count in (step, steps))
+    report_progress(f"fit: photos {photos:.1f} dB", round(done / total * steps), steps)

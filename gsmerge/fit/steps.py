@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -82,28 +83,34 @@ class Optimiser:
 
     def step(self, state: FitState, step: Step) -> float:
         """Take one Adam step on one view, in place; return the mean squared error of its training pixels."""
-        photos, mode, opacities = self.photos[step.mode.size], step.mode, None
-        weight = self.run.step_weights[mode.size][step.view]
+        opacities, weight = None, self.run.weight(step)
         if step.kept is not None:
             fuller = state.splats.opacities / np.float32(1 - self.run.dropout)
             opacities = step.kept * np.minimum(fuller, MAX_ALPHA)
         error = self._take_prepared(state, step, weight, opacities)
         if error is not None:
             return error / max(3 * float(weight.sum()), 1)
-        camera = photos.camera(step.view) | {"eps2d": mode.eps2d, "antialiased": mode.antialiased}
+        photo, camera = self._look(step)
         drawn = tile_view(state.splats, **camera, opacities=opacities)
         all_colors = state.view_colors()
         colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
         image, transmittance = blend(drawn, colors, step.background)
         rates = self.run.job.options.tuning
         weights = loss_weights(rates, step.progress)
-        gradient, error = image_gradient(image, photos.image(step.view, step.background), weight, *weights)
+        gradient, error = image_gradient(image, photo, weight, *weights)
         with_viewmat = self.poses is not None
         g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=with_viewmat)
         if self.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
             self.poses.step(step.view, g.viewmat, rates, step.progress)
         self._move(state, g, step)
         return error / max(3 * float(weight.sum()), 1)
+
+    def _look(self, step: Step) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return the pixels ``[h,w,3]`` float32 of a photo that a step draws, and the camera that draws them."""
+        photos, mode, sample = self.photos[step.mode.size], step.mode, step.sample
+        camera = photos.camera(step.view, sample)
+        camera |= {"eps2d": mode.eps2d / sample.stride**2, "antialiased": mode.antialiased}
+        return np.ascontiguousarray(photos.image(step.view, step.background, sample), np.float32), camera
 
     def _take_prepared(
         self, state: FitState, step: Step, weight: np.ndarray, opacities: np.ndarray | None
@@ -115,8 +122,7 @@ class Optimiser:
             tables = self.tables
             if tables is None or tables.state is not state or tables.threads != threads:
                 tables = self.tables = StepTables(state, threads)
-            mode, photos = step.mode, self.photos[step.mode.size]
-            camera = photos.camera(step.view) | {"eps2d": mode.eps2d, "antialiased": mode.antialiased}
+            photo, camera = self._look(step)
             rates = self.run.job.options.tuning
             numbers = self._constants(state, step) | {
                 "camera": camera_numbers(**camera),
@@ -124,7 +130,6 @@ class Optimiser:
                 "loss_weights": np.array(loss_weights(rates, step.progress), np.float32),
             }
             drawn = state.splats.opacities if opacities is None else opacities
-            photo = np.ascontiguousarray(photos.image(step.view, step.background), np.float32)
             return tables.take(step.number, photo, weight, drawn, numbers)
 
     def _constants(self, state: FitState, step: Step) -> dict[str, np.ndarray]:

@@ -50,6 +50,26 @@ class PhotoScore:
 
 
 @dataclass(frozen=True)
+class Sample:
+    """Pixels of a photo at equal distances: each ``stride``-th of its columns and rows from ``column`` and ``row`` on.
+
+    They are drawn as a photo of their number by a camera that looks at their middles, with the low-pass of the whole.
+    """
+
+    stride: int = 1
+    column: int = 0
+    row: int = 0
+
+    @property
+    def pixels(self) -> tuple[slice, slice]:
+        """Rows and columns of the sample."""
+        return slice(self.row, None, self.stride), slice(self.column, None, self.stride)
+
+
+WHOLE_PHOTO = Sample()
+
+
+@dataclass(frozen=True)
 class Photos:
     """V photos of one size, with their cameras and pixel weights."""
 
@@ -85,22 +105,26 @@ class Photos:
         """Number of columns."""
         return self.images.shape[2]
 
-    def image(self, view: int, background: np.ndarray | None = None) -> np.ndarray:
+    def image(self, view: int, background: np.ndarray | None = None, sample: Sample = WHOLE_PHOTO) -> np.ndarray:
         """Return the photo of a view ``[h,w,3]``, sRGB in [0, 1], before a ``background [3]``; None: black."""
-        image = self.images[view]
+        image = self.images[view][sample.pixels]
         image = np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
         if self.empty is None or background is None:
             return image
-        return np.asarray(image + self.empty[view][..., None] * background, np.float32)
+        return np.asarray(image + self.empty[view][sample.pixels][..., None] * background, np.float32)
 
-    def camera(self, view: int) -> dict[str, Any]:
-        """Return the arguments of :func:`gsmerge.raster.tile_view` for rendering into a photo."""
+    def camera(self, view: int, sample: Sample = WHOLE_PHOTO) -> dict[str, Any]:
+        """Return the arguments of :func:`gsmerge.raster.tile_view` for rendering into a photo, or a sample of it."""
+        K, stride, offset = self.Ks[view], sample.stride, np.array([sample.column, sample.row])
+        if stride > 1:  # column i stands for stride * i + offset, which are counted from their middles
+            K = K / np.array([[stride], [stride], [1.0]])
+            K[:2, 2] += ((stride - 1) / 2 - offset) / stride
         return {
             "viewmat": self.viewmats[view],
-            "K": self.Ks[view],
-            "width": self.width,
-            "height": self.height,
-            "eps2d": self.eps2d,
+            "K": K,
+            "width": len(range(sample.column, self.width, stride)),
+            "height": len(range(sample.row, self.height, stride)),
+            "eps2d": self.eps2d / stride**2,
         }
 
 

@@ -11,7 +11,7 @@ from gsmerge.settings.setting import Settings, setting
 Fit = Literal["full", "none"]
 STEPS = 320  # of the full fit
 LONG_STEPS = 600  # from here on a little dropout pays
-USUAL_SHARE = 0.044  # of Gaussians in the pixels, which half-size photos show well
+USUAL_SHARE = 0.044  # of Gaussians in the pixels, which a quarter of these shows well
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
@@ -82,13 +82,14 @@ class FitOptions(Settings):
         "The result is then no longer the same on every machine. By default there is no limit.", above=0,
         unit="seconds", in_trial=None)  # fmt: skip
     photo_scale: float | Literal["auto"] = setting("auto", "Times the views' size at which two of every five steps "
-        "after those on half-size photos look at larger photos, as far as the photos are that large.",
+        "after the first ones look at larger photos, as far as the photos are that large.",
         "`auto`: up to 2 with effort `default` and `best`.", least=1, below=math.inf, in_trial=1.0)  # fmt: skip
     dropout: float | None = setting(None, "Share of the Gaussians that a step leaves out.",
         "By default 0.1 for at most five views and at least 150 steps, 0.05 from 600 steps and 30 looks at each view "
         "on, otherwise 0.", least=0, below=1)  # fmt: skip
-    half_res_share: float | None = setting(None, "Share of the steps on half-size photos.",
-        "By default 0.6, from 600 steps on 0.5, below 150 0.7, below 20 all; less for more than 6 % of the Gaussians.",
+    half_res_share: float | None = setting(None, "Share of the steps, the first ones, that draw every second pixel of "
+        "every second row.", "By default 0.6, from 600 steps on 0.5, below 150 0.7, below 20 all; less for more than "
+        "6 % of the Gaussians.",
         least=0, most=1)  # fmt: skip
     holdout: float = setting(0.05, "Share of the photos' patches that decides whether a fit is accepted.", above=0,
         below=1)  # fmt: skip
@@ -109,7 +110,7 @@ class FitOptions(Settings):
 
     @property
     def half_res_part(self) -> float:
-        """Share of the steps on half-size photos."""
+        """Share of the steps, the first ones, that draw a quarter of the pixels."""
         if self.half_res_share is not None:
             return self.half_res_share
         if self.steps < HASTY_STEPS:

@@ -101,9 +101,13 @@ CASES = [
 def test_photos_are_mended(
     room: Scene, sound: CompactResult, change: Change, loss: float, note: tuple[str, ...]
 ) -> None:
-    result = compact(replace(room, images=change(room.images)), **FIT)
+    """Over two seeds, between which results of so few pixels differ by .5 dB."""
+    changed = replace(room, images=change(room.images))
+    result, others = compact(changed, **FIT), [compact(scene, **FIT, seed=1) for scene in (room, changed)]
     assert noted(result.report.notes, *note)
-    assert novel_psnr(result.gaussians) > novel_psnr(sound.gaussians) - loss
+    before, after = ((novel_psnr(one.gaussians) + novel_psnr(other.gaussians)) / 2
+                     for one, other in zip((sound, result), others, strict=True))  # fmt: skip
+    assert after > before - loss
     assert {"photos_changed", "photos_left_out"} & result.report.choices.keys()
 
 

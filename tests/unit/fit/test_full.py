@@ -12,7 +12,8 @@ from gsmerge import Gaussians, Scene
 from gsmerge.fit import FitJob, FitOptions, report_steps, start_share, steps
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full, limit_moves
-from gsmerge.fit.report import HALF_COST
+from gsmerge.fit.photo_sizes import training_weights
+from gsmerge.fit.report import SAMPLE_COST
 from gsmerge.fit.schedule import (
     DROPOUT,
     MAX_STEPS,
@@ -130,8 +131,31 @@ def test_steps_draw_as_viewers_do(photos: Pair) -> None:
     assert set(modes) == {DrawMode(0, 0.3, antialiased=True), DrawMode(0, 0.3), DrawMode(0, 0.075), afar}
     assert modes.count(afar) == 3
     assert modes[0] == run.draw_mode(17, 0.8)
-    assert {run.draw_mode(step, 0.49) for step in range(1, 17)} == {DrawMode(1, 0.075)}
+    assert {run.draw_mode(step, 0.49) for step in range(1, 17)} == {DrawMode(0, 0.3, stride=2)}
+    crowd = prepare_fit(FitJob(photos, LONG, count=photos[1].width * photos[1].height * len(photos[1]) + 1))
+    moving = prepare_fit(FitJob(photos, replace(LONG, move_cameras=True)))
+    assert {run.draw_mode(1, 0.49) for run in (crowd, moving)} == {DrawMode(1, 0.075)}
     assert afar not in {prepare_fit(FitJob(photos, QUICK)).draw_mode(step, 0.8) for step in range(1, 17)}
+
+
+def test_the_first_steps_draw_each_pixel_in_turn(photos: Pair) -> None:
+    """As the camera of a sample shows it: alone as among the others, and never those that are held out."""
+    run = prepare_fit(FitJob(photos, LONG))
+    schedule, views = Schedule(run), len(photos[0])
+    steps = [schedule.draw(number, 0.1, 10) for number in range(1, 8 * views + 1)]
+    full = photos[0]
+    for view in range(views):
+        drawn = np.zeros((full.height, full.width), int)
+        for step in steps:
+            if step.view == view:
+                drawn[step.sample.pixels] += 1
+                assert run.weight(step).shape == full.image(view)[step.sample.pixels].shape[:2]
+        assert (drawn > 0).all()
+    held_out = training_weights(full, LONG.holdout, 0)
+    for step in steps[:4]:
+        hidden = held_out[step.view][step.sample.pixels] == 0
+        assert (run.weight(step)[hidden] == 0).all()
+        assert (run.weight(step)[~hidden] == 1).all()
 
 
 @pytest.mark.parametrize(("name", "field"), [("opacity_reg", "opacities"), ("scale_reg", "scales")])
@@ -289,7 +313,7 @@ def test_steps_follow_the_time_budget(photos: Pair) -> None:
     actual = [steps(budget, 0.06) for budget in (0.5, 1, 2, 4)]
     assert actual == sorted(actual)
     assert actual[0] > probe + 1
-    # a step of 10 ms at half size: 0.6 of the steps at that, the rest at three times it
+    # a step of 10 ms on a quarter of the pixels: 0.6 of the steps at that, the rest at three times it
     assert steps(1.0, 0.06) == pytest.approx(probe + (1.0 - 0.06) / (0.01 * (0.6 + 3 * 0.4)), abs=1)
 
 
@@ -320,11 +344,9 @@ def test_progress_counts_the_steps(truth: Gaussians, photos: Pair) -> None:
     assert np.isfinite(np.array(calls, float)).all()
 
 
-def test_photos_of_full_size_have_a_mean_and_a_name_of_their_own(
-    truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Half-size photos are easier to show: a mean over both would seem to get worse half-way."""
-    monkeypatch.setattr(Optimiser, "step", lambda self, state, step: 0.01 if step.mode.size else 0.1)
+def test_whole_photos_have_a_mean_of_their_own(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before them a mean over fewer pixels may be another one."""
+    monkeypatch.setattr(Optimiser, "step", lambda self, state, step: 0.01 if step.mode.stride > 1 else 0.1)
     calls: list[tuple[int, int, float, bool]] = []
     options = FitOptions(fit_steps=30, half_res_share=0.5, judged=False)
     fit_full(scenes.spoil(truth), scenes.run_for(photos, options, progress=lambda *call: calls.append(call)))
@@ -336,8 +358,8 @@ def test_photos_of_full_size_have_a_mean_and_a_name_of_their_own(
         report_steps(10, 20, 20.0, 0.5)
         report_steps(15, 20, 10.0, 0.5)
         report_steps(20, 20, 10.0, 0.5)
-    # half-size steps are quicker, so that the time left is about right
-    assert said[0] == ("fit: half-size photos 20.0 dB", round(20 * HALF_COST / (1 + HALF_COST)), 20)
+    # the first steps are quicker, so that the time left is about right
+    assert said[0] == ("fit: photos 20.0 dB", round(20 * SAMPLE_COST / (1 + SAMPLE_COST)), 20)
     assert said[1][0] == "fit: photos 10.0 dB"
     assert said[0][1] < said[1][1] < 20
     assert said[2][1:] == (20, 20)

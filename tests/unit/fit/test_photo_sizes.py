@@ -153,12 +153,12 @@ def test_some_views_have_their_own_photos(scene: Scene) -> None:
 def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
     options = FitOptions(fit_steps=200, photo_scale=2)
     run = prepare_fit(FitJob(fit_photos(with_large(scene, 2), options), options))
-    sizes = [run.draw_mode(step + 1, step / 200).size for step in range(200)]
-    assert [sizes.count(size) for size in (1, 0, 2)] == [122, 46, 32]
-    assert sizes[:120] == [1] * 120
+    modes = [run.draw_mode(step + 1, step / 200) for step in range(200)]
+    assert [mode.stride for mode in modes] == [2] * 120 + [1] * 80
+    sizes = [mode.size for mode in modes[120:]]
+    assert [sizes.count(size) for size in (1, 0, 2)] == [2, 46, 32]
     usual = prepare_fit(FitJob(scenes.pair_of(scene), options))
     sizes = [usual.draw_mode(step + 1, step / 200).size for step in range(200)]
-    assert sizes[:120] == [1] * 120
     assert [sizes[140:].count(size) for size in (0, 1)] == [49, 11]
 
 
@@ -184,16 +184,21 @@ def test_time_budget_counts_larger_photos(scene: Scene) -> None:
 
 
 def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> None:
+    """Over three seeds, since by one the gain is .2 to .9 dB."""
     large, start = with_large(scene, 2), scenes.spoil(truth)
     near = large_photos(large, 2)
     near = replace(near, images=np.stack([near.image(view) for view in range(len(near))]))
+
+    def fitted(scale: float, seed: int) -> Gaussians:
+        run = scenes.run_for(fit_photos(large, replace(LONG, photo_scale=scale)), LONG)
+        return fit_full(start, replace(run, job=replace(run.job, seed=seed)))[0]
+
+    assert scenes.identical(fitted(1, 0), fit_full(start, scenes.run_for(scenes.pair_of(scene), LONG))[0])
     usual, sharp = (
-        fit_full(start, scenes.run_for(fit_photos(large, replace(LONG, photo_scale=scale)), LONG))[0]
+        np.mean([score_photos(fitted(scale, seed), near, range(len(near))).psnr for seed in range(3)])
         for scale in (1, 2)
     )
-    assert scenes.identical(usual, fit_full(start, scenes.run_for(scenes.pair_of(scene), LONG))[0])
-    views = range(len(near))
-    assert score_photos(sharp, near, views).psnr > score_photos(usual, near, views).psnr + 0.3
+    assert sharp > usual + 0.3
 
 
 def test_result_does_not_depend_on_threads(truth: Gaussians, scene: Scene) -> None:
