@@ -9,6 +9,7 @@ from dataclasses import is_dataclass
 from typing import Any
 
 import gsmerge
+import gsmerge.integrations
 
 TOPICS = {
     "Read": ("read_scene", "read_ply", "read_gaussians", "read_cameras", "to_cameras", "inspect"),
@@ -46,6 +47,10 @@ def api_page() -> str:
         lines += ["", f"## {topic}"]
         for name in names:
             lines += ["", f"### {name}", "", *_describe(name, getattr(gsmerge, name))]
+    lines += ["", "## gsmerge.integrations", "", inspect.cleandoc(gsmerge.integrations.__doc__ or "")]
+    for name, value in vars(gsmerge.integrations).items():
+        if inspect.isfunction(value) and value.__module__ == gsmerge.integrations.__name__ and name[0] != "_":
+            lines += ["", f"### integrations.{name}", "", *_describe(f"integrations.{name}", value)]
     return "\n".join([*lines, ""])
 
 

@@ -165,7 +165,8 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     if sys.stdout.isatty():
         look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
         look = ["python", "-m", "http.server", "-d", str(out.parent)] if out.name == find_format(out).site else look
-        lines = result_table(document, shlex.join(look) or None, columns=terminal_columns(sys.stdout))
+        next_step = shlex.join([f"./{word}" if word.endswith(out.name) and word[0] == "-" else word for word in look])
+        lines = result_table(document, next_step or None, columns=terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     unchecked = document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]
     if args.strict and unchecked and not document["worse"]:

@@ -53,6 +53,7 @@ SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # of a path, at least
 VIEW_FRAMES = 4  # for each view of a spline, at least
 FPS, GIF_FPS = 30.0, 12.5  # frames per second
 GIF_SIDE = 640  # pixels at most of a GIF of which no size is asked for
+PLACED_SIZE = 1280, 720  # pixels of pictures where there are no cameras whose size they could have
 OPAQUE = 0.5  # alpha from which a pixel has a depth
 HALF_TURN = 180  # degrees about the middle: of less, a turntable also shows the side that no photo shows
 
@@ -340,7 +341,8 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     with record_run() as record:
         scene = add_views(load.scene, shown=True)
     scene = scene if inside else subset(scene, range(len(scene) // 2))
-    views = SceneViews(scene.cameras, NO_IMAGES, scene.names, tuple(range(len(scene))))
+    cameras = fill_cameras(scene.cameras, *PLACED_SIZE)
+    views = SceneViews(cameras, NO_IMAGES, scene.names, tuple(range(len(scene))))
     notes = [text for text in record.notes if text != NO_VIEWS]  # that is for results
     placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
     return replace(load, scene=scene, views=views, notes=(*load.notes, *notes, placed))

@@ -85,7 +85,7 @@ def test_what_a_grid_leaves_behind(charted_scene: Path) -> None:
     assert first.seconds == 0
     assert one.seconds == pytest.approx(sum(v for k, v in one.stages.items() if k not in ("score", "input")))
     page = (charted_scene / "out" / "index.html").read_text()
-    assert "3 runs on 1 scene(s): room" in page
+    assert "3 runs on 1 scene: room" in page
     assert page.count('<input type="range"') == 2
     assert len((charted_scene / "out" / "runs.csv").read_text().splitlines()) == 1 + 3
     names = {path.name for path in (charted_scene / "out" / "charts").iterdir()}
@@ -182,4 +182,11 @@ def test_drawing_alone(copied: Path, run: Run) -> None:
     assert document["schema_version"] == 1
     assert (document["num_runs"], document["num_done"], document["num_failed"]) == (3, 0, 0)
     assert {Path(path).name for path in document["charts"]} == drawn
-    assert "3 runs on 1 scene(s): room" in Path(document["page"]).read_text()
+    assert "3 runs on 1 scene: room" in Path(document["page"]).read_text()
+
+
+def test_without_targets_it_is_said_which_photos_judge(small_copy: Path, tmp_path: Path, run: Run) -> None:
+    args = ("--grid", "budget=5%", "--set", "fit=none", "--set", "lpips=none")
+    done = run("lab", "chart", small_copy, "-o", tmp_path / "out", *args, code=0)
+    assert names(done.err, "without --targets", "judged", "view_001.png")
+    assert "without --targets" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")

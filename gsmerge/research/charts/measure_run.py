@@ -41,6 +41,7 @@ from gsmerge.scene.read import load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians, Scene, Views
 
+HELD_OUT = "without --targets no run sees these photos, by which all are judged"
 RECORD_VERSION = 2  # of what a run records; another version is run again
 SCORING = ("score", "input")  # stages of a run that only measure
 MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
@@ -239,7 +240,7 @@ def _load(
     if held_out is None:
         return scene, None, tuple(load.notes)
     names = ", ".join(held_out.names)
-    return scene, held_out, (*load.notes, f"without --targets, no run sees these photos, which judge all: {names}")
+    return scene, held_out, (*load.notes, f"{HELD_OUT}: {names}")
 
 
 def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:

@@ -96,7 +96,7 @@ def test_every_reference_inside_the_page_is_there(page: str) -> None:
 
 
 def test_the_page_says_what_was_found(page: str) -> None:
-    assert "42 runs on 3 scene(s): apples, fern, fox" in page
+    assert "42 runs on 3 scenes: apples, fern, fox" in page
     assert "gsmerge lab chart scenes --grid budget=1%,4.4%" in page
     assert "<td>processor</td><td>one</td>" in page
     assert "Failed runs" not in page
