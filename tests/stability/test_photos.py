@@ -91,7 +91,7 @@ def bgr(photos: Photos) -> Photos:
 CASES = [
     (band, 0.5, ("3 of 6", "part")), (linear, 0.5, ("6 of 6", "tone")),
     (masked, 0.5, ("6 of 6", "part")), (bars, 0.5, ("6 of 6", "part")),
-    (letterbox, 1.1, ("6 of 6",)),
+    (letterbox, 1.5, ("6 of 6",)),  # half of the rows are gone: 1.4 dB over five seeds
     (half, 0.5, ("6 of 6", "tone")), (gamma, 0.5, ("6 of 6", "tone")),
     (bgr, 0.1, ("red", "blue")),
 ]  # fmt: skip
