@@ -149,8 +149,7 @@ def run_jobs(
             add(record)
             why = record["error"] or ""
             num_failed += record["status"] == FAILED
-            failed = f"{num_failed} failed, " if num_failed and not why else ""
-            progress(f"{failed}{record[name]} {record['status']}", num_ended, why)
+            progress(record[name], record["status"], num_ended, why, num_failed)
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:

@@ -13,6 +13,7 @@ from contextvars import ContextVar
 from typing import Any
 
 Progress = Callable[[str, int, int], None]
+RunProgress = Callable[[str, str, int, str, int], None]  # see total_progress
 
 MAX_LINE = 5000  # characters
 SHORT = 5  # seconds: what is left is shown from so many on
@@ -240,25 +241,25 @@ def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
 
 
 @contextmanager
-def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, str], None]]:
+def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     """Show one bar for many runs on stderr, with the time left, and the last failure below it.
 
-    Without a terminal it prints a line for each run. Yields ``(text, done, failure) -> None``, ``text`` the name of the
-    run and its status after the last space; ``failure`` is empty after a run that succeeded.
+    Without a terminal it prints a line for each run. Yields ``(name, status, done, failure, num_failed) -> None``;
+    ``failure`` is empty after a run that succeeded.
     """
     if _as_json.get():
 
-        def print_event(text: str, done: int, failure: str) -> None:
-            scene, _, status = text.rpartition(" ")
-            event = {"scene": scene, "status": status, "done": done, "total": total, "error": failure or None}
-            _print_event(event)
+        def print_event(name: str, status: str, done: int, failure: str, num_failed: int) -> None:
+            event = {"scene": name, "status": status, "done": done, "total": total, "failed": num_failed}
+            _print_event({**event, "error": failure or None})
 
         yield print_event
         return
     console = _terminal(quiet=quiet)
     if console is None:
 
-        def print_run(text: str, done: int, failure: str) -> None:
+        def print_run(name: str, status: str, done: int, failure: str, num_failed: int) -> None:
+            text = _run_text(name, status, failure, num_failed)
             say(f"{done}/{total} {text}{f': {failure}' if failure else ''}", quiet=quiet)
 
         yield print_run
@@ -276,12 +277,16 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, s
     with Live(Group(bars, last), console=console, transient=True, refresh_per_second=5):
         task = bars.add_task("", total=total)
 
-        def move(text: str, done: int, failure: str) -> None:
-            bars.update(task, completed=done, description=one_line(text))
+        def move(name: str, status: str, done: int, failure: str, num_failed: int) -> None:
+            bars.update(task, completed=done, description=one_line(_run_text(name, status, failure, num_failed)))
             if failure:
                 last.plain = one_line(f"last failure: {failure}")
 
         yield move
+
+
+def _run_text(name: str, status: str, failure: str, num_failed: int) -> str:
+    return f"{name} {status}{f', {num_failed} failed' if num_failed and not failure else ''}"
 
 
 def duration(seconds: float) -> str:

@@ -154,9 +154,7 @@ def _check_place(folder: Path, output: Path, expected: str) -> None:
 
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
     """List the files of Gaussians, cameras and photos that reading the scene uses."""
-    pictures = files.images, files.masks, files.protect
-    paths = tuple(path for path in (*files.plys, files.cameras, *pictures) if path is not None)
-    return (*paths, *(path for scene_files in files.more for path in input_files(scene_files)))
+    return (*files.paths, *(path for scene_files in files.more for path in input_files(scene_files)))
 
 
 def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:

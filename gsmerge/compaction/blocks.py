@@ -47,7 +47,7 @@ from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Decoded, Gaussians, PicturedScene, Scene, SceneT
 
 T = TypeVar("T")
-# of a result on a block: PSNR (dB), over the pixels that the input covers, and on files of photos that were changed
+# of a result on a block: PSNR (dB), and what is measured besides
 Scores = tuple[float | None, Besides]
 FOREIGN = 0.1  # share of a Gaussian's weights in other blocks' views from which on it is at a seam
 SEAM_SHARE = 0.1  # of a view's weights that such Gaussians have from which on it is fitted to

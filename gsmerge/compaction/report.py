@@ -72,7 +72,7 @@ class CompactReport:
         covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
             not.
         photo_files: PSNR on the photos as their files have them, where the run changed some; None where it did not.
-        protected: PSNR over the pixels that ``protect`` names, and their share of those scored; None without.
+        protected: PSNR over the pixels that ``protect`` names, and their share of all; None without.
 
     Example:
         >>> report = gsmerge.compact("demo", effort="draft", budget=300).report

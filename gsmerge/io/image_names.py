@@ -153,7 +153,7 @@ def _find_unread(files: Sequence[Path]) -> tuple[str, str] | None:
     if pictures := sum(found[ending] for ending in OTHER_PICTURES):
         endings = " and ".join(sorted(ending for ending in found if ending in OTHER_PICTURES))
         return f"{pictures} {endings}", "convert them to .jpg or .png, with their names"
-    return ("a film", _CUT) if any(found[ending] for ending in FILMS) else None
+    return (FILM, _CUT) if any(found[ending] for ending in FILMS) else None
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

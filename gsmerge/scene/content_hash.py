@@ -42,7 +42,7 @@ def content_hash(files: Sequence[Path]) -> str:
 
 def read_files(files: SceneFiles) -> list[Path]:
     """List all files and folders that reading a scene would read, each once."""
-    paths = [path for path in (*files.plys, files.cameras, files.images, files.masks, files.protect) if path]
+    paths = list(files.paths)
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
         folders = (root, files.cameras.parent, files.ply.parent)

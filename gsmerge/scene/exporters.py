@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from gsmerge.alignment import ESTIMATED, MAY_BE_UNALIGNED, Layout
 from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.json_files import FFGS
-from gsmerge.settings.reading import QuatChoice, ReadHints
+from gsmerge.settings.reading import OF_SCENE, QuatChoice, ReadHints
 from gsmerge.settings.setting import join_words
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def make_hints(values: dict[str, Any]) -> ReadHints:
     names = {field.name for field in fields(ReadHints)}
     unknown = sorted(values.keys() - names)
     if unknown:
-        known = sorted({*names, "cameras", "images", "masks", "protect", "opacity"})
+        known = sorted({*names, *OF_SCENE})
         near = "".join(f"; perhaps {name}" for name in get_close_matches(unknown[0], known, 1))
         raise ValueError(f"expected {join_words(map(repr, known))}, got {unknown[0]!r}{near}")
     return ReadHints(**values)

@@ -96,6 +96,12 @@ class SceneFiles:
         """Paths of the Gaussians, in the order of their rows."""
         return self.parts or (self.ply,)
 
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Paths of all that the scene is read from: Gaussians, cameras, and folders of pictures."""
+        others = (self.cameras, self.images, self.masks, self.protect)
+        return (*self.plys, *(path for path in others if path is not None))
+
     def without_found(self, problem: str) -> Iterator[SceneFiles]:
         """Yield copies without what was found and may not belong to the scene, if the file ``problem`` is unusable.
 

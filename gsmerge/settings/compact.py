@@ -11,6 +11,7 @@ from gsmerge.runtime import MOST_THREADS
 from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.fit import FitOptions
+from gsmerge.settings.reading import OF_SCENE
 from gsmerge.settings.setting import Setting, Settings, change_settings, flat_settings, setting, settings_of
 from gsmerge.settings.stages import (
     BlockOptions,
@@ -22,7 +23,6 @@ from gsmerge.settings.stages import (
 )
 
 OURS = "gsmerge"  # the method that is no plugin
-OF_SCENE = ("cameras", "images", "masks", "protect", "opacity")  # arguments of reading a scene, not settings of a run
 EFFORT_NAMES = ("draft", "fast", "default", "best")  # what each means: gsmerge.plan
 CHECKPOINTS = ("auto", "shipped", "paper", "none")  # names that are no files
 # Settings under one name; what is set besides goes before. "paper": the superpixel merging paper's own chain: 12,000

@@ -12,6 +12,7 @@ OpacityChoice = Literal["auto", "logit", "raw"]
 QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
 Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
 
+OF_SCENE = ("cameras", "images", "masks", "protect", "opacity")  # arguments of reading a scene besides hints
 NONE = "none"  # in the place of cameras, photos or masks: the scene is read without; Path(NONE) is a file of that name
 
 
