@@ -22,16 +22,21 @@ def grow_to(state: FitState, half: Photos, count: int) -> FitState:
 
     ``half``: the half-size photos, whose errors decide which Gaussians are split.
     """
-    before, opacities = 0, state.splats.opacities
+    opacities = state.splats.opacities
     if len(opacities):
         state = state[opacities >= min(FADED, float(lower_median(opacities)))]  # of a faint scene most stay
+    if len(state.x) >= count:
+        return state
+    masses, before = error_masses(state, half), 0
     while before < len(state.x) < count:
-        before, state = len(state.x), grow(state, error_masses(state, half), count)
+        before, (state, masses) = len(state.x), grow(state, masses, count)
     return state
 
 
-def grow(state: FitState, masses: np.ndarray, count: int) -> FitState:
+def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.ndarray]:
     """Split the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
+
+    Returns the state and its masses; each half has half the mass of its parent.
 
     Each is split at most once, so the number at most doubles. Gaussians that no photo shows are not split. Both halves
     inherit momentum, share of the box and least size. First halves keep the rows of their parents, second halves are
@@ -39,7 +44,7 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> FitState:
     """
     num = min(count - len(state.x), int((masses > 0).sum()))
     if num <= 0:
-        return state
+        return state, masses
     picked = np.sort(np.argsort(-masses, kind="stable")[:num])
     parents, rows = state.x[picked], np.arange(num)
     longest = parents[:, SIZE:QUAT].argmax(1)
@@ -61,7 +66,9 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> FitState:
     grown.x0[old], grown.units[old] = state.x0[old[: len(state.x)]], state.units[old[: len(state.x)]]
     for name in set(CARRIED) - {"x0", "units"}:
         getattr(grown, name)[:] = getattr(state, name)[source]
-    return grown
+    masses = masses[source]
+    masses[~old] /= 2
+    return grown, masses
 
 
 def error_masses(state: FitState, half: Photos) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmerge.fit.outside import Outside
-from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weight, training_weights
+from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weights
 from gsmerge.kernels.elementary import power
 from gsmerge.raster.photos import WHOLE_PHOTO, Photos, Sample
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
@@ -86,15 +86,15 @@ class FitRun:
     dropout: float  # Share of the Gaussians that a step leaves out
     half_part: float  # Share of the steps, the first ones, that draw samples of the photos
     samples: bool = True  # Whether they do; otherwise they draw photos of half the size
+    # [h,w] bool of each photo at full size: the pixels that count in the first steps; None: those of the others
+    first_pixels: tuple[np.ndarray, ...] | None = None
 
     def weight(self, step: Step) -> np.ndarray:
         """Return the weights ``[h,w]`` of the pixels that a step draws; the first steps leave out held-out patches."""
-        photos, view = self.job.photos[0], step.view
-        weight = self.step_weights[step.mode.size][view][step.sample.pixels]
-        if step.mode.stride == 1 or not self.job.options.judged:
+        weight = self.step_weights[step.mode.size][step.view][step.sample.pixels]
+        if step.mode.stride == 1 or self.first_pixels is None:
             return np.ascontiguousarray(weight)
-        trained = training_weight(photos, view, self.job.options.holdout, self.job.seed)[step.sample.pixels]
-        return np.where((trained == 0) | (trained == HIDDEN), np.float32(0), weight)
+        return np.where(self.first_pixels[step.view][step.sample.pixels], weight, np.float32(0))
 
     def outside_view(self, step: int, progress: float) -> int | None:
         """Return the index of the view from outside that is fitted after step ``step`` (from 1); None: none."""
@@ -131,13 +131,16 @@ def prepare_fit(job: FitJob) -> FitRun:
     dropout = default if options.dropout is None else options.dropout
     everywhere, *larger = (_weigh(_weights_of(level), level) for level in (photos[0], *photos[2:]))
     weights = trained = _weights_of(photos[1])
+    first_pixels = None
     if options.judged:
-        weights = reduced(training_weights(photos[0], options.holdout, job.seed), photos[1])
+        whole = training_weights(photos[0], options.holdout, job.seed)
+        first_pixels = tuple((weight != 0) & (weight != HIDDEN) for weight in whole)
+        weights = reduced(whole, photos[1])
         trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights]
         if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
             weights = [np.where(weight == 1, np.float32(0), weight) for weight in weights]
     step_weights = everywhere, _weigh(trained, photos[1]), *larger
-    return FitRun(job, weights, step_weights, dropout, options.half_res_part, _can_sample(job))
+    return FitRun(job, weights, step_weights, dropout, options.half_res_part, _can_sample(job), first_pixels)
 
 
 def _can_sample(job: FitJob) -> bool:

@@ -94,12 +94,12 @@ class Optimiser:
         drawn = tile_view(state.splats, **camera, opacities=opacities)
         all_colors = state.view_colors()
         colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
-        image, transmittance = blend(drawn, colors, step.background)
+        image, transmittance = blend(drawn, colors, step.background, early=True)
         rates = self.run.job.options.tuning
         weights = loss_weights(rates, step.progress)
         gradient, error = image_gradient(image, photo, weight, *weights)
         with_viewmat = self.poses is not None
-        g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=with_viewmat)
+        g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=with_viewmat, early=True)
         if self.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
             self.poses.step(step.view, g.viewmat, rates, step.progress)
         self._move(state, g, step)

@@ -105,7 +105,7 @@ def test_view_colors_bring_the_harmonics_up_to_date() -> None:
 @pytest.mark.parametrize("more", [0, 1, 7, 40])
 def test_grown_count_is_exact(gaussians: Gaussians, photos: Photos, more: int) -> None:
     state = start_state(gaussians)
-    grown = grow(state, error_masses(state, photos), len(gaussians) + more)
+    grown, _ = grow(state, error_masses(state, photos), len(gaussians) + more)
     assert len(grown.x) == len(gaussians) + more
     for array in (grown.x0, grown.m, grown.v, grown.units, grown.colors, *vars(grown.splats).values()):
         assert len(array) in (len(grown.x), 3)
@@ -116,15 +116,15 @@ def test_grown_count_is_exact(gaussians: Gaussians, photos: Photos, more: int) -
 def test_never_more_than_doubled(gaussians: Gaussians, photos: Photos) -> None:
     state = start_state(gaussians)
     masses = error_masses(state, photos)
-    assert len(grow(state, masses, 10 * len(gaussians)).x) == 2 * len(gaussians)
-    assert len(grow(state, masses, 3).x) == len(gaussians)
+    assert len(grow(state, masses, 10 * len(gaussians))[0].x) == 2 * len(gaussians)
+    assert len(grow(state, masses, 3)[0].x) == len(gaussians)
 
 
 def test_halves_have_their_parents_moments(gaussians: Gaussians, photos: Photos) -> None:
     """Mean and covariance of the pair are those of the parent: exactly, the axes across included."""
     state = start_state(gaussians)
     n = len(gaussians)
-    grown = grow(state, error_masses(state, photos), 2 * n)
+    grown, _ = grow(state, error_masses(state, photos), 2 * n)
     first, second = grown.x[:n], grown.x[n:]
     np.testing.assert_allclose((first[:, :3] + second[:, :3]) / 2, state.x[:, :3], atol=1e-6)
     own = covars_of(first)
@@ -143,7 +143,7 @@ def test_halves_cover_what_their_parent_did(gaussians: Gaussians, scene: Scene, 
     """Each is clearer than the parent; both together cover a little more, so as to close gaps."""
     state = start_state(gaussians)
     n = len(gaussians)
-    grown = grow(state, error_masses(state, photos), 2 * n)
+    grown, _ = grow(state, error_masses(state, photos), 2 * n)
     assert (grown.splats.opacities[:n] < state.splats.opacities).all()
     before, after = (scenes.images_of(gaussians_of(s.x, s.splats.shN), scene.cameras)[1].mean() for s in (state, grown))
     assert before <= after <= before + 0.1
@@ -152,7 +152,7 @@ def test_halves_cover_what_their_parent_did(gaussians: Gaussians, scene: Scene, 
 def test_the_rest_stays_as_it_is(gaussians: Gaussians, photos: Photos) -> None:
     """In order, with its past and its start; halves have their parent's past and start where they are."""
     state, n = used(gaussians), len(gaussians)
-    grown = grow(state, error_masses(state, photos), n + 9)
+    grown, _ = grow(state, error_masses(state, photos), n + 9)
     worst = np.sort(np.argsort(-error_masses(state, photos), kind="stable")[:9])
     rest = np.setdiff1d(np.arange(n), worst)
     for name in ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors"):
@@ -171,7 +171,7 @@ def test_the_rest_stays_as_it_is(gaussians: Gaussians, photos: Photos) -> None:
 def test_harmonics_are_inherited(photos: Photos) -> None:
     _, gaussians = make(3)
     state, n = start_state(gaussians), len(gaussians)
-    grown = grow(state, error_masses(state, photos), 2 * n)
+    grown, _ = grow(state, error_masses(state, photos), 2 * n)
     np.testing.assert_array_equal(grown.splats.shN[:n], state.splats.shN)
     np.testing.assert_array_equal(grown.splats.shN[n:], state.splats.shN)
 
@@ -184,7 +184,7 @@ def test_growing_happens_where_the_error_is(scene: Scene, gaussians: Gaussians) 
     state, n = start_state(gaussians), len(gaussians)
     masses = error_masses(state, spoilt)
     assert (masses >= 0).all()
-    grown = grow(state, error_masses(state, spoilt), n + 5)
+    grown, _ = grow(state, error_masses(state, spoilt), n + 5)
     for view in range(3):
         centres = grown.x[n:, :3] @ spoilt.viewmats[view, :3, :3].T + spoilt.viewmats[view, :3, 3]
         pixels = centres @ spoilt.Ks[view].T
@@ -195,7 +195,7 @@ def test_unseen_ones_have_no_error_and_are_the_last_to_be_halved(gaussians: Gaus
     behind = replace(gaussians[:5], means=gaussians.means[:5] - 100)
     state = start_state(Gaussians.concat([behind, gaussians]))
     assert (error_masses(state, photos)[:5] == 0).all()
-    grown = grow(state, error_masses(state, photos), len(state.x) + len(gaussians) // 2)
+    grown, _ = grow(state, error_masses(state, photos), len(state.x) + len(gaussians) // 2)
     np.testing.assert_array_equal(grown.x[:5], state.x[:5])
 
 
@@ -278,7 +278,7 @@ def test_growth_spends_the_count_on_what_can_be_seen(gaussians: Gaussians, photo
 
 def test_halves_of_what_has_not_faded_are_drawn(gaussians: Gaussians, photos: Photos) -> None:
     faint = start_state(replace(gaussians, opacities=np.full_like(gaussians.opacities, FADED * 1.0001)))
-    grown = grow(faint, error_masses(faint, photos), 2 * len(gaussians))
+    grown, _ = grow(faint, error_masses(faint, photos), 2 * len(gaussians))
     assert len(grown.x) > len(gaussians)
     assert grown.splats.opacities.min() >= 1 / 255
 

@@ -42,12 +42,15 @@ LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 
 def test_perturbed_scene_comes_back(scene: Scene, truth: Gaussians, photos: Pair) -> None:
-    start = scenes.spoil(truth)
-    result, report = fit_full(start, scenes.run_for(photos, replace(LONG, dropout=0.0)))
-    assert (report.method, report.accepted, report.steps) == ("full", True, 160)
-    assert report.holdout_after > report.holdout_before + 4
-    assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 6
-    assert len(result) == len(start)
+    gains = []
+    for seed in range(3):
+        start = scenes.spoil(truth, seed=seed)
+        result, report = fit_full(start, scenes.run_for(photos, replace(LONG, dropout=0.0), seed=seed))
+        assert (report.method, report.accepted, report.steps) == ("full", True, 160)
+        assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 6
+        assert len(result) == len(start)
+        gains.append(report.holdout_after - report.holdout_before)
+    assert np.mean(gains) > 5
     scenes.assert_invariants(result, scene)
 
 
