@@ -45,6 +45,7 @@ MARGIN = 0.15
 # Gaussians of the start for each photo from which on fog weighs as much as errors of the photos: fewer and larger ones
 # reach from the borders of photos into what is empty, and would leave both. LIGHT is the least weight; veils weigh more
 MANY, LIGHT, VEIL = 1000, 0.15, 30
+LEVEL = 3  # times a photo's pixel is one of the pictures: at 2 fog is as thin, at 4 a fifth thicker
 LEAST_WIDTH = 64  # pixels of the pictures
 LEAST = 0.005  # share of a picture that must be empty or solid for it to count
 TOUCHED = 1e-9  # gradient of the opacity from which on a Gaussian takes part in a step
@@ -74,7 +75,7 @@ class Outside:
 def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOptions) -> Outside | None:
     """Place views outside the capture for a fit from a ``start``, and see how far into the scene they look.
 
-    Cameras step back from those of ``photos``. Pictures are half as large, at least ``LEAST_WIDTH`` wide. None if no
+    Cameras step back from those of ``photos``. Pictures are a third as large, at least ``LEAST_WIDTH`` wide. None if no
     step looks there, or the scene says nothing in any of them; of a scene without Gaussians, as views of blocks are
     joined, the start says it.
     """
@@ -90,7 +91,7 @@ def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOpt
     depths = [depths_inside(points, cameras[[view]]) for view in range(min(len(placed), len(cameras)))]
     near, far = np.resize([np.quantile(some, (0.5, LAST)) for some in depths], (len(placed), 2)).T
     near, far = NEAREST * near, FARTHEST * far
-    views, drawn = blank_photos(placed, min(2, photos.width / LEAST_WIDTH)), make_splats(rows)
+    views, drawn = blank_photos(placed, min(LEVEL, photos.width / LEAST_WIDTH)), make_splats(rows)
 
     def look(view: int) -> np.ndarray:
         depths, left = blend_depths(_tile(drawn, views, view, near[view]), far[view])
