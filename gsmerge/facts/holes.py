@@ -16,6 +16,7 @@ import numpy as np
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import fill_gaps
 from gsmerge.geometry import nearest_views, rgb_to_sh0
+from gsmerge.kernels.compare_views import add_differences
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
 from gsmerge.raster import TiledView
@@ -182,24 +183,15 @@ def _agreeing(scene: PicturedScene, view: int, holes: np.ndarray, rays: np.ndarr
     for other in others:
         K, (turn, shift) = cameras.Ks[other], np.split(cameras.viewmats[other, :3], [3], 1)
         start = matmul(K, matmul(turn, centres[view]) + shift[:, 0])
-        moves.append((scene.images[other], matmul(matmul(rays, turn.T), K.T).T.copy(), start))
-    colors, size = scene.images[view][holes], np.array([[cameras.width], [cameras.height]])
-    chosen, least = depths[0].copy(), np.full(len(rays), np.inf)
+        along = np.ascontiguousarray(matmul(matmul(rays, turn.T), K.T).T)
+        moves.append((scene.images[other], along, start))
+    colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
+    chosen, least = depths[0], np.full(len(rays), np.inf, np.float32)
     for step, depth in enumerate(depths):
-        sums = np.zeros((2, len(rays)), np.float32)  # of differences, and their number
-        for image, along, start in moves:
-            x, y, z = along * depth + start[:, None]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                place = np.floor(np.stack([x, y]) / z)
-            seen = np.flatnonzero((z > 0) & ((place >= 0) & (place < size)).all(0))
-            column, row = place[:, seen].astype(np.int64)
-            apart = np.abs(image[row, column] - colors[seen])
-            sums[0, seen] += (apart[:, 0] + apart[:, 1] + apart[:, 2]) / 3
-            sums[1, seen] += 1
-        pictures = np.zeros((*holes.shape, 2), np.float32)
-        pictures[holes] = sums.T
-        total, number = blur(pictures, BLUR)[holes].T
+        sums = np.zeros((*holes.shape, 2), np.float32)  # of differences, and their number
+        for picture, along, start in moves:
+            add_differences(picture, along, start, depth, colors, pixels, sums)
+        total, number = blur(sums, BLUR).reshape(-1, 2)[pixels].T
         cost = np.where(number > LEAST, total / np.maximum(number, LEAST), np.inf) + FARTHER * step
-        better = cost < least
-        chosen[better], least[better] = depth[better], cost[better]
+        chosen, least = np.where(cost < least, depth, chosen), np.minimum(cost, least)
     return chosen
