@@ -127,11 +127,14 @@ def _find_lengths(points: np.ndarray) -> list[tuple[int, int]]:
     """
     most = min(_MAX_WIDTH, len(points) // 4)
     starts = np.linspace(0, len(points) - most - 1, _LOOKED_AT).astype(int)
-    near = points.astype(np.float32)
-    lags = [
-        _MIN_SIDE + int(np.argmin(((near[start + _MIN_SIDE : start + most] - near[start]) ** 2).sum(1)))
-        for start in starts
-    ]
+    x, y, z = points.T.astype(np.float32)
+
+    def find_nearest(start: int) -> int:
+        rows = slice(start + _MIN_SIDE, start + most)
+        right, down, ahead = x[rows] - x[start], y[rows] - y[start], z[rows] - z[start]
+        return _MIN_SIDE + int(np.argmin(right * right + down * down + ahead * ahead))
+
+    lags = [find_nearest(start) for start in starts]
     counts = np.bincount(lags, minlength=2 * most)
     beside = np.maximum(np.roll(counts, 1), np.roll(counts, -1))
     peaks = np.where(counts >= beside, counts, 0)
