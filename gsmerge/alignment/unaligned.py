@@ -19,6 +19,8 @@ from gsmerge.types import Cameras, Gaussians
 _FRAME_GAIN = 1.1  # times the score of the cameras as given, for another frame; of as good ones those stay as they are
 _PEAK_GAIN = 1.05  # times that of a scale two steps of the search beside it, for a scale that colours chose
 _SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to see whether cameras see them
+# In other conventions and frames, whose scores differ by 5 % and more where it counts; so many have 0.4 % of noise
+_COMPARED_GAUSSIANS = 5000
 _FEW_GAUSSIANS, _MAX_PROJECTED = 200, 4_000_000  # at least, and times the cameras at most
 _MIN_SEEN = 0.5  # share of them that some camera sees
 _MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, of the foremost ones alone in a frame that colours chose
@@ -128,7 +130,7 @@ def choose_poses(
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
-        (poses, check_cameras(gaussians, valid, replace(cameras, viewmats=poses.viewmats), images))
+        (poses, check_cameras(gaussians, valid, replace(cameras, viewmats=poses.viewmats), images, _COMPARED_GAUSSIANS))
         for poses in other_conventions(cameras.viewmats, convention)
     ]
     ranked = sorted(candidates, key=lambda candidate: -candidate[1].score)
@@ -229,7 +231,7 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     return best if score > _FRAME_GAIN * enough else None
 
 
-def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _SEEN_GAUSSIANS) -> float:
+def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:
     """Score what the cameras see in a frame; 0 where the photos cannot tell."""
     # the first camera may see all Gaussians at any scale
     seen = slice(1 if len(inputs.cameras) > 1 else 0, None)
@@ -239,7 +241,7 @@ def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _SEEN
 
 
 def _best_frame(
-    inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _SEEN_GAUSSIANS
+    inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _COMPARED_GAUSSIANS
 ) -> tuple[Similarity, float]:
     """Return the frame with the highest score, the first of equal ones, and its score."""
     scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
