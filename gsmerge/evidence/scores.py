@@ -87,8 +87,8 @@ class Comparer:
         """
         out = np.full((len(photos), self.views, TURNS), np.nan)
         small = [shrink_pictures(photo[None], *fit_size(photo.shape[1::-1], SIZES[-1]))[0] for photo in photos]
-        square = np.array([height == width for height, width, _ in (photo.shape for photo in photos)])
-        portrait = np.array([height > width for height, width, _ in (photo.shape for photo in photos)])
+        shapes = np.array([photo.shape for photo in photos]).reshape(-1, 3)
+        square, portrait = shapes[:, 0] == shapes[:, 1], shapes[:, 0] > shapes[:, 1]
         upright = self._square | square | (portrait == self._portrait)
         lying = self._square | square | (portrait != self._portrait)
         for is_upright, stand in ((True, upright), (False, lying)):
@@ -96,7 +96,8 @@ class Comparer:
             if len(ids):
                 filters = self._upright if is_upright else self._lying
                 scores = np.mean([_correlate([small[photo] for photo in ids], each) for each in filters], 0)
-                out[np.ix_(ids, range(self.views), filters[0].turns)] = scores.reshape(len(ids), self.views, -1)
+                turns = np.array(filters[0].turns)
+                out[np.ix_(ids, np.arange(self.views), turns)] = scores.reshape(len(ids), self.views, -1)
         out[:, self._empty] = np.nan
         return out
 
