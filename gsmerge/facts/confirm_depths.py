@@ -85,7 +85,7 @@ def confirm_depths(scene: Scene) -> Agreement | None:
     views = len(scene)
     if not scene.aligned or views < 2 or not scene.valid.any():
         return None
-    means, centres = scene.gaussians.means.reshape(views, -1, 3), scene.cameras.centres
+    means, centres = scene.gaussians.means, scene.cameras.centres
     cameras, valid = scene.cameras, scene.valid.reshape(views, -1)
     width, height = cameras.width, cameras.height
     reach = max(PIXELS, REACH * max(width, height))
@@ -93,7 +93,10 @@ def confirm_depths(scene: Scene) -> Agreement | None:
     def count(view: int) -> np.ndarray:
         rows = np.flatnonzero(valid[view])
         rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), SAMPLE_PIXELS))]
-        points, pixels = means[view, rows].astype(np.float64), np.stack([rows % width, rows // width], 1) + 0.5
+        points, pixels = (
+            means[view * width * height + rows].astype(np.float64),
+            np.stack([rows % width, rows // width], 1) + 0.5,
+        )
         others = nearest_views(centres, view)[:NEIGHBORS]
         places, depths = project(points, cameras[others])
         x, y = places[..., 0], places[..., 1]
@@ -103,9 +106,10 @@ def confirm_depths(scene: Scene) -> Agreement | None:
         there, other = row * width + column, others[number]
         known = valid[other, there]
         number, ids, there, other = number[known], ids[known], there[known], other[known]
-        surface = means[other, there].astype(np.float64)
+        surface = means.take(other * width * height + there, 0).astype(np.float64)
         (back,), (ahead,) = project(surface, cameras[[view]])
-        away = np.where(ahead > TINY, np.sqrt(((back - pixels[ids]) ** 2).sum(1)), np.inf) / reach
+        right, down = (back - pixels[ids]).T
+        away = np.where(ahead > TINY, np.sqrt(right * right + down * down), np.inf) / reach
         behind = log(depths[number, ids] / np.maximum(camera_depths(surface, cameras.viewmats[other]), TINY))
         agrees = (away < 1) & (np.abs(behind) < SAME)
         sees_through = ~agrees & ((behind < -2 * SAME) | ((behind < 0) & (away > 2)))
