@@ -79,7 +79,8 @@ def scene_depth(scene: Scene) -> float:
         return float(lower_median(np.abs(camera_depths(means, viewmats))))
     views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
     pixels, depths = project(means, views)
-    seen = (depths > 0) & ((pixels > 0) & (pixels < (views.width, views.height))).all(-1)
+    x, y = pixels[..., 0], pixels[..., 1]
+    seen = (depths > 0) & (x > 0) & (x < views.width) & (y > 0) & (y < views.height)
     return float(lower_median(depths[seen])) if seen.any() else 0.0
 
 

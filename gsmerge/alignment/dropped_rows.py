@@ -7,7 +7,7 @@ where the rows of a view end.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -44,6 +44,7 @@ _GAP, _RISE = 4.0, 2.0  # pixels that a piece of a line may lack at once, and of
 _CROOKED = 0.8  # mean distance of rows from their line, pixels
 _SPARSE = 1.8  # pixels of a piece for each of its rows, at most
 _AROUND = 3  # rows before and after
+_FIRST_LINES, _MORE = 2, 8  # lines of rows that are walked first; times as many rows next
 _RUN = 8  # rows from pixel to pixel that are no chance
 _SAME = 2  # pixels by which the principal point may be off
 _AHEAD, _MIN_AHEAD = 0.3, 2  # lines that a camera is trusted beyond those it is solved from, as a share, and at least
@@ -73,30 +74,50 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
     return None
 
 
-def follow_rows(means: np.ndarray, valid: np.ndarray, cameras: Cameras) -> Layout | None:
-    """Find the pixels of rows ``means [n,3]`` that lack some, in their ``cameras``; None if rows do not follow them.
+def follow_rows(points: np.ndarray, cameras: Cameras) -> np.ndarray | None:
+    """Find the pixels ``[n]`` of rows at ``points [n,3]`` that lack some, in their ``cameras``, -1 for none.
 
-    ``valid [n]`` bool. Rows come view after view, or pixel after pixel with the views side by side.
+    Rows come view after view, or pixel after pixel with the views side by side; None if they do not follow.
     """
-    rows, count, width, height = np.flatnonzero(valid), len(cameras), cameras.width, cameras.height
-    points = means[rows].astype(np.float64)
     projections = list(matmul(cameras.Ks, cameras.viewmats[:, :3]))
-    ids, place = np.full(len(means), -1), 0
+    for follow in (_follow_in_turn, _follow_mixed):
+        rows, pixels = follow(points, projections, cameras.width, cameras.height)
+        if len(rows) >= _MIN_PLACED * len(points) > 0:
+            ids = np.full(len(points), -1)
+            ids[rows] = pixels
+            return ids
+    return None
+
+
+def _follow_in_turn(
+    points: np.ndarray, projections: list[np.ndarray], width: int, height: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Place rows that come view after view; return some rows and their pixels."""
+    place, rows, pixels = 0, [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for view, camera in enumerate(projections):
         placed, x, y = _walk(points[place:], camera, (-1, 0), width, height - 1)
         if not len(placed):
             break
-        ids[rows[place + placed]] = (view * height + y) * width + x
+        rows.append(place + placed)
+        pixels.append((view * height + y) * width + x)
         place += int(placed[-1]) + 1
-    few = points[: _MIN_LINES * width * count]
-    if (ids >= 0).sum() < _MIN_PLACED * len(rows) and 1 < count <= _MAX_MIXED:
-        reach = width * height * count
-        if len(_walk_mixed(few, projections, -1, width, reach)[0]) >= _MIN_PLACED * len(few):
-            ids[:] = -1
-            placed, keys = _walk_mixed(points, projections, -1, width, reach)
-            ids[rows[placed]] = keys % count * (height * width) + keys // count
-    placed_all = (ids >= 0).sum() >= _MIN_PLACED * len(rows) > 0
-    return dropped_layout(ids, count, width, height) if placed_all else None
+    return np.concatenate(rows), np.concatenate(pixels)
+
+
+def _follow_mixed(
+    points: np.ndarray, projections: list[np.ndarray], width: int, height: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Place rows that come pixel after pixel with the views side by side, if the first do."""
+    count = len(projections)
+    few, reach = points[: _MIN_LINES * width * count], width * height * count
+    if 1 < count <= _MAX_MIXED:
+        for part in (few, points):
+            rows, keys = _walk_mixed(part, projections, -1, width, reach, _MIN_PLACED)
+            if len(rows) < _MIN_PLACED * len(part):
+                break
+        else:
+            return rows, keys % count * (height * width) + keys // count
+    return np.empty(0, np.int64), np.empty(0, np.int64)
 
 
 def _find_lengths(points: np.ndarray) -> list[tuple[int, int]]:
@@ -106,11 +127,14 @@ def _find_lengths(points: np.ndarray) -> list[tuple[int, int]]:
     """
     most = min(_MAX_WIDTH, len(points) // 4)
     starts = np.linspace(0, len(points) - most - 1, _LOOKED_AT).astype(int)
-    near = points.astype(np.float32)
-    lags = [
-        _MIN_SIDE + int(np.argmin(((near[start + _MIN_SIDE : start + most] - near[start]) ** 2).sum(1)))
-        for start in starts
-    ]
+    x, y, z = points.T.astype(np.float32)
+
+    def find_nearest(start: int) -> int:
+        rows = slice(start + _MIN_SIDE, start + most)
+        right, down, ahead = x[rows] - x[start], y[rows] - y[start], z[rows] - z[start]
+        return _MIN_SIDE + int(np.argmin(right * right + down * down + ahead * ahead))
+
+    lags = [find_nearest(start) for start in starts]
     counts = np.bincount(lags, minlength=2 * most)
     beside = np.maximum(np.roll(counts, 1), np.roll(counts, -1))
     peaks = np.where(counts >= beside, counts, 0)
@@ -288,7 +312,7 @@ def _shift(view: _View, columns: int) -> _View:
 def _project(points: np.ndarray, camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Project points ``[n,3]``; return columns and lines, 0 at the centre of the first pixel."""
     with np.errstate(all="ignore"):
-        places = matmul(points, camera[:, :3].T) + camera[:, 3]
+        places = matmul(points.astype(np.float64, copy=False), camera[:, :3].T) + camera[:, 3]
         u, v = (np.nan_to_num(places[:, i] / places[:, 2] - 0.5, nan=-_OUTSIDE) for i in (0, 1))
     return u.clip(-_OUTSIDE, _OUTSIDE), v.clip(-_OUTSIDE, _OUTSIDE)
 
@@ -362,9 +386,27 @@ def _walk(
     Rows of a piece of a line, which lacks few pixels at once, come to one line together. Returns rows ``[p]`` and their
     ``x``, ``y``; ends where as many rows as a line has do not follow the ones before.
     """
-    points = points[: (reach + 1) * width]
+    for part in _grow_parts(points[: (reach + 1) * width], _FIRST_LINES * width):
+        rows, x, y, ended = _walk_part(part, camera, last, width, reach)
+        if ended:
+            break
+    return rows, x, y
+
+
+def _grow_parts(points: np.ndarray, count: int) -> Iterator[np.ndarray]:
+    """Yield the first ``count`` rows, more each time, then all: those that do not follow end in the first ones."""
+    while count < len(points):
+        yield points[:count]
+        count *= _MORE
+    yield points
+
+
+def _walk_part(
+    points: np.ndarray, camera: np.ndarray, last: tuple[int, int], width: int, reach: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+    """Place rows as :func:`_walk`; also return whether they end before the last piece of a line of ``points``."""
     if not len(points):
-        return (np.empty(0, np.int64),) * 3
+        return *(np.empty(0, np.int64),) * 3, True
     u, v = _project(points, camera)
     cuts = (np.abs(np.diff(u) - 1) > _GAP) | (np.abs(np.diff(v)) > _RISE)
     starts = np.flatnonzero(np.concatenate([[True], cuts]))
@@ -376,7 +418,7 @@ def _walk(
     firsts, lasts = x[starts], x[starts + lengths - 1]
     ends = u[starts], u[starts + lengths - 1]
     after, line, lost, end = last[1] * width + last[0], last[1], 0, 0
-    follows = np.zeros(len(starts), bool)
+    follows, ended = np.zeros(len(starts), bool), False
     dense = lasts - firsts < _SPARSE * lengths
     inside = straight & dense & (ends[0] >= -1.5) & (ends[1] < width + 0.5) & (y <= last[1] + reach)
     pieces = zip(y.tolist(), firsts.tolist(), lasts.tolist(), lengths.tolist(), strict=True)
@@ -388,10 +430,11 @@ def _walk(
         else:
             lost += length
             if lost > width:
+                ended = i + 1 < len(starts)  # the last piece may go on
                 break
     follows[end:] = False
     placed = np.flatnonzero(np.repeat(follows, lengths))
-    return placed, x[placed], np.repeat(y, lengths)[placed]
+    return placed, x[placed], np.repeat(y, lengths)[placed], ended
 
 
 def _smooth_columns(u: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -469,33 +512,51 @@ def _grow_mixed(points: np.ndarray, views: list[_View], width: int) -> list[_Vie
 
 
 def _walk_mixed(
-    points: np.ndarray, cameras: list[np.ndarray], last: int, width: int, reach: int
+    points: np.ndarray, cameras: list[np.ndarray], last: int, width: int, reach: int, least: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Place rows that follow one after the other, each in the view in which the next pixel is the nearest.
 
     Pixels are counted line by line and with the views side by side; ``last`` is that of the row before, and ``reach``
-    how far on rows are placed. Returns rows ``[p]`` and their pixels.
+    how far on rows are placed. Returns rows ``[p]`` and their pixels; fewer than follow where less than the share
+    ``least`` of the rows do.
     """
-    points, count = points[: reach + 1], len(cameras)
+    points = points[: reach + 1]
+    spare = int((1 - least) * len(points)) + 1
+    for part in _grow_parts(points, width * len(cameras)):
+        rows, keys, ended = _walk_mixed_part(part, cameras, last, width, reach, spare)
+        if ended:
+            break
+    return rows, keys
+
+
+def _walk_mixed_part(
+    points: np.ndarray, cameras: list[np.ndarray], last: int, width: int, reach: int, spare: int
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Place rows as :func:`_walk_mixed`; also return whether they end before the last of ``points``.
+
+    They end after more than ``spare`` rows without a pixel.
+    """
+    count, outside = len(cameras), np.iinfo(np.int64).min
     keys = np.empty((len(points), count), np.int64)
     for view, camera in enumerate(cameras):
         x, y = (np.rint(values).astype(np.int64) for values in _project(points, camera))
-        keys[:, view] = np.where((x >= 0) & (x < width), (y * width + x) * count + view, np.iinfo(np.int64).min)
-    far, current, lost, end = last + reach, last, 0, 0
+        keys[:, view] = np.where((x >= 0) & (x < width), (y * width + x) * count + view, outside)
+    far, current, near, end, ended = last + reach, last, -1, 0, False
+    most = np.where(keys <= far, keys, outside).max(1).tolist()
     placed: list[tuple[int, int]] = []
-    for row, choices in enumerate(keys.tolist()):
-        key = min((key for key in choices if current < key <= far), default=None)
-        if key is not None and key - current <= _RUN * count:
-            lost, end = 0, len(placed) + 1
-        else:
-            lost += 1
-            if lost > width * count:
-                break
-        if key is not None:
-            placed.append((row, key))
-            current = key
+    for row, largest in enumerate(most):
+        ended = row > near + 1 + width * count or row > len(placed) + spare
+        if ended:
+            break
+        if largest <= current:
+            continue
+        key = min(key for key in keys[row].tolist() if current < key <= far)
+        placed.append((row, key))
+        if key - current <= _RUN * count:
+            near, end = row, len(placed)
+        current = key
     rows, keys = np.array(placed[:end], np.int64).reshape(-1, 2).T
-    return rows, keys
+    return rows, keys, ended
 
 
 def _make_layout(rows: np.ndarray, views: list[_View]) -> Layout:

@@ -159,7 +159,9 @@ def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[in
         return 1, []
     starts = np.linspace(0, count - lags[-1] - 1, _STEPS).astype(int)
     starts = starts[valid[starts]]
-    steps = np.abs(means[starts + lags[:, None]].astype(np.float64) - means[starts]).sum(2)
+    ends = starts + lags[:, None]
+    right, down, ahead = (np.abs(values[ends].astype(np.float64) - values[starts]) for values in means.T)
+    steps = right + down + ahead
     lengths = np.median(steps, 1) if np.isfinite(steps).all() else np.array(list(map(_median, steps)))
     fastest = int(lags[np.argmax(lengths <= _AS_SHORT * lengths.min())])
     segment = 1 << min(_SEGMENT, count - fastest).bit_length() - 1

@@ -252,6 +252,8 @@ def _follow_cameras(source: RowSource, grids: Sequence[Grid]) -> Iterator[list[G
     from gsmerge.alignment.dropped_rows import follow_rows  # few files come here
 
     others = other_conventions(source.camera_file.viewmats, source.camera_file.convention)
+    rows = np.flatnonzero(source.ply.valid)
+    points = source.ply.gaussians.means[rows]
     for grid in grids:
         if not _may_lack_pixels(source, [grid]):
             continue
@@ -260,8 +262,13 @@ def _follow_cameras(source: RowSource, grids: Sequence[Grid]) -> Iterator[list[G
             (replace(grid.cameras, viewmats=poses.viewmats) for poses in others),
         )
         for cameras in moved:
-            layout = follow_rows(source.ply.gaussians.means, source.ply.valid, cameras)
-            if layout is not None and source.may_be(layout.order):
+            pixels = follow_rows(points, cameras)
+            if pixels is None:
+                continue
+            ids = np.full(len(source.ply.gaussians), -1)
+            ids[rows] = pixels
+            layout = dropped_layout(ids, len(cameras), cameras.width, cameras.height)
+            if source.may_be(layout.order):
                 yield [(grid, layout)]
 
 

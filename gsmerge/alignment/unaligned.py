@@ -19,6 +19,8 @@ from gsmerge.types import Cameras, Gaussians
 _FRAME_GAIN = 1.1  # times the score of the cameras as given, for another frame; of as good ones those stay as they are
 _PEAK_GAIN = 1.05  # times that of a scale two steps of the search beside it, for a scale that colours chose
 _SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to see whether cameras see them
+# In other conventions and frames, whose scores differ by 5 % and more where it counts; so many have 0.4 % of noise
+_COMPARED_GAUSSIANS = 5000
 _FEW_GAUSSIANS, _MAX_PROJECTED = 200, 4_000_000  # at least, and times the cameras at most
 _MIN_SEEN = 0.5  # share of them that some camera sees
 _MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, of the foremost ones alone in a frame that colours chose
@@ -79,30 +81,38 @@ def check_cameras(
         some = cameras[first : first + at_once]
         with np.errstate(all="ignore"):
             xy, depth = project_points(points[None], some.viewmats, some.Ks)
-            xy = np.floor(xy)
-        inside = (depth > 0) & (xy >= 0).all(2) & (xy < (cameras.width, cameras.height)).all(2)
+            x, y = np.floor(xy[..., 0]), np.floor(xy[..., 1])
+        inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < cameras.width) & (y < cameras.height)
         visible |= inside.any(0)
         for view in np.flatnonzero(inside.any(1)) if len(images) else ():
-            seen = inside[view]
+            seen = np.flatnonzero(inside[view])
+            column, row = x[view, seen].astype(np.int64), y[view, seen].astype(np.int64)
             if foremost:
-                seen[seen] = _are_foremost(xy[view, seen], depth[view, seen], cameras.width * cameras.height)
-            x, y = xy[view, seen].astype(np.int64).T
-            photo = photo_colors(images, np.full(len(x), first + view), y, x)
+                front = _are_foremost(column, row, depth[view, seen], cameras.width * cameras.height)
+                seen, column, row = seen[front], column[front], row[front]
+            photo = photo_colors(images, np.full(len(seen), first + view), row, column)
             if (photo == photo[:1]).all():  # black, where a view has no photo
                 continue
-            errors.append(np.abs(colors[seen] - photo).mean(1))
-            shuffled_errors.append(np.abs(colors[seen] - rng.permutation(photo)).mean(1))
+            errors.append(_mean_apart(colors[seen], photo))
+            shuffled_errors.append(_mean_apart(colors[seen], rng.permutation(photo)))
     share, ratio = float(visible.sum()) / max(1, len(rows)), np.nan
     if errors and (other := float(np.concatenate(shuffled_errors).mean())) > SAME_COLORS:
         ratio = float(np.concatenate(errors).mean()) / other
     return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > RANDOM_SHARE)
 
 
-def _are_foremost(xy: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
-    """Return which points ``[n]`` at pixels ``xy [n,2]`` are about as near as the nearest point of their cell."""
-    if not len(xy):
+def _mean_apart(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the mean differences ``[n]`` between colours ``[n,3]``."""
+    red, green, blue = np.abs(colors - others).T
+    return np.asarray((red + green + blue) / 3)
+
+
+def _are_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
+    """Return which points ``[n]`` in pixels are about as near as the nearest point of their cell."""
+    if not len(row):
         return np.zeros(0, bool)
-    column, row = (xy // max(1, int(np.sqrt(_PER_CELL * area / len(xy))))).astype(np.int64).T
+    side = max(1, int(np.sqrt(_PER_CELL * area / len(row))))
+    column, row = column // side, row // side
     cells = row * (column.max() + 1) + column
     nearest = np.full(cells.max() + 1, np.inf)
     np.minimum.at(nearest, cells, depth)
@@ -120,7 +130,7 @@ def choose_poses(
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
-        (poses, check_cameras(gaussians, valid, replace(cameras, viewmats=poses.viewmats), images))
+        (poses, check_cameras(gaussians, valid, replace(cameras, viewmats=poses.viewmats), images, _COMPARED_GAUSSIANS))
         for poses in other_conventions(cameras.viewmats, convention)
     ]
     ranked = sorted(candidates, key=lambda candidate: -candidate[1].score)
@@ -209,16 +219,19 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     if not len(inputs.images):
         return None
     frames = [IDENTITY, *_exporter_frames(inputs)]
-    best = _best_frame(inputs, frames)
-    if inputs.scale is None and not _stands_out(inputs, best):
-        best = _best_frame(
-            inputs, [best, *(_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[-1]))]
-        )
+    best, score = _best_frame(inputs, frames)
+    stands_out = _stands_out(inputs, best, score)
+    if inputs.scale is None and not stands_out:
+        solved = (_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[-1]))
+        best, score = _best_frame(inputs, [best, *solved])
+        stands_out = _stands_out(inputs, best, score)
+    if best is IDENTITY or not stands_out:
+        return None
     enough = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
-    return best if _stands_out(inputs, best) and _score_frame(inputs, best) > _FRAME_GAIN * enough else None
+    return best if score > _FRAME_GAIN * enough else None
 
 
-def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _SEEN_GAUSSIANS) -> float:
+def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:
     """Score what the cameras see in a frame; 0 where the photos cannot tell."""
     # the first camera may see all Gaussians at any scale
     seen = slice(1 if len(inputs.cameras) > 1 else 0, None)
@@ -227,15 +240,19 @@ def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _SEEN
     return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
 
 
-def _best_frame(inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _SEEN_GAUSSIANS) -> Similarity:
-    return max(frames, key=lambda frame: _score_frame(inputs, frame, samples))
+def _best_frame(
+    inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _COMPARED_GAUSSIANS
+) -> tuple[Similarity, float]:
+    """Return the frame with the highest score, the first of equal ones, and its score."""
+    scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
+    return max(scored, key=lambda each: each[1])
 
 
-def _stands_out(inputs: AlignmentInput, frame: Similarity) -> bool:
-    """Return whether a frame scores clearly higher than the same frame at nearby scales."""
+def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool:
+    """Return whether the ``score`` of a frame is clearly higher than that of the same frame at nearby scales."""
     away = float(_SCALES[2] / _SCALES[0])
     beside = (_score_frame(inputs, _scaled(frame, factor)) for factor in (1 / away, away))
-    return _score_frame(inputs, frame) > _PEAK_GAIN * max(beside)
+    return all(score > _PEAK_GAIN * other for other in beside)
 
 
 def _scaled(frame: Similarity, factor: float) -> Similarity:
@@ -249,8 +266,8 @@ def _scaled(frame: Similarity, factor: float) -> Similarity:
 
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
     """Find the scale at which the colours are nearest to the photos."""
-    best = _best_frame(inputs, (_scaled(frame, float(scale)) for scale in _SCALES), _SCALE_GAUSSIANS)
+    best, _ = _best_frame(inputs, (_scaled(frame, float(scale)) for scale in _SCALES), _SCALE_GAUSSIANS)
     for reach, steps, samples in _FINER:
         factors = exp(np.linspace(-reach, reach, steps))
-        best = _best_frame(inputs, [_scaled(best, float(factor)) for factor in factors], samples)
+        best, _ = _best_frame(inputs, [_scaled(best, float(factor)) for factor in factors], samples)
     return best

@@ -7,6 +7,7 @@ photo shows the same things, but in other places.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,6 +25,7 @@ DOUBT = 2.0  # standard deviations of noise up to which two scores are one, and 
 ALIKE = 4  # photos most like a view that are compared with it part by part
 FLAT = 1 / 255  # root mean square of a picture's contrast below which it shows nothing to go by: a rounding of 8 bits
 FAR = 1e6  # cost of a pair that cannot be
+TOGETHER = 8  # photos that are compared by one task: what the views show is looked at once for all
 AT_ONCE = 256  # photos of a film that are compared first, at equal distances; then those around the most alike
 
 
@@ -82,8 +84,12 @@ class Assigner:
         """Compare photos with all views."""
         ids = tuple(dict.fromkeys(photos))
         new = [photo for photo in ids if photo not in self._correlations]
-        read, compare = self.candidates.read, self._comparer.correlate
-        self._correlations |= dict(zip(new, parallel_map(lambda photo: compare(read(photo)), new), strict=True))
+
+        def compare(first: int) -> np.ndarray:
+            return self._comparer.correlate([self.candidates.read(photo) for photo in new[first : first + TOGETHER]])
+
+        compared = parallel_map(compare, range(0, len(new), TOGETHER))
+        self._correlations |= dict(zip(new, itertools.chain(*compared), strict=True))
         correlations = np.stack([self._correlations[photo] for photo in ids], 1)
         z = fisher_z(correlations)
         middle, noise = measure_noise(z, self._comparer.least_noise)

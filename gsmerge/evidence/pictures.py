@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.frame import canonicalise
+from gsmerge.frame import Frame, canonicalise
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, shrink_pictures
@@ -20,6 +20,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 SAMPLE_GAUSSIANS = 1 << 17  # Gaussians that are drawn
 SIDE = 96  # pixels of the longer side of pictures that photos are compared with
 LEAST = 1 / 255  # opacity below which a rasterizer draws nothing
+_CANONICAL = Frame(np.zeros(3), 1.0)  # of canonical scenes
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,23 +89,25 @@ def average(pictures: np.ndarray, weights: np.ndarray, small: np.ndarray) -> np.
 
 
 def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
-    """Pair ``photos [v,h,w,3]`` with what a scene's Gaussians show in its views."""
-    shown = show_views(scene)
+    """Pair ``photos [v,h,w,3]`` with what a canonical scene's Gaussians show in its views."""
+    shown = show_views(scene, frame=_CANONICAL)
     if scene.aligned:
         return Pairs(photos[_every(scene.cameras, SIDE)], shown)
     level = max(1.0, max(scene.cameras.width, scene.cameras.height) / SIDE)
     return Pairs(photos_of(photos, scene.cameras, level).images, shown)
 
 
-def show_views(scene: Scene, side: int | None = None, samples: int = SAMPLE_GAUSSIANS) -> ViewPictures:
-    """Make small pictures of what a scene's Gaussians show in its views, in any frame.
+def show_views(
+    scene: Scene, side: int | None = None, samples: int = SAMPLE_GAUSSIANS, frame: Frame | None = None
+) -> ViewPictures:
+    """Make small pictures of what a scene's Gaussians show in its views; its canonical ``frame`` may be known.
 
     Where rows belong to pixels these are the colours of some of them, else drawings of a sample of all Gaussians.
     """
     if scene.aligned:
         return _show_rows(scene, SIDE) if side is None else _show_rows(scene, 2 * side).shrink(side)
     few = Scene(thin_out(scene.finite_gaussians, samples), scene.cameras, None, None, scene.names)
-    canonical, _ = canonicalise(few)
+    canonical, _ = canonicalise(few, frame)
     shown = draw_views(canonical.gaussians, canonical.cameras, side or SIDE)
     inside = pixel_weights(scene.masks, *shown.weights.shape[2:0:-1])
     return shown if inside is None else replace(shown, weights=shown.weights * (inside == 1))

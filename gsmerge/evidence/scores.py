@@ -80,20 +80,25 @@ class Comparer:
         weight = self._small[-1].weights.sum((1, 2), dtype=np.float64)
         return np.asarray(self._upright[-1].lengths / np.sqrt(3 * np.maximum(weight, 1.0)))
 
-    def correlate(self, photo: np.ndarray) -> np.ndarray:
-        """Return the mean correlation ``[v,8]`` over the sizes of a stored photo in each turn; NaN for impossible ones.
+    def correlate(self, photos: Sequence[np.ndarray]) -> np.ndarray:
+        """Return mean correlations ``[p,v,8]`` over the sizes of stored photos in each turn; NaN for impossible ones.
 
         A photo ``[h,w,3]`` is squeezed to the views' shape; it cannot stand where they lie.
         """
-        out = np.full((self.views, TURNS), np.nan)
-        portrait, square = photo.shape[0] > photo.shape[1], photo.shape[0] == photo.shape[1]
-        upright = self._square or square or portrait == self._portrait
-        lying = self._square or square or portrait != self._portrait
-        small = shrink_pictures(photo[None], *fit_size(photo.shape[1::-1], SIZES[-1]))[0]
-        for filters in ([self._upright] if upright else []) + ([self._lying] if lying else []):
-            scores = np.mean([_correlate(small, each) for each in filters], 0)
-            out[:, list(filters[0].turns)] = scores.reshape(self.views, -1)
-        out[self._empty] = np.nan
+        out = np.full((len(photos), self.views, TURNS), np.nan)
+        small = [shrink_pictures(photo[None], *fit_size(photo.shape[1::-1], SIZES[-1]))[0] for photo in photos]
+        shapes = np.array([photo.shape for photo in photos]).reshape(-1, 3)
+        square, portrait = shapes[:, 0] == shapes[:, 1], shapes[:, 0] > shapes[:, 1]
+        upright = self._square | square | (portrait == self._portrait)
+        lying = self._square | square | (portrait != self._portrait)
+        for is_upright, stand in ((True, upright), (False, lying)):
+            ids = np.flatnonzero(stand)
+            if len(ids):
+                filters = self._upright if is_upright else self._lying
+                scores = np.mean([_correlate([small[photo] for photo in ids], each) for each in filters], 0)
+                turns = np.array(filters[0].turns)
+                out[np.ix_(ids, np.arange(self.views), turns)] = scores.reshape(len(ids), self.views, -1)
+        out[:, self._empty] = np.nan
         return out
 
 
@@ -112,12 +117,12 @@ def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
     return _Filters((width, height), turns, np.stack(products), np.stack(weights), np.array(lengths))
 
 
-def _correlate(photo: np.ndarray, filters: _Filters) -> np.ndarray:
-    """Correlate a photo's contrast with pictures that are turned as it is, ``[v·t]``."""
-    contrast = find_contrast(shrink_pictures(photo[None], *filters.size)[0])
-    products = matmul(filters.products, contrast.reshape(-1, 1))[:, 0]
-    squares = matmul(filters.weights, (contrast * contrast).sum(-1).reshape(-1, 1))[:, 0]
-    return np.asarray(products / np.sqrt(np.maximum(squares, 1e-12)))
+def _correlate(photos: Sequence[np.ndarray], filters: _Filters) -> np.ndarray:
+    """Correlate photos' contrast with pictures that are turned as they are, ``[p,v·t]``."""
+    contrast = np.stack([find_contrast(shrink_pictures(photo[None], *filters.size)[0]) for photo in photos])
+    products = matmul(filters.products, contrast.reshape(len(photos), -1).T)
+    squares = matmul(filters.weights, (contrast * contrast).sum(-1).reshape(len(photos), -1).T)
+    return np.asarray(products / np.sqrt(np.maximum(squares, 1e-12))).T
 
 
 def measure_noise(z_scores: np.ndarray, least: float) -> tuple[np.ndarray, float]:

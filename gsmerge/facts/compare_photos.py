@@ -26,7 +26,7 @@ from gsmerge.evidence.colors import (
     plain_blocks,
     tone_blocks,
 )
-from gsmerge.evidence.pictures import Pairs, pair_photos, show_views
+from gsmerge.evidence.pictures import SIDE, Pairs, ViewPictures, pair_photos, show_views
 from gsmerge.evidence.scores import MARGIN, signed_ranks
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
@@ -60,7 +60,7 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     order = find_orders(pairs, given)
     pairs = pairs.with_photos(np.where(order[:, None, None, None], pairs.photos[..., ::-1], pairs.photos))
     images = [photo[..., ::-1] if wrong else photo for photo, wrong in zip(scene.images, order, strict=True)]
-    right = find_matching_views(scene, given, images)
+    right = find_matching_views(scene, given, images, pairs.shown)
     if _has_other_look(scene, pairs, right or given, images):
         problem = "the scene has another look than its photos: its own colours are kept"
         note(f"{problem}; --set look=photos gives it that of the photos")
@@ -129,15 +129,22 @@ def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
     return [list(views)] if pairs.shown.drawn else [[view] for view in views]
 
 
-def find_matching_views(scene: PicturedScene, views: Sequence[int], photos: Sequence[np.ndarray]) -> list[int]:
+def find_matching_views(
+    scene: PicturedScene, views: Sequence[int], photos: Sequence[np.ndarray], shown: ViewPictures
+) -> list[int]:
     """Find which of some views their ``photos [h,w,3]`` show; see :mod:`gsmerge.evidence.assign`.
 
-    None where all together are no more alike than wrong pairs. Layers of one camera have one photo.
+    None where all together are no more alike than wrong pairs. Layers of one camera have one photo. ``shown``:
+    small pictures of what the Gaussians show in all views; drawings serve again.
     """
     kinds = camera_kinds(scene.cameras)
     ids = sorted({kinds[view]: view for view in reversed(views)}.values())
     candidates = Candidates(lambda photo: photos[ids[photo]], len(ids), [0] * len(ids))
-    assigner = Assigner(lambda side: show_views(scene, side)[ids], candidates)
+
+    def show(side: int) -> ViewPictures:
+        return (shown.shrink(side) if shown.drawn and side <= SIDE else show_views(scene, side))[ids]
+
+    assigner = Assigner(show, candidates)
     chosen, _ = assigner.confirm(range(len(ids)), exact=True)
     if not assigner.stand_together(chosen):
         return []
@@ -157,8 +164,9 @@ def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int], ph
         blocks = cut_blocks(part)
         solid = blocks.solid
         matrix = fit_map(blocks.photos[solid], blocks.pictures[solid], np.ones(solid.sum()))
-        return bool(find_matching_views(scene, views, [map_colors(matrix, photo).clip(0, 1) for photo in photos]))
-    return _is_mapped(part.exchange()) and bool(find_matching_views(scene, views, photos))
+        mapped = [map_colors(matrix, photo).clip(0, 1) for photo in photos]
+        return bool(find_matching_views(scene, views, mapped, pairs.shown))
+    return _is_mapped(part.exchange()) and bool(find_matching_views(scene, views, photos, pairs.shown))
 
 
 def _is_mapped(pairs: Pairs) -> bool:

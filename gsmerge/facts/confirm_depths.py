@@ -85,7 +85,7 @@ def confirm_depths(scene: Scene) -> Agreement | None:
     views = len(scene)
     if not scene.aligned or views < 2 or not scene.valid.any():
         return None
-    means, centres = scene.gaussians.means.reshape(views, -1, 3), scene.cameras.centres
+    means, centres = scene.gaussians.means, scene.cameras.centres
     cameras, valid = scene.cameras, scene.valid.reshape(views, -1)
     width, height = cameras.width, cameras.height
     reach = max(PIXELS, REACH * max(width, height))
@@ -93,23 +93,27 @@ def confirm_depths(scene: Scene) -> Agreement | None:
     def count(view: int) -> np.ndarray:
         rows = np.flatnonzero(valid[view])
         rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), SAMPLE_PIXELS))]
-        points, pixels = means[view, rows].astype(np.float64), np.stack([rows % width, rows // width], 1) + 0.5
+        points, pixels = (
+            means[view * width * height + rows].astype(np.float64),
+            np.stack([rows % width, rows // width], 1) + 0.5,
+        )
         others = nearest_views(centres, view)[:NEIGHBORS]
         places, depths = project(points, cameras[others])
-        inside = (depths > TINY) & (places > 0).all(2) & (places < (width, height)).all(2)
-        same, through = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.int64)
-        for other, place, depth, seen in zip(others, places, depths, inside, strict=True):
-            column, row = place[seen].astype(np.int64).T
-            there = row * width + column
-            known = valid[other, there]
-            ids, there = np.flatnonzero(seen)[known], there[known]
-            surface = means[other, there].astype(np.float64)
-            (back,), (ahead,) = project(surface, cameras[[view]])
-            away = np.where(ahead > TINY, np.sqrt(((back - pixels[ids]) ** 2).sum(1)), np.inf) / reach
-            behind = log(depth[ids] / np.maximum(camera_depths(surface, cameras.viewmats[other]), TINY))
-            agrees = (away < 1) & (np.abs(behind) < SAME)
-            same[ids] += agrees
-            through[ids] += ~agrees & ((behind < -2 * SAME) | ((behind < 0) & (away > 2)))
+        x, y = places[..., 0], places[..., 1]
+        inside = (depths > TINY) & (x > 0) & (y > 0) & (x < width) & (y < height)
+        number, ids = np.nonzero(inside)  # of the other view, and the pixel that it sees
+        column, row = x[number, ids].astype(np.int64), y[number, ids].astype(np.int64)
+        there, other = row * width + column, others[number]
+        known = valid[other, there]
+        number, ids, there, other = number[known], ids[known], there[known], other[known]
+        surface = means.take(other * width * height + there, 0).astype(np.float64)
+        (back,), (ahead,) = project(surface, cameras[[view]])
+        right, down = (back - pixels[ids]).T
+        away = np.where(ahead > TINY, np.sqrt(right * right + down * down), np.inf) / reach
+        behind = log(depths[number, ids] / np.maximum(camera_depths(surface, cameras.viewmats[other]), TINY))
+        agrees = (away < 1) & (np.abs(behind) < SAME)
+        sees_through = ~agrees & ((behind < -2 * SAME) | ((behind < 0) & (away > 2)))
+        same, through = (np.bincount(ids[each], minlength=len(rows)) for each in (agrees, sees_through))
         kinds = (same > 0) & (same >= through), through > same, ~inside.any(0)
         thirds = np.stack([3 * (rows % width) // width, 3 * (rows // width) // height])
         within = [

@@ -50,7 +50,7 @@ UNEXPECTED = 0.69
 COARSE = 4  # pixels per side of those that one says the brightness of
 BRIGHT = 1.15  # gain from which on clipped pixels no longer count
 NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
-NEAREST, FARTHER = 24, 8  # views that one is compared with: of all others the nearest, and some at equal steps of rank
+NEAREST, FARTHER = 6, 2  # views that one is compared with: of all others the nearest, and some at equal steps of rank
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ the view's farthest surface: the depth at which the pictures of the nearest othe
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,12 +16,14 @@ import numpy as np
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import fill_gaps
 from gsmerge.geometry import nearest_views, rgb_to_sh0
+from gsmerge.kernels.compare_views import add_differences
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
 from gsmerge.raster import TiledView
 from gsmerge.raster.composite import blend_depths
 from gsmerge.raster.images import tile_views
 from gsmerge.runtime.record import note
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, PicturedScene, grid_ids
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
@@ -56,10 +58,10 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     cut: Iterable[np.ndarray] = [] if everywhere or not scene.aligned else bare
     if not (free.any() or any(large_parts(view).any() for view in cut if view.any())):
         return scene
-    holes, empty, parts = np.zeros_like(free), np.zeros_like(free), dict[int, Gaussians]()
+    holes, empty, edges = np.zeros_like(free), np.zeros_like(free), dict[int, _Edges]()
     gap = 2 * round(GAP * max(shown.shape[1:]) / 2) + 1
 
-    def fill(view: int, tiled: TiledView) -> None:
+    def find(view: int, tiled: TiledView) -> None:
         depths, left = blend_depths(tiled)
         covered = left <= 1 - EMPTY
         if not everywhere:
@@ -72,22 +74,32 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             around = np.ones((gap, gap), np.uint8)
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, around) > 0
         if covered.any() and holes[view].any():
-            parts[view] = _fill_view(scene, view, holes[view], covered, depths)
+            beside = fill_gaps(depths[..., None], covered)[..., 0][holes[view]]
+            edges[view] = _Edges(beside, float(np.quantile(depths[covered], FARTHEST)))
 
-    tile_views(scene, fill)
+    tile_views(scene, find)
     filled = scene
-    if parts and (scene.aligned or np.count_nonzero(holes) < MOST * np.count_nonzero(shown)):
-        filled = _add_holes(scene, holes, parts)
+    if edges and (scene.aligned or np.count_nonzero(holes) < MOST * np.count_nonzero(shown)):
+        filled = _add_holes(scene, holes, edges)
     return _leave_empty(filled, empty)
 
 
-def _add_holes(scene: PicturedScene, holes: np.ndarray, parts: Mapping[int, Gaussians]) -> PicturedScene:
-    """Add the Gaussians ``parts`` of each view's ``holes [v,h,w]`` to a scene, with a note."""
-    added = Gaussians.concat([parts[view] for view in sorted(parts)])
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Depths in a view around its n holes."""
+
+    beside: np.ndarray  # [n] of the surface beside each
+    farthest: float  # of the view's farthest surface
+
+
+def _add_holes(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edges]) -> PicturedScene:
+    """Add Gaussians to a scene in the ``holes [v,h,w]`` of views with ``edges``, with a note."""
+    views = sorted(edges)
+    added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), views))
     note(f"{len(added):,} pixels that Gaussians hardly cover, or not at all, get the colours of their pictures")
     if not scene.aligned:
         return replace(scene, gaussians=Gaussians.concat([scene.gaussians, added]))
-    holes[[view for view in range(len(scene)) if view not in parts]] = False
+    holes[[view for view in range(len(scene)) if view not in edges]] = False
     columns = {name: values.copy() for name, values in vars(scene.gaussians).items()}
     for name, values in vars(added).items():
         columns[name][holes.reshape(-1)] = values
@@ -133,16 +145,13 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
     return replace(scene, images=images, masks=masks, large_photos=large, empty=empty)
 
 
-def _fill_view(
-    scene: PicturedScene, view: int, holes: np.ndarray, covered: np.ndarray, depths: np.ndarray
-) -> Gaussians:
-    """Make a Gaussian for each of a view's ``holes [h,w]``, given ``depths [h,w]`` where it is ``covered [h,w]``."""
+def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges) -> Gaussians:
+    """Make a Gaussian for each of a view's ``holes [h,w]``."""
     cameras, shN = scene.cameras, scene.gaussians.shN
     y, x = np.nonzero(holes)
     pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
     rays = matmul(matmul(pixels, invert(cameras.Ks[view]).T), cameras.viewmats[view, :3, :3])  # to depth 1
-    beside = fill_gaps(depths[..., None], covered)[..., 0][holes].astype(np.float64)
-    beyond = float(np.quantile(depths[covered], FARTHEST)) * FACTORS[:, None]
+    beside, beyond = edges.beside.astype(np.float64), edges.farthest * FACTORS[:, None]
     tried = np.concatenate([beside[None], np.maximum(beyond, beside)])
     depth = _agreeing(scene, view, holes, rays, tried)
     eye, size = cameras.centres[view], SIZE / cameras.Ks[view, 0, 0]
@@ -174,24 +183,15 @@ def _agreeing(scene: PicturedScene, view: int, holes: np.ndarray, rays: np.ndarr
     for other in others:
         K, (turn, shift) = cameras.Ks[other], np.split(cameras.viewmats[other, :3], [3], 1)
         start = matmul(K, matmul(turn, centres[view]) + shift[:, 0])
-        moves.append((scene.images[other], matmul(matmul(rays, turn.T), K.T).T.copy(), start))
-    colors, size = scene.images[view][holes], np.array([[cameras.width], [cameras.height]])
-    chosen, least = depths[0].copy(), np.full(len(rays), np.inf)
+        along = np.ascontiguousarray(matmul(matmul(rays, turn.T), K.T).T)
+        moves.append((scene.images[other], along, start))
+    colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
+    chosen, least = depths[0], np.full(len(rays), np.inf, np.float32)
     for step, depth in enumerate(depths):
-        sums = np.zeros((2, len(rays)), np.float32)  # of differences, and their number
-        for image, along, start in moves:
-            x, y, z = along * depth + start[:, None]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                place = np.floor(np.stack([x, y]) / z)
-            seen = np.flatnonzero((z > 0) & ((place >= 0) & (place < size)).all(0))
-            column, row = place[:, seen].astype(np.int64)
-            apart = np.abs(image[row, column] - colors[seen])
-            sums[0, seen] += (apart[:, 0] + apart[:, 1] + apart[:, 2]) / 3
-            sums[1, seen] += 1
-        pictures = np.zeros((*holes.shape, 2), np.float32)
-        pictures[holes] = sums.T
-        total, number = blur(pictures, BLUR)[holes].T
+        sums = np.zeros((*holes.shape, 2), np.float32)  # of differences, and their number
+        for picture, along, start in moves:
+            add_differences(picture, along, start, depth, colors, pixels, sums)
+        total, number = blur(sums, BLUR).reshape(-1, 2)[pixels].T
         cost = np.where(number > LEAST, total / np.maximum(number, LEAST), np.inf) + FARTHER * step
-        better = cost < least
-        chosen[better], least[better] = depth[better], cost[better]
+        chosen, least = np.where(cost < least, depth, chosen), np.minimum(cost, least)
     return chosen

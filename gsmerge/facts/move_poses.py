@@ -101,15 +101,13 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
     """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours that see most of it."""
     cameras, means = scene.cameras, scene.gaussians.means.reshape(len(scene), -1, 3)
     step = max(1, scene.pixels_per_view // OVERLAP_PIXELS)
-    size, pairs, chosen = np.array([cameras.width, cameras.height]), set(), set(views)
+    pairs, chosen = set(), set(views)
     for view in views:
         xyz = means[view, ::step][scene.valid[view].reshape(-1)[::step]]
         pixels, z = project(xyz, cameras)
-        seen = (
-            ((z > NEAR_PLANE) & (pixels > 0).all(-1) & (pixels < size).all(-1)).mean(1)
-            if len(xyz)
-            else np.zeros(len(z))
-        )
+        x, y = pixels[..., 0], pixels[..., 1]
+        inside = (z > NEAR_PLANE) & (x > 0) & (y > 0) & (x < cameras.width) & (y < cameras.height)
+        seen = inside.mean(1) if len(xyz) else np.zeros(len(z))
         overlap = seen * matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3]).clip(0)
         ranked = [int(other) for other in np.argsort(-overlap, kind="stable") if other != view and other in chosen]
         for other in ranked[:NEIGHBOURS]:

@@ -155,3 +155,25 @@ API int64_t find_surfaces(const float *means, const int64_t *rows, const float *
   }
   return count;
 }
+
+// Adds to `sums` at some pixels how far their colours are from those of the picture [h,w,3], and one, where a camera
+// shows them in it: at `start` and `depths` times `along`, columns, rows and depths one array after the other.
+API int32_t add_differences(const float *picture, const double *along, const double *start, const double *depths,
+                            const float *colors, const int64_t *pixels, float *sums, int64_t h, int64_t w, int64_t n,
+                            int64_t height, int64_t width) {
+  for (int64_t i = 0; i < n; i++) {
+    if ((uint64_t)pixels[i] >= (uint64_t)(height * width)) return OUTSIDE;
+    double place[3];
+    for (int c = 0; c < 3; c++) {
+      double way = along[c * n + i] * depths[i];
+      place[c] = way + start[c];
+    }
+    double u = place[0] / place[2], v = place[1] / place[2];
+    if (!(place[2] > 0.0 && u >= 0.0 && u < (double)w && v >= 0.0 && v < (double)h)) continue;
+    const float *there = picture + 3 * ((int64_t)v * w + (int64_t)u), *here = colors + 3 * i;
+    float red = absf4(there[0] - here[0]), green = absf4(there[1] - here[1]), blue = absf4(there[2] - here[2]);
+    sums[2 * pixels[i]] += (red + green + blue) / 3.0f;
+    sums[2 * pixels[i] + 1] += 1.0f;
+  }
+  return 0;
+}

@@ -52,3 +52,15 @@ def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
     ids, places = np.empty((2, len(rows)), np.int64)
     count = _find_surfaces(means, rows, others, valid.view(np.uint8), viewmat, K, width, near, same, ids, places)
     return ids[:count], places[:count]
+
+
+@native(
+    STATUS, picture=f4("h", "w", 3), along=f8(3, "n"), start=f8(3), depths=f8("n"), colors=f4("n", 3), pixels=i8("n"),
+    sums=f4("height", "width", 2, out=True),
+)  # fmt: skip
+def add_differences(picture, along, start, depths, colors, pixels, sums):
+    """Add to ``sums`` at some ``pixels`` how far their ``colors`` are from a picture, and one, where it shows them.
+
+    Points lie at ``start`` and ``depths`` times ``along`` in a camera whose intrinsics are applied: columns, rows and
+    depths, one array after the other.
+    """

@@ -137,8 +137,9 @@ def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
     y, x = np.divmod(np.arange(height * width), width)
     sizes = np.maximum(np.bincount(flat, minlength=count), 1)
     dy, dx = (axis - (np.bincount(flat, axis, count) / sizes)[flat] for axis in (y, x))
-    order = np.lexsort((dx * dx + dy * dy, flat))
-    present, at = np.unique(flat[order], return_index=True)
+    away, least = dx * dx + dy * dy, np.full(count, np.inf)
+    np.minimum.at(least, flat, away)
+    nearest = np.flatnonzero(away == least[flat])[::-1]  # the first pixel of equal ones is written last
     middles = np.zeros(count, np.int64)
-    middles[present] = order[at]
+    middles[flat[nearest]] = nearest
     return middles

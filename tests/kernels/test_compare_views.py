@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsmerge.geometry import camera_depths, motion_matrices, project_points
-from gsmerge.kernels.compare_views import COLUMNS, compare_views, find_surfaces
+from gsmerge.kernels.compare_views import COLUMNS, add_differences, compare_views, find_surfaces
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import sample_bilinear
@@ -119,3 +119,26 @@ def test_surfaces_are_those_of_the_formula(seed: int) -> None:
     assert 20 < len(ids) < pixels // 3
     with pytest.raises(ValueError, match="find_surfaces"):
         find_surfaces(means, rows + pixels, others, valid, viewmat, K, WIDTH, NEAR, 0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_differences_are_those_of_the_formula_bit_for_bit(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    picture, colors = rng.random((HEIGHT, WIDTH, 3), np.float32), rng.random((POINTS, 3), np.float32)
+    pixels = rng.permutation(HEIGHT * WIDTH)[:POINTS]
+    along, start = rng.normal((0, 0, 1), (9, 7, 0.5), (POINTS, 3)).T.copy(), np.array([20.0, 15, 0.3])
+    depths, before = rng.uniform(0.5, 2, POINTS), rng.random((HEIGHT, WIDTH, 2), np.float32)
+    before.reshape(-1, 2)[pixels[:9]] = np.nan
+    sums = before.copy()
+    add_differences(picture, along, start, depths, colors, pixels, sums)
+    x, y, z = along * depths + start[:, None]
+    column, row = np.floor(x / z), np.floor(y / z)
+    seen = (z > 0) & (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
+    apart = np.abs(picture[row[seen].astype(int), column[seen].astype(int)] - colors[seen])
+    expected = before.copy()
+    expected.reshape(-1, 2)[pixels[seen], 0] += (apart[:, 0] + apart[:, 1] + apart[:, 2]) / 3
+    expected.reshape(-1, 2)[pixels[seen], 1] += 1
+    assert np.array_equal(sums, expected, equal_nan=True)
+    assert 50 < seen.sum() < POINTS - 50
+    with pytest.raises(ValueError, match="add_differences"):
+        add_differences(picture, along, start, depths, colors, pixels + HEIGHT * WIDTH, sums)

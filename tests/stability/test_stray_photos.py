@@ -13,6 +13,7 @@ from messages import noted, says
 from sweeps import sweep
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
+from gsmerge.evidence.pictures import show_views
 from gsmerge.facts.compare_photos import compare_photos, find_matching_views
 from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.fit import FitOptions, fit_photos
@@ -92,7 +93,9 @@ def with_photos(room: Scene, change: Callable[[Photos], Photos], *, aligned: boo
 def odd_photos(room: Scene, change: Callable[[Photos], Photos]) -> list[int]:
     scene, _ = canonicalise(with_photos(room, change, aligned=False))
     pictured = PicturedScene.of(scene, scene.images, None)
-    return sorted({*range(len(scene))} - {*find_matching_views(pictured, range(len(scene)), scene.images)})
+    return sorted(
+        {*range(len(scene))} - {*find_matching_views(pictured, range(len(scene)), scene.images, show_views(pictured))}
+    )
 
 
 def novel_psnr(gaussians: Gaussians) -> float:

@@ -46,7 +46,7 @@ def test_correlations_are_those_of_upright_photos(turn: int) -> None:
     weights = np.ones(views.shape[:3], np.float32)
     weights[0, :60] = 0.2
     shown, photos = show(views, 256, weights), take_photos(views)
-    actual = Comparer(shown).correlate(np.ascontiguousarray(turn_back(photos[1], turn)))
+    actual = Comparer(shown).correlate([np.ascontiguousarray(turn_back(photos[1], turn))])[0]
     for view in range(2):
         expected = correlate_slowly(shown, view, np.ascontiguousarray(photos[1]))
         assert actual[view, turn] == pytest.approx(expected, abs=1e-5)
@@ -54,7 +54,9 @@ def test_correlations_are_those_of_upright_photos(turn: int) -> None:
 
 
 def test_a_photo_that_lies_can_only_stand_turned() -> None:
-    scores = Comparer(show(cut_views(2), 256)).correlate(np.ascontiguousarray(np.rot90(take_photos(cut_views(2))[0])))
+    scores = Comparer(show(cut_views(2), 256)).correlate(
+        [np.ascontiguousarray(np.rot90(take_photos(cut_views(2))[0]))]
+    )[0]
     assert np.isnan(scores[:, [0, 2, 4, 6]]).all()
     assert np.isfinite(scores[:, [1, 3, 5, 7]]).all()
     turn = int(np.nanargmax(scores[0]))
@@ -67,13 +69,15 @@ def test_transparency_changes_no_score() -> None:
     views = cut_views(2)
     faint = show(views, 256, np.full(views.shape[:3], 0.05, np.float32))
     photo = take_photos(views)[0]
-    np.testing.assert_allclose(Comparer(faint).correlate(photo), Comparer(show(views, 256)).correlate(photo), atol=1e-4)
+    np.testing.assert_allclose(
+        Comparer(faint).correlate([photo]), Comparer(show(views, 256)).correlate([photo]), atol=1e-4
+    )
 
 
 def test_views_that_show_nothing_have_no_score() -> None:
     views, weights = cut_views(2), np.ones((2, 192, 256), np.float32)
     weights[1] = 0
-    scores = Comparer(show(views, 256, weights)).correlate(take_photos(views)[0])
+    scores = Comparer(show(views, 256, weights)).correlate(take_photos(views)[:1])[0]
     assert np.isnan(scores[1]).all()
     middle, noise = measure_noise(fisher_z(scores)[:, None], 0.01)
     assert np.isfinite(middle).all()
