@@ -72,16 +72,17 @@ def expected_errors(witnesses: Witnesses, camera: Cameras, own: int | None = Non
     y, x = np.nonzero(depth > 0)
     points = lift_pixels(depth, depth > 0, camera)
     sums, counts = np.zeros((2, len(points)), np.float32)
-    for other in _nearest(witnesses.views.cameras, camera, own):
-        cameras = witnesses.views.cameras[[other]]
-        ((pixels,), (z,)), size = project(points, cameras), np.array([cameras.width, cameras.height])
-        seen = np.flatnonzero((counts < COUNTED) & (z > 0) & ((pixels >= 0) & (pixels < size)).all(1))
+    open_rows, small = np.arange(len(points)), witnesses.views.cameras
+    for other in _nearest(small, camera, own):
+        (pixels,), (z,) = project(points[open_rows], small[[other]])
+        seen = np.flatnonzero((z > 0) & ((pixels >= 0) & (pixels < (small.width, small.height))).all(1))
         column, row = pixels[seen].astype(np.int64).T
         shown = z[seen] < BEHIND * witnesses.look(other)[1][row, column]
         seen = seen[shown if witnesses.masks is None else shown & witnesses.masks[other, row, column]]
-        there = sample_bilinear(witnesses.views.images[other], *(pixels[seen].T - 0.5))
-        sums[seen] += np.abs(there - image[y[seen], x[seen]]).mean(1)
-        counts[seen] += 1
+        there, rows = sample_bilinear(witnesses.views.images[other], *(pixels[seen].T - 0.5)), open_rows[seen]
+        sums[rows] += np.abs(there - image[y[rows], x[rows]]).mean(1)
+        counts[rows] += 1
+        open_rows = open_rows[counts[open_rows] < COUNTED]
     errors = np.zeros((*depth.shape, 2), np.float32)
     errors[y, x, 0], errors[y, x, 1] = sums / np.maximum(counts, 1), counts > 0
     known = errors[..., 1] > 0

@@ -68,7 +68,7 @@ def draw_masks(
 ) -> bytes | None:
     """Draw ``masks [n]``, at most three, in the ``colors`` of their words, each as opaque as its share of a pixel.
 
-    Returns a WebP; None if nothing is seen.
+    Returns a PNG; None if nothing is seen.
     """
     if not masks:
         return None
@@ -77,6 +77,6 @@ def draw_masks(
     marked = replace(gaussians, sh0=rgb_to_sh0(flags)[:, None], shN=gaussians.shN[:, :0])
     shares = render(marked, camera, near=near).images[0][..., : len(colors)]
     steps = np.ceil(STEPS * shares.max(2).clip(0, 1)).astype(np.uint8)
-    ids = np.where(shares.max(2) >= VISIBLE, STEPS * shares.argmax(2) + steps, 0)
+    ids = np.where(shares.max(2) >= VISIBLE, STEPS * shares.argmax(2) + steps, 0).astype(np.uint8)
     tints = [(*color, MOST_ALPHA * step // STEPS) for color in colors.values() for step in range(1, STEPS + 1)]
     return encode_indexed(ids, np.array([(0, 0, 0, 0), *tints], np.uint8)) if ids.any() else None
