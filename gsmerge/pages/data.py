@@ -28,9 +28,9 @@ from gsmerge.measure.evaluate import (
 )
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, draw_borders, mean_colors, to_picture
-from gsmerge.pages.marks import DROPS, SEEN, Marks, draw_masks, find_marks
+from gsmerge.pages.marks import Marks, draw_marks, find_marks
 from gsmerge.pages.splats import MAX_GAUSSIANS, drawn_rows, highest_degree, pack_splats, pack_support
-from gsmerge.raster import render
+from gsmerge.raster import Splats, make_splats, render
 from gsmerge.raster.photos import WHOLE
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import SegmentOptions
@@ -208,14 +208,10 @@ def page_data(
         name: call_witnesses(entered[name], Views(moved.get(name, placed), pictures, scene.names), scene.masks)
         for name in (looked_at if len(pictures) > 1 else ())
     }
+    splats = {name: make_splats(entered[name]) for name in looked_at}
+    shown = tuple(replace(view, maps=tuple(_map(witnesses.get(name), view) for name in named)) for view in shown)
     *drawn, outside = (
-        replace(
-            view,
-            maps=() if view.outside else tuple(_map(witnesses.get(name), view) for name in named),
-            drops=tuple(draw_masks(entered[name], marks[name].drops, DROPS, view.camera, near) for name in named),
-            seen=tuple(draw_masks(entered[name], marks[name].seen, SEEN, view.camera, near) for name in named),
-        )
-        for view in (*shown, _outside_view(scene, named, frame, len(views)))
+        _with_marks(view, splats, marks, near) for view in (*shown, _outside_view(scene, named, frame, len(views)))
     )
     faint = (marks[name].fade(gaussians) for name, gaussians in entered.items())
     faded = (None if g is None else render(g, outside.camera, near=near).images[0] for g in faint)
@@ -228,6 +224,16 @@ def page_data(
         title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
         lacks_pixels, confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=placed)),
     )  # fmt: skip
+
+
+def _with_marks(view: PageView, splats: Mapping[str, Splats], marks: Mapping[str, Marks], near: float) -> PageView:
+    """Add to a view what is marked of each side."""
+    drawn = [
+        draw_marks(splats[name], of, view.camera, near) if name in splats else (None, None)
+        for name, of in marks.items()
+    ]
+    drops, seen = zip(*drawn, strict=True)
+    return replace(view, drops=drops, seen=seen)
 
 
 def _page_views(
@@ -310,10 +316,9 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     light = means.mean(1, keepdims=True) > 0.5
     shifted = means + OUTLINE_SHIFT * (np.where(light, 0.0, 1.0) - means)
     levels = np.round((OUTLINE_LEVELS - 1) * shifted) * (255 // (OUTLINE_LEVELS - 1))
-    colors, ids = np.unique(levels.astype(np.uint8), axis=0, return_inverse=True)
-    ids = 1 + ids.reshape(-1).astype(np.uint8)
-    factor = max(1, OUTLINE_SIDE // max(labels.shape))
-    return encode_indexed(draw_borders(labels, ids, factor), np.pad(colors, ((1, 0), (0, 0))))
+    colors, places = np.unique(levels.astype(np.uint8), axis=0, return_inverse=True)
+    drawn = draw_borders(labels, 1 + places.reshape(-1).astype(np.uint8), max(1, OUTLINE_SIDE // max(labels.shape)))
+    return encode_indexed(drawn, np.pad(colors, ((1, 0), (0, 0))))
 
 
 def _map(witnesses: Witnesses | None, view: PageView) -> bytes | None:
