@@ -15,7 +15,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frame import scene_frame
-from gsmerge.geometry import project
+from gsmerge.geometry import is_inside, project
 from gsmerge.kernels.pictures import blur, sample_bilinear
 from gsmerge.measure.preview import Picture, contact_sheet, to_picture
 from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
@@ -75,7 +75,7 @@ def expected_errors(witnesses: Witnesses, camera: Cameras, own: int | None = Non
     open_rows, small = np.arange(len(points)), witnesses.views.cameras
     for other in _nearest(small, camera, own):
         (pixels,), (z,) = project(points[open_rows], small[[other]])
-        seen = np.flatnonzero((z > 0) & ((pixels >= 0) & (pixels < (small.width, small.height))).all(1))
+        seen = np.flatnonzero((z > 0) & is_inside(pixels, small))
         column, row = pixels[seen].astype(np.int64).T
         shown = z[seen] < BEHIND * witnesses.look(other)[1][row, column]
         seen = seen[shown if witnesses.masks is None else shown & witnesses.masks[other, row, column]]

@@ -190,7 +190,7 @@ def _bin(
 ) -> tuple[Array, Array]:
     """Return the tile lists and their starts."""
     # One gather in advance, 8 bytes a box: in the loops below every miss would be paid in full.
-    boxes = boxes.view(np.uint64)[order, 0].view(np.int16).reshape(-1, 4)
+    boxes = boxes.view(np.uint64).reshape(-1).take(order).view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], tile_height, tile_width), spans))
     if counts.sum() > max(MANY, MANY_EACH * len(order)):
