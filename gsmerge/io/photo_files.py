@@ -483,6 +483,8 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
 def encode_picture(picture: np.ndarray, quality: int) -> bytes:
     """Encode a picture ``[h,w,3]`` uint8 sRGB as a WebP of a ``quality`` up to 100."""
+    from PIL import WebPImagePlugin  # noqa: F401 - Pillow imports those of all formats where it lacks one
+
     content = io.BytesIO()
     Image.fromarray(picture).save(content, "WEBP", quality=quality, method=_EFFORT)
     return content.getvalue()

@@ -189,6 +189,7 @@ def page_data(
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
     entered = {name: frame.enter(gaussians) for name, gaussians in named.items()}
+    whole = entered[INPUT] if scene.missing is None else frame.enter(scene.gaussians)
     placed = frame.enter_cameras(scene.cameras.numpy())
     looked_at = [name for name in named if name != INPUT or not results]
     photos = pictures if len(pictures) else None
@@ -222,7 +223,7 @@ def page_data(
     lacks_pixels = share is not None and share < WHOLE
     return ViewData(
         title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
-        lacks_pixels, confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=placed)),
+        lacks_pixels, confirm_depths(replace(scene, gaussians=whole, cameras=placed)),
     )  # fmt: skip
 
 
