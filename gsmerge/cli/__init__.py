@@ -67,7 +67,7 @@ def _open_streams() -> None:
 
 
 def _keep_memory() -> None:
-    """Let arrays take the places of those that went before, where the C library is told so."""
+    """Let arrays take the places of those that went before, where the C library can."""
     import ctypes
 
     with suppress(AttributeError, OSError, TypeError):  # another C library
