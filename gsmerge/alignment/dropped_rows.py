@@ -106,9 +106,9 @@ def _find_lengths(points: np.ndarray) -> list[tuple[int, int]]:
     """
     most = min(_MAX_WIDTH, len(points) // 4)
     starts = np.linspace(0, len(points) - most - 1, _LOOKED_AT).astype(int)
-    near = points.astype(np.float32)
+    near = np.ascontiguousarray(points.T, np.float32)  # axes first: NumPy adds up short rows slowly
     lags = [
-        _MIN_SIDE + int(np.argmin(((near[start + _MIN_SIDE : start + most] - near[start]) ** 2).sum(1)))
+        _MIN_SIDE + int(np.argmin(((near[:, start + _MIN_SIDE : start + most] - near[:, [start]]) ** 2).sum(0)))
         for start in starts
     ]
     counts = np.bincount(lags, minlength=2 * most)
