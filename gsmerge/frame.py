@@ -35,7 +35,8 @@ class Frame:
 
         def fill(first: int) -> None:
             rows = slice(first, first + ROWS)
-            means[rows] = (gaussians.means[rows] - self.origin) / self.unit
+            for axis, start in enumerate(self.origin):  # axis by axis NumPy takes half the time
+                means[rows, axis] = (gaussians.means[rows, axis] - start) / self.unit
             np.divide(gaussians.scales[rows], self.unit, out=scales[rows])
 
         parallel_map(fill, range(0, len(gaussians), ROWS))

@@ -96,6 +96,12 @@ def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> 
     return image[..., :2] / image[..., 2:], camera[..., 2]
 
 
+def is_inside(pixels: np.ndarray, cameras: Cameras) -> np.ndarray:
+    """Return a mask ``[...]`` of the positions ``[...,2]``, in pixels, that lie in the cameras' pictures."""
+    column, row = pixels[..., 0], pixels[..., 1]
+    return np.asarray((column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height))
+
+
 def camera_depths(points: np.ndarray, viewmats: np.ndarray) -> np.ndarray:
     """Return the depths ``[...]`` along z of points ``[...,3]`` in cameras ``[...,4,4]``, world to camera."""
     (x, y, z), (a, b, c, d) = np.moveaxis(points, -1, 0), np.moveaxis(viewmats[..., 2, :], -1, 0)

@@ -51,7 +51,7 @@ def view(args: opt.Args) -> None:
         pair = read_before_after(args, files)
         say_notes(pair.notes, quiet=args.silent)
         sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
-        results, cameras, gains, more = _compact_sizes(pair, args.sizes or (), progress)
+        results, cameras, gains, more = _compact_sizes(pair, args.sizes, progress) if args.sizes else ({}, {}, {}, [])
         data = collect(
             pair.title, pair.scene, pair.gaussians | results, [*sizes, *more], pair.held_out,
             cameras=pair.cameras | cameras, new_gains=file_gains(pair.plys) | gains, light=args.light,

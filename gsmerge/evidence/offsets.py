@@ -92,6 +92,7 @@ def _look_up(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.n
     heavy, squares = picture * weight[..., None], (photo * photo).sum(-1)
     products = np.fft.irfft2((cut(photo, PART + 2 * REACH) * cut(heavy, PART).conj()).sum(1))[:, shifts, shifts]
     energies = np.fft.irfft2(cut(squares, PART + 2 * REACH) * cut(weight, PART).conj())[:, shifts, shifts]
-    own = np.stack([(heavy * picture).sum(-1)[t : t + PART, left : left + PART].sum() for t, left in corners])
+    power = (heavy * picture).sum(-1)
+    own = np.stack([power[top : top + PART, left : left + PART].sum() for top, left in corners])
     sizes = np.sqrt(np.maximum(energies, 1e-9) * np.maximum(own, 1e-9)[:, None, None])
     return fisher_z(products / sizes).reshape(len(corners), -1)

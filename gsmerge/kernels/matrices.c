@@ -8,19 +8,40 @@ enum { PANEL = 16 };   // columns that are eliminated together, so that large ma
 enum { SWEEPS = 50 };  // of Jacobi's method at most; it needs about six
 static const double TINY = 1e-300;
 
+// out[i,k] = a[i,j] b[j,k]
+static inline void multiply_rows(const double *restrict a, const double *restrict b, double *restrict out, int64_t i,
+                                 int64_t j, int64_t k) {
+  for (int64_t row = 0; row < i; row++) {
+    double *to = out + row * k;
+    for (int64_t c = 0; c < k; c++) to[c] = 0.0;
+    for (int64_t t = 0; t < j; t++) {
+      double factor = a[row * j + t];
+      for (int64_t c = 0; c < k; c++) to[c] += factor * b[t * k + c];
+    }
+  }
+}
+
+// The same of points, whose sums stay in registers.
+static inline void turn_points(const double *restrict a, const double *restrict b, double *restrict out, int64_t i) {
+  for (int64_t row = 0; row < i; row++) {
+    double sums[3] = {0.0};
+    for (int t = 0; t < 3; t++)
+      for (int c = 0; c < 3; c++) sums[c] += a[row * 3 + t] * b[t * 3 + c];
+    for (int c = 0; c < 3; c++) out[row * 3 + c] = sums[c];
+  }
+}
+
 // out[n,i,k] = a[n,i,j] b[m,j,k] with m = n, or one matrix for all.
 API int32_t multiply_matrices(const double *restrict a, const double *restrict b,
                               double *restrict out, int64_t n, int64_t i, int64_t j, int64_t m,
                               int64_t k) {
   if (m != n && m != 1) return OUTSIDE;
-  for (int64_t row = 0; row < n * i; row++) {
-    const double *right = m == 1 ? b : b + row / i * (j * k);
-    double *to = out + row * k;
-    for (int64_t c = 0; c < k; c++) to[c] = 0.0;
-    for (int64_t t = 0; t < j; t++) {
-      double factor = a[row * j + t];
-      for (int64_t c = 0; c < k; c++) to[c] += factor * right[t * k + c];
-    }
+  for (int64_t each = 0; each < n; each++) {
+    const double *left = a + each * i * j, *right = m == 1 ? b : b + each * j * k;
+    if (j == 3 && k == 3)
+      turn_points(left, right, out + each * i * k, i);
+    else
+      multiply_rows(left, right, out + each * i * k, i, j, k);
   }
   return 0;
 }

@@ -2,6 +2,9 @@
 #include "exp_log.h"
 
 enum { LOOKS = 10, MOST_COLUMNS = 64 };  // columns before the harmonics, and of all
+enum { BLOCK = 256 };                    // rows that are packed column by column, in loops that vectorise
+
+typedef int32_t column[BLOCK + 1];  // numbers of the rows of a block, after that of the row before it
 
 // Rounds halves to even numbers.
 static inline double nearest(double x) {
@@ -27,44 +30,101 @@ static inline void put(const int32_t *row, int32_t *before, uint32_t *out, int64
 
 static inline double dot3(const double *a, double x, double y, double z) { return (a[0] * x + a[1] * y) + a[2] * z; }
 
+static inline void gather(const int64_t *restrict rows, const float *restrict values, int64_t width, int64_t count,
+                          double *restrict out) {
+  for (int64_t i = 0; i < count; i++) out[i] = values[width * rows[i]];
+}
+
 // Products and sums are statements of their own, so that they are rounded as NumPy rounds them.
+static void pack_opacities(const double *restrict opacities, int32_t step, int64_t count, int32_t *restrict out) {
+  for (int64_t i = 0; i < count; i++) {
+    double opacity = 255.0 * opacities[i];
+    out[i] = (int32_t)nearest((double)to_byte(opacity) / step);
+  }
+}
+
+static void pack_colors(const double *restrict harmonics, double sh_scale, double color_scale, int32_t step,
+                        int64_t count, int32_t *restrict out) {
+  for (int64_t i = 0; i < count; i++) {
+    double harmonic = sh_scale * harmonics[i], color = 0.5 + harmonic;
+    double share = color_scale * (color - 0.5) / sh_scale, level = 255.0 * (share + 0.5);
+    out[i] = (int32_t)nearest((double)to_byte(level) / step);
+  }
+}
+
+static void pack_scales(const double *restrict scales, int32_t step, int64_t count, int32_t *restrict out) {
+  for (int64_t i = 0; i < count; i++) {
+    double size = log8(scales[i]);
+    size = size > -30.0 ? size : -30.0;
+    size = 16.0 * ((size < 30.0 ? size : 30.0) + 10.0);
+    out[i] = (int32_t)nearest((double)to_byte(size) / step);
+  }
+}
+
+static void pack_turns(const int64_t *restrict rows, const float *restrict quats, double levels, int64_t count,
+                       column *restrict out) {
+  double parts[4][BLOCK], lengths[BLOCK];
+  for (int64_t i = 0; i < count; i++) {
+    const float *quat = quats + 4 * rows[i];
+    float squares[4];
+    for (int c = 0; c < 4; c++) squares[c] = quat[c] * quat[c];
+    lengths[i] = sqrtf4(((squares[0] + squares[1]) + squares[2]) + squares[3]);
+    for (int c = 0; c < 4; c++) parts[c][i] = quat[c];
+  }
+  for (int64_t i = 0; i < count; i++) {
+    double sign = parts[0][i] < 0.0 ? -1.0 : 1.0, length = sign * (lengths[i] > 1e-12 ? lengths[i] : 1e-12);
+    double w = parts[0][i] / length;
+    for (int c = 0; c < 3; c++) out[c][1 + i] = (int32_t)nearest(levels * (parts[1 + c][i] / length / (1.0 + w)));
+  }
+}
+
+static void pack_harmonics(const double *restrict values, int32_t step, int64_t count, int32_t *restrict out) {
+  for (int64_t i = 0; i < count; i++) {
+    double harmonic = values[i] > -2.0 ? values[i] : -2.0;
+    int32_t value = (int32_t)nearest(128.0 * (harmonic < 2.0 ? harmonic : 2.0)) + 128 + step / 2;
+    value = (value - (value & (step - 1)));
+    value = value > 0 ? value : 0;
+    out[i] = value < 255 ? value : 255;
+  }
+}
+
+// Writes the differences of a column from row to row, and keeps its last row for the next block.
+static void put_column(int32_t *restrict numbers, int64_t count, uint32_t *restrict out) {
+  for (int64_t i = 0; i < count; i++) {
+    uint32_t by = (uint32_t)numbers[1 + i] - (uint32_t)numbers[i];
+    out[i] = (by << 1) ^ (by >> 31 ? UINT32_MAX : 0);
+  }
+  numbers[0] = numbers[count];
+}
+
 API int32_t pack_looks(const int64_t *rows, const float *opacities, const float *sh0, const float *scales,
                        const float *quats, const float *shN, double sh_scale, double color_scale, const int32_t *steps,
                        double levels, uint32_t *out, int64_t m, int64_t n, int64_t stored, int64_t columns) {
-  int32_t row[MOST_COLUMNS] = {0}, before[MOST_COLUMNS] = {0};
+  column looks[MOST_COLUMNS];
+  double values[BLOCK];
   if (columns > MOST_COLUMNS || columns > LOOKS + stored) return OUTSIDE;
   (void)n;
-  for (int64_t i = 0; i < m; i++) {
-    int64_t g = rows[i];
-    double opacity = 255.0 * opacities[g];
-    row[0] = (int32_t)nearest((double)to_byte(opacity) / steps[0]);
+  for (int64_t c = 0; c < columns; c++) looks[c][0] = 0;
+  for (int64_t first = 0; first < m; first += BLOCK) {
+    const int64_t *block = rows + first, count = m - first < BLOCK ? m - first : BLOCK;
+    gather(block, opacities, 1, count, values);
+    pack_opacities(values, steps[0], count, looks[0] + 1);
     for (int c = 0; c < 3; c++) {
-      double harmonic = sh_scale * sh0[3 * g + c], color = 0.5 + harmonic;
-      double share = color_scale * (color - 0.5) / sh_scale, level = 255.0 * (share + 0.5);
-      row[1 + c] = (int32_t)nearest((double)to_byte(level) / steps[1]);
-      double size = log8(scales[3 * g + c]);
-      size = size > -30.0 ? size : -30.0;
-      size = 16.0 * ((size < 30.0 ? size : 30.0) + 10.0);
-      row[4 + c] = (int32_t)nearest((double)to_byte(size) / steps[2]);
+      gather(block, sh0 + c, 3, count, values);
+      pack_colors(values, sh_scale, color_scale, steps[1], count, looks[1 + c] + 1);
+      gather(block, scales + c, 3, count, values);
+      pack_scales(values, steps[2], count, looks[4 + c] + 1);
     }
-    row[1] -= row[2];  // from green, which says most of the others
-    row[3] -= row[2];
-    const float *quat = quats + 4 * g;
-    float squares[4];
-    for (int c = 0; c < 4; c++) squares[c] = quat[c] * quat[c];
-    double length = sqrtf4(((squares[0] + squares[1]) + squares[2]) + squares[3]), sign = quat[0] < 0.f ? -1.0 : 1.0;
-    length = sign * (length > 1e-12 ? length : 1e-12);
-    double w = quat[0] / length;
-    for (int c = 0; c < 3; c++) row[7 + c] = (int32_t)nearest(levels * (quat[1 + c] / length / (1.0 + w)));
+    for (int64_t i = 1; i <= count; i++) {  // from green, which says most of the others
+      looks[1][i] -= looks[2][i];
+      looks[3][i] -= looks[2][i];
+    }
+    pack_turns(block, quats, levels, count, looks + 7);
     for (int64_t k = 0; k < columns - LOOKS; k++) {
-      double harmonic = shN[stored * g + k];
-      harmonic = harmonic > -2.0 ? harmonic : -2.0;
-      int32_t step = k < 9 ? 8 : 16, value = (int32_t)nearest(128.0 * (harmonic < 2.0 ? harmonic : 2.0)) + 128 + step / 2;
-      value = (value - (value & (step - 1)));
-      value = value > 0 ? value : 0;
-      row[LOOKS + k] = value < 255 ? value : 255;
+      gather(block, shN + k, stored, count, values);
+      pack_harmonics(values, k < 9 ? 8 : 16, count, looks[LOOKS + k] + 1);
     }
-    put(row, before, out, i, m, columns);
+    for (int64_t c = 0; c < columns; c++) put_column(looks[c], count, out + c * m + first);
   }
   return 0;
 }

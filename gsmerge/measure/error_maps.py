@@ -15,7 +15,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frame import scene_frame
-from gsmerge.geometry import project
+from gsmerge.geometry import is_inside, project
 from gsmerge.kernels.pictures import blur, sample_bilinear
 from gsmerge.measure.preview import Picture, contact_sheet, to_picture
 from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
@@ -69,21 +69,27 @@ def expected_errors(witnesses: Witnesses, camera: Cameras, own: int | None = Non
     """
     camera = shrink_cameras(camera, SIDE)
     image, depth = look_from(witnesses.gaussians, camera) if own is None else witnesses.look(own)
-    y, x = np.nonzero(depth > 0)
-    points = lift_pixels(depth, depth > 0, camera)
-    sums, counts = np.zeros((2, len(points)), np.float32)
-    for other in _nearest(witnesses.views.cameras, camera, own):
-        cameras = witnesses.views.cameras[[other]]
-        ((pixels,), (z,)), size = project(points, cameras), np.array([cameras.width, cameras.height])
-        seen = np.flatnonzero((counts < COUNTED) & (z > 0) & ((pixels >= 0) & (pixels < size)).all(1))
-        column, row = pixels[seen].astype(np.int64).T
-        shown = z[seen] < BEHIND * witnesses.look(other)[1][row, column]
-        seen = seen[shown if witnesses.masks is None else shown & witnesses.masks[other, row, column]]
-        there = sample_bilinear(witnesses.views.images[other], *(pixels[seen].T - 0.5))
-        sums[seen] += np.abs(there - image[y[seen], x[seen]]).mean(1)
-        counts[seen] += 1
-    errors = np.zeros((*depth.shape, 2), np.float32)
-    errors[y, x, 0], errors[y, x, 1] = sums / np.maximum(counts, 1), counts > 0
+    ids = np.flatnonzero(depth > 0)
+    points, colors = lift_pixels(depth, depth > 0, camera), image.reshape(-1, 3).take(ids, 0)
+    sums, counts = np.zeros((2, len(ids)), np.float32)
+    open_rows, small = np.arange(len(ids)), witnesses.views.cameras
+    for other in _nearest(small, camera, own):
+        (pixels,), (z,) = project(points.take(open_rows, 0), small[[other]])
+        seen = np.flatnonzero((z > 0) & is_inside(pixels, small))
+        pixels, rows = pixels.take(seen, 0), open_rows.take(seen)
+        column, row = pixels.astype(np.int64).T
+        there = row * small.width + column
+        shown = z.take(seen) < BEHIND * witnesses.look(other)[1].reshape(-1).take(there)
+        if witnesses.masks is not None:
+            shown &= witnesses.masks[other].reshape(-1).take(there)
+        pixels, rows = pixels.compress(shown, 0), rows.compress(shown)
+        apart = np.abs(sample_bilinear(witnesses.views.images[other], *(pixels.T - 0.5)) - colors.take(rows, 0))
+        sums[rows] += (apart[:, 0] + apart[:, 1] + apart[:, 2]) / np.float32(3)
+        counts[rows] += 1
+        open_rows = open_rows.compress(counts.take(open_rows) < COUNTED)
+    errors = np.zeros((depth.size, 2), np.float32)
+    errors[ids, 0], errors[ids, 1] = sums / np.maximum(counts, 1), counts > 0
+    errors = errors.reshape(*depth.shape, 2)
     known = errors[..., 1] > 0
     total, weight = np.moveaxis(blur(errors, SIGMA), 2, 0)
     return np.where(known, total / np.maximum(weight, np.float32(1e-6)), np.float32(np.nan))

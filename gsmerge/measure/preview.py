@@ -125,12 +125,16 @@ def _join(pictures: Sequence[Picture], axis: int) -> Picture:
     return np.concatenate(out, axis)
 
 
-def borders(labels: np.ndarray) -> np.ndarray:
-    """Return a mask ``[h,w]`` of pixels whose left or upper neighbour has another label ``[h,w]``."""
-    border = np.zeros(labels.shape, bool)
-    border[:, 1:] |= labels[:, 1:] != labels[:, :-1]
-    border[1:] |= labels[1:] != labels[:-1]
-    return border
+def draw_borders(labels: np.ndarray, ids: np.ndarray, factor: int) -> NDArray[np.uint8]:
+    """Enlarge ``labels [h,w]`` by a whole factor and draw where the left or upper neighbour has another one.
+
+    Returns the ``ids [k]`` uint8 of the labels at these borders, which are one pixel wide, and 0 elsewhere.
+    """
+    (height, width), own = labels.shape, ids[labels]
+    drawn = np.zeros((height, factor, width, factor), np.uint8)
+    drawn[:, :, 1:, 0] = np.where(labels[:, 1:] != labels[:, :-1], own[:, 1:], 0)[:, None]
+    drawn[1:, 0] = np.where((labels[1:] != labels[:-1])[..., None], own[1:, :, None], drawn[1:, 0])
+    return drawn.reshape(height * factor, width * factor)
 
 
 def mean_colors(image: np.ndarray, labels: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.geometry import project
+from gsmerge.geometry import is_inside, project
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.raster import render
 from gsmerge.runtime.threads import parallel_map
@@ -55,7 +55,6 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
     points (``sources``), a point marks proportionally more pixels, so that there are no gaps.
     """
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-    size = np.array([cameras.width, cameras.height])
 
     def one_view(view: int) -> NDArray[np.bool_]:
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
@@ -65,10 +64,10 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
         for first in (*range(own, len(points), _CHUNK), *range(0, own, _CHUNK)):
             chunk = points[first : first + _CHUNK]
             image = matmul(matmul(chunk, viewmats[view, :3, :3].T) + viewmats[view, :3, 3], Ks[view].T)
-            image = image[image[:, 2] > near]
-            pixels = np.floor(image[:, :2] / image[:, 2:])
-            pixels = pixels[((pixels >= 0) & (pixels < size)).all(1)].astype(np.int64)
-            hit[pixels[:, 1], pixels[:, 0]] = 1
+            image = image.compress(image[:, 2] > near, 0)
+            pixels = image[:, :2] / image[:, 2:]
+            column, row = pixels.compress(is_inside(pixels, cameras), 0).astype(np.int64).T
+            hit[row, column] = 1
             seen = cv2.dilate(hit, np.ones((side, side), np.uint8)) > 0
             if seen.all():
                 break
@@ -90,7 +89,7 @@ def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
     rows = []
     for view in range(len(cameras)):
         (pixels,), (depths,) = project(gaussians.means, cameras[[view]])
-        inside = (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)
+        inside = (depths > 0) & is_inside(pixels, cameras)
         near = _NEAR * float(np.median(depths[inside])) if inside.any() else 1.0
         drawn = render(gaussians, cameras[[view]], near=near, with_depths=True)
         assert drawn.depths is not None
@@ -106,4 +105,4 @@ def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
     at_once = 1 + _CHUNK // max(1, len(points))
     for first in range(0, len(cameras), at_once):
         pixels, depths = project(points, cameras[first : first + at_once])
-        yield from (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(2)
+        yield from (depths > 0) & is_inside(pixels, cameras)

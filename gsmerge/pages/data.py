@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
-import cv2
 import numpy as np
 
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.views import even_views
 from gsmerge.frame import Frame, scene_frame
 from gsmerge.geometry import middle_depth
-from gsmerge.io.photo_files import encode_indexed, photo_array
+from gsmerge.io.photo_files import encode_indexed, encode_picture, photo_array
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.error_maps import Witnesses, call_witnesses, draw_errors, expected_errors
 from gsmerge.measure.evaluate import (
@@ -28,10 +27,10 @@ from gsmerge.measure.evaluate import (
     near_plane,
 )
 from gsmerge.measure.lpips import lpips_available
-from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
-from gsmerge.pages.marks import DROPS, SEEN, Marks, draw_masks, find_marks
+from gsmerge.measure.preview import OUTSIDE, Picture, draw_borders, mean_colors, to_picture
+from gsmerge.pages.marks import Marks, draw_marks, find_marks
 from gsmerge.pages.splats import MAX_GAUSSIANS, drawn_rows, highest_degree, pack_splats, pack_support
-from gsmerge.raster import render
+from gsmerge.raster import Splats, make_splats, render
 from gsmerge.raster.photos import WHOLE
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import SegmentOptions
@@ -79,9 +78,9 @@ class PageView:
     photo: bytes | None  # WebP
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
-    outlines: bytes | None = None  # borders of the photo's superpixels as WebP; None of held-out views
+    outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None of held-out views
     outside: bool = False  # a camera where no photo is; it has no scores
-    drops: tuple[bytes | None, ...] = ()  # WebP, one for each side: what ``--drop`` would take, coloured
+    drops: tuple[bytes | None, ...] = ()  # PNG, one for each side: what ``--drop`` would take, coloured
     seen: tuple[bytes | None, ...] = ()  # the same of what none or one of the input views shows
     maps: tuple[bytes | None, ...] = ()  # WebP, one for each side: see :mod:`gsmerge.measure.error_maps`
     faded: tuple[bytes | None, ...] = ()  # stills from outside with that made faint which no view shows
@@ -190,6 +189,7 @@ def page_data(
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
     entered = {name: frame.enter(gaussians) for name, gaussians in named.items()}
+    whole = entered[INPUT] if scene.missing is None else frame.enter(scene.gaussians)
     placed = frame.enter_cameras(scene.cameras.numpy())
     looked_at = [name for name in named if name != INPUT or not results]
     photos = pictures if len(pictures) else None
@@ -209,14 +209,10 @@ def page_data(
         name: call_witnesses(entered[name], Views(moved.get(name, placed), pictures, scene.names), scene.masks)
         for name in (looked_at if len(pictures) > 1 else ())
     }
+    splats = {name: make_splats(entered[name]) for name in looked_at}
+    shown = tuple(replace(view, maps=tuple(_map(witnesses.get(name), view) for name in named)) for view in shown)
     *drawn, outside = (
-        replace(
-            view,
-            maps=() if view.outside else tuple(_map(witnesses.get(name), view) for name in named),
-            drops=tuple(draw_masks(entered[name], marks[name].drops, DROPS, view.camera, near) for name in named),
-            seen=tuple(draw_masks(entered[name], marks[name].seen, SEEN, view.camera, near) for name in named),
-        )
-        for view in (*shown, _outside_view(scene, named, frame, len(views)))
+        _with_marks(view, splats, marks, near) for view in (*shown, _outside_view(scene, named, frame, len(views)))
     )
     faint = (marks[name].fade(gaussians) for name, gaussians in entered.items())
     faded = (None if g is None else render(g, outside.camera, near=near).images[0] for g in faint)
@@ -227,8 +223,18 @@ def page_data(
     lacks_pixels = share is not None and share < WHOLE
     return ViewData(
         title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
-        lacks_pixels, confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=placed)),
+        lacks_pixels, confirm_depths(replace(scene, gaussians=whole, cameras=placed)),
     )  # fmt: skip
+
+
+def _with_marks(view: PageView, splats: Mapping[str, Splats], marks: Mapping[str, Marks], near: float) -> PageView:
+    """Add to a view what is marked of each side."""
+    drawn = [
+        draw_marks(splats[name], of, view.camera, near) if name in splats else (None, None)
+        for name, of in marks.items()
+    ]
+    drops, seen = zip(*drawn, strict=True)
+    return replace(view, drops=drops, seen=seen)
 
 
 def _page_views(
@@ -298,27 +304,22 @@ def short_names(names: Sequence[str]) -> list[str]:
 
 def encode_still(picture: Picture) -> bytes:
     """Encode a picture as WebP."""
-    _, data = cv2.imencode(".webp", picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])
-    return bytes(data.tobytes())
+    return encode_picture(picture, WEBP_QUALITY)
 
 
 def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
-    """Encode the borders of superpixels ``[h,w]`` as an enlarged, transparent WebP without losses.
+    """Encode the borders of superpixels ``[h,w]`` as an enlarged, transparent PNG.
 
     Each border has the mean colour of its superpixel in ``photo [h,w,3]``, slightly lighter or, for light colours,
     darker.
     """
-    factor = max(1, OUTLINE_SIDE // max(labels.shape))
-    enlarged = labels.repeat(factor, 0).repeat(factor, 1)
     means = mean_colors(photo, labels)
     light = means.mean(1, keepdims=True) > 0.5
     shifted = means + OUTLINE_SHIFT * (np.where(light, 0.0, 1.0) - means)
-    levels = np.round((OUTLINE_LEVELS - 1) * shifted).astype(np.uint8)
-    steps = np.array([OUTLINE_LEVELS**2, OUTLINE_LEVELS, 1], np.uint8)
-    ids = 1 + (levels * steps).sum(1, dtype=np.uint8)
-    every = np.indices((OUTLINE_LEVELS,) * 3).reshape(3, -1).T * (255 // (OUTLINE_LEVELS - 1))
-    colors = np.pad(every, ((1, 0), (0, 0))).astype(np.uint8)
-    return encode_indexed(np.where(borders(enlarged), ids[enlarged], 0), colors)
+    levels = np.round((OUTLINE_LEVELS - 1) * shifted) * (255 // (OUTLINE_LEVELS - 1))
+    colors, places = np.unique(levels.astype(np.uint8), axis=0, return_inverse=True)
+    drawn = draw_borders(labels, 1 + places.reshape(-1).astype(np.uint8), max(1, OUTLINE_SIDE // max(labels.shape)))
+    return encode_indexed(drawn, np.pad(colors, ((1, 0), (0, 0))))
 
 
 def _map(witnesses: Witnesses | None, view: PageView) -> bytes | None:

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gsmerge.facts.support import TINTS, count_views
-from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.photo_files import encode_indexed
-from gsmerge.raster import render
+from gsmerge.raster import Splats, TiledView, composite, tile_view
 from gsmerge.stages.clean import floaters
 from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
@@ -63,20 +62,27 @@ def find_marks(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None
     return Marks(drops, None if aligned else np.minimum(count_views(gaussians, cameras), MORE).astype(np.uint8))
 
 
-def draw_masks(
-    gaussians: Gaussians, masks: Mapping[str, np.ndarray], colors: Mapping[str, Color], camera: Cameras, near: float
-) -> bytes | None:
-    """Draw ``masks [n]``, at most three, in the ``colors`` of their words, each as opaque as its share of a pixel.
+def draw_marks(splats: Splats, marks: Marks, camera: Cameras, near: float) -> tuple[bytes | None, bytes | None]:
+    """Draw what is marked of canonical ``splats``, in one view: ``drops``, and what is ``seen`` by none or one."""
+    if not (marks.drops or marks.seen):
+        return None, None
+    viewmat, K = camera.viewmats[0], camera.Ks[0]
+    tiled = tile_view(splats, viewmat, K, camera.width, camera.height, near=near)
+    return draw_masks(tiled, marks.drops, DROPS), draw_masks(tiled, marks.seen, SEEN)
 
-    Returns a WebP; None if nothing is seen.
+
+def draw_masks(tiled: TiledView, masks: Mapping[str, np.ndarray], colors: Mapping[str, Color]) -> bytes | None:
+    """Draw ``masks [n]`` in the ``colors`` of their words, two, each as opaque as its share of a pixel.
+
+    Returns a PNG; None if nothing is seen.
     """
-    if not masks:
+    flags = np.zeros((len(tiled.splats), 3), np.float32)
+    for channel, word in enumerate(colors):
+        flags[:, channel] = masks.get(word, 0)
+    if not flags[tiled.ids].any():
         return None
-    flags = np.zeros((len(gaussians), 3), np.float32)
-    flags[:, : len(colors)] = np.stack([masks.get(word, flags[:, 0] > 0) for word in colors], 1)
-    marked = replace(gaussians, sh0=rgb_to_sh0(flags)[:, None], shN=gaussians.shN[:, :0])
-    shares = render(marked, camera, near=near).images[0][..., : len(colors)]
-    steps = np.ceil(STEPS * shares.max(2).clip(0, 1)).astype(np.uint8)
-    ids = np.where(shares.max(2) >= VISIBLE, STEPS * shares.argmax(2) + steps, 0)
+    first, second, _ = np.moveaxis(composite(tiled, flags)[0], 2, 0)
+    most = np.maximum(first, second)
+    ids = np.where(most >= VISIBLE, STEPS * (second > first) + np.ceil(STEPS * most.clip(0, 1)), 0).astype(np.uint8)
     tints = [(*color, MOST_ALPHA * step // STEPS) for color in colors.values() for step in range(1, STEPS + 1)]
     return encode_indexed(ids, np.array([(0, 0, 0, 0), *tints], np.uint8)) if ids.any() else None

@@ -48,9 +48,9 @@ def view_page(data: ViewData) -> str:
     first = {side: opened[side] for side in (left, right)}  # in the page itself, to be seen at once
     opened[left] = opened[right] = None
 
-    def pictures(of_sides: Sequence[bytes | None]) -> list[str | None]:
+    def pictures(of_sides: Sequence[bytes | None], kind: str = "image/webp") -> list[str | None]:
         some = [None] * (len(sources) - len(of_sides)) + list(of_sides)
-        return [None if one is None else data_uri(one, "image/webp") for one in some]
+        return [None if one is None else data_uri(one, kind) for one in some]
 
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     engine = VIEWER.read_bytes() if splats else None
@@ -86,9 +86,9 @@ def view_page(data: ViewData) -> str:
         stills=stills,
         speed_words=speed_words(results[0]["speed"]),
         agreement=agreement_words(data),
-        outlines=[view.outlines and data_uri(view.outlines, "image/webp") for view in data.shown],
-        drops=[pictures(view.drops) for view in data.shown],
-        seen=[pictures(view.seen) for view in data.shown],
+        outlines=[view.outlines and data_uri(view.outlines, "image/png") for view in data.shown],
+        drops=[pictures(view.drops, "image/png") for view in data.shown],
+        seen=[pictures(view.seen, "image/png") for view in data.shown],
         faded=pictures(data.outside.faded),
         maps=[pictures(view.maps) for view in data.shown],
         splats=splats,

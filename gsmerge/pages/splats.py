@@ -43,13 +43,14 @@ def pack_splats(
     highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREE)
     degree = max((d for d in range(highest + 1) if (20 + 3 * ((d + 1) ** 2 - 1)) * count <= MAX_SPZ_BYTES), default=0)
     steps, levels = COARSE if count > MANY else EXACT
-    fixed, fraction = spz.fix_means(means[rows], FINE)
+    drawn = means.take(rows, 0)
+    fraction = spz.choose_fraction(drawn, FINE)
     head: dict[str, Any] = {"count": count, "degree": degree, "fraction": fraction}
     places = None
     if cameras is not None and pixel_ids is not None:
         places = _pixel_places(rows, means, cameras, pixel_ids)
     if places is None:
-        moved = np.diff(fixed, axis=0, prepend=np.zeros((1, 3), np.int32)).T
+        moved = np.diff(spz.fix_means(drawn, fraction), axis=0, prepend=np.zeros((1, 3), np.int32)).T
         places = np.where(moved < 0, -2 * moved - 1, 2 * moved).astype("<u4")
     elif cameras is not None:
         head["cameras"] = [

@@ -76,6 +76,14 @@ def _spread_origin(means: Array) -> Array:
     return centre if np.abs(centre).max() > 16 * spread else np.zeros(3)
 
 
+def _shift(means: Array, start: Array) -> Array:
+    """Return ``means [n,3]`` less ``start [3]``, subtracted in float64 and rounded to float32."""
+    shifted = np.empty(means.shape, np.float32)
+    for axis in range(3):  # axis by axis NumPy takes a third of the time
+        np.subtract(means[:, axis], start[axis], out=shifted[:, axis], dtype=np.float64, casting="unsafe")
+    return shifted
+
+
 def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
     """Convert Gaussians to float32 splats for the kernels, copying only what needs conversion.
 
@@ -85,7 +93,7 @@ def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats
     """
     gaussians = gaussians.numpy()
     start = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
-    columns = vars(gaussians) | {"means": gaussians.means - start if start.any() else gaussians.means}
+    columns = vars(gaussians) | {"means": _shift(gaussians.means, start) if start.any() else gaussians.means}
     return Splats(**{name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}, origin=start)
 
 
@@ -182,7 +190,7 @@ def _bin(
 ) -> tuple[Array, Array]:
     """Return the tile lists and their starts."""
     # One gather in advance, 8 bytes a box: in the loops below every miss would be paid in full.
-    boxes = boxes.view(np.uint64)[order, 0].view(np.int16).reshape(-1, 4)
+    boxes = boxes.view(np.uint64).reshape(-1).take(order).view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], tile_height, tile_width), spans))
     if counts.sum() > max(MANY, MANY_EACH * len(order)):

@@ -88,7 +88,7 @@ class FitOptions(Settings):
         "By default 0.1 for at most five views and at least 150 steps, 0.05 from 600 steps and 30 looks at each view "
         "on, otherwise 0.", least=0, below=1)  # fmt: skip
     half_res_share: float | None = setting(None, "Share of the steps, the first ones, that draw every second pixel of "
-        "every second row.", "By default 0.6, from 600 steps on 0.5, below 150 0.7, below 20 all; less for more than "
+        "every second row.", "By default 0.66, from 600 steps on 0.5, below 150 0.7, below 20 all; less for more than "
         "6 % of the Gaussians.",
         least=0, most=1)  # fmt: skip
     holdout: float = setting(0.05, "Share of the photos' patches that decides whether a fit is accepted.", above=0,
@@ -117,7 +117,7 @@ class FitOptions(Settings):
             return 1.0
         if not self.grows:
             return 0.7
-        most = 0.5 if self.steps >= LONG_STEPS else 0.6  # details come last, and long runs have time for them
+        most = 0.5 if self.steps >= LONG_STEPS else 0.66  # details come last, and long runs have time for them
         return most if self.share is None else min(most, 0.7 * math.sqrt(USUAL_SHARE / max(self.share, USUAL_SHARE)))
 
     @property

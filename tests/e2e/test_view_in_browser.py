@@ -229,7 +229,7 @@ def test_what_would_be_dropped_is_shown_in_colour(opened: tuple[Browser, Any]) -
     assert tab.run("data.sources[3].dropped.floaters") > 0  # the one that reaches in from outside
     tab.run("choose(3); jump(data.views.findIndex((_, i) => drops[i][3])); set('drops', '1')")
     layer = "document.querySelector('#right-pane .drops')"
-    assert tab.run(f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/webp')]") == [
+    assert tab.run(f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/png')]") == [
         False,
         True,
     ]
@@ -251,7 +251,7 @@ def test_what_no_view_shows_is_faint_from_outside(opened: tuple[Browser, Any]) -
     where = "data.views.findIndex((named, i) => !named.outside && (seen[i] || [])[3])"
     tab.run(f"jump({where}); set('seen', 'color')")
     layer = "document.querySelector('#right-pane .seen')"
-    assert tab.run(f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/webp')]") == [
+    assert tab.run(f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/png')]") == [
         False,
         True,
     ]

@@ -262,19 +262,23 @@ def _octave(size: float) -> int:
 
 def round_means(means: np.ndarray) -> np.ndarray:
     """Return means ``[n,3]`` as a ``.spz`` of them holds them."""
-    fixed, fraction = fix_means(means, FINE)
-    return to_float32(fixed / 2.0**fraction)
+    fraction = choose_fraction(means, FINE)
+    return to_float32(fix_means(means, fraction) / 2.0**fraction)
 
 
-def fix_means(means: np.ndarray, fine: int) -> tuple[np.ndarray, int]:
-    """Quantise means; also returns the bits behind the point, by the scene's size and its farthest Gaussian."""
-    fraction = 0
-    if len(means):
-        size = np.median(reduce(np.maximum, np.abs(means - np.median(means, axis=0)).T))
-        enough = fine - _octave(max(size, 1e-6))
-        room = _octave(LARGEST / max(np.abs(means).max(), 1e-6))
-        fraction = int(np.clip(min(enough, room), 0, MAX_FRACTION))
-    return np.clip(np.round(means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4"), fraction
+def choose_fraction(means: np.ndarray, fine: int) -> int:
+    """Choose the bits behind the point of quantised means, by the scene's size and its farthest Gaussian."""
+    if not len(means):
+        return 0
+    size = np.median(reduce(np.maximum, (np.abs(axis - np.median(axis)) for axis in means.T)))
+    enough = fine - _octave(max(size, 1e-6))
+    room = _octave(LARGEST / max(np.abs(means).max(), 1e-6))
+    return int(np.clip(min(enough, room), 0, MAX_FRACTION))
+
+
+def fix_means(means: np.ndarray, fraction: int) -> np.ndarray:
+    """Quantise means to ``fraction`` bits behind the point."""
+    return np.clip(np.round(means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
 
 
 def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> tuple[bytes, tuple[np.ndarray, ...]]:
@@ -283,7 +287,8 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> 
     ValueError if there is NaN or inf.
     """
     columns = arrays.to_columns(gaussians, max_degree)
-    fixed, fraction = fix_means(columns.means, FINE)
+    fraction = choose_fraction(columns.means, FINE)
+    fixed = fix_means(columns.means, fraction)
     steps = np.where(np.arange(columns.harmonics.shape[1]) < 3, 8, 16)[:, None]  # of degree 1, and above
     stepped = (np.round(np.clip(columns.harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
     # rotations from the top: index of the largest of xyzw, then sign and magnitude of the others

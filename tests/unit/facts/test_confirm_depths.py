@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import hypot, inf
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ import unaligned_scenes
 
 from gsmerge import Cameras, Scene
 from gsmerge.facts.confirm_depths import FEWEST, MOST, PIXELS, REACH, SAME, Agreement, confirm_depths
-from gsmerge.geometry import project
 from gsmerge.kernels.elementary import log
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import grid_ids
@@ -45,9 +45,16 @@ def turned_away(scene: Scene, view: int) -> Scene:
     return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
 
 
+def look_at(point: list[float], viewmat: list[list[float]], K: list[list[float]]) -> tuple[float, float, float]:
+    """Where a view shows a point, pixels, and how far ahead it is."""
+    x, y, z = (sum(a * b for a, b in zip(row, (*point, 1.0), strict=True)) for row in viewmat[:3])
+    return K[0][0] * x / z + K[0][2], K[1][1] * y / z + K[1][2], z
+
+
 def confirm_slowly(scene: Scene) -> Agreement:
     """Look up each pixel in each other view, one after the other, in the words of the definition."""
-    means = scene.gaussians.means.reshape(VIEWS, HEIGHT, WIDTH, 3)
+    means = scene.gaussians.means.reshape(VIEWS, HEIGHT, WIDTH, 3).tolist()
+    lenses = list(zip(scene.cameras.viewmats.tolist(), scene.cameras.Ks.tolist(), strict=True))
     reach = max(PIXELS, REACH * WIDTH)
     counts = [0, 0, 0]
     for view in range(VIEWS):
@@ -55,18 +62,14 @@ def confirm_slowly(scene: Scene) -> Agreement:
             for column in range(WIDTH):
                 same, through, seen = 0, 0, False
                 for other in {*range(VIEWS)} - {view}:
-                    (((x, y),),), ((depth,),) = project(means[view, row, column][None], scene.cameras[[other]])
+                    x, y, depth = look_at(means[view][row][column], *lenses[other])
                     if depth <= 0 or not (0 < x < WIDTH and 0 < y < HEIGHT):
                         continue
                     seen = True
-                    surface = means[other, int(y), int(x)][None]
-                    (((back_x, back_y),),), ((ahead,),) = project(surface, scene.cameras[[view]])
-                    there = project(surface, scene.cameras[[other]])[1].item()
-                    away = (
-                        ((back_x - column - 0.5) ** 2 + (back_y - row - 0.5) ** 2) ** 0.5 / reach
-                        if ahead > 0
-                        else np.inf
-                    )
+                    surface = means[other][int(y)][int(x)]
+                    back_x, back_y, ahead = look_at(surface, *lenses[view])
+                    there = look_at(surface, *lenses[other])[2]
+                    away = hypot(back_x - column - 0.5, back_y - row - 0.5) / reach if ahead > 0 else inf
                     behind = float(log(depth / there))
                     if away < 1 and abs(behind) < SAME:
                         same += 1

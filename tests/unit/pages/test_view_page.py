@@ -19,7 +19,7 @@ from gsmerge.pages.data import ViewData, collect
 from gsmerge.pages.page import headline, results_table, speed, speed_words, view_page
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
-WEBP = "data:image/webp;base64,"
+WEBP, PNG = "data:image/webp;base64,", "data:image/png;base64,"
 NAMES = ("images/<i>0</i>.png", "images/1.png", EVIL)
 
 
@@ -82,7 +82,7 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
         assert base64.b64decode(address.removeprefix(WEBP)) == data.views[1].stills[still]
     assert base64.b64decode(stills[0][2].removeprefix(WEBP)) == data.views[0].stills[1]
     outlines = json.loads(block(page, "outline-pictures"))
-    assert [one and base64.b64decode(one.removeprefix("data:image/webp;base64,")) for one in outlines] == [
+    assert [one and base64.b64decode(one.removeprefix(PNG)) for one in outlines] == [
         view.outlines for view in data.shown
     ]
     assert page.index("data:image/webp") < page.index("<script")
@@ -179,7 +179,7 @@ def test_what_would_be_dropped_has_a_switch(data: ViewData) -> None:
     views = tuple(replace(view, drops=(None, b"one")) for view in data.views)
     page = view_page(replace(data, sides=dropping, views=views))
     assert 'data-set="drops"' in page
-    assert json.loads(block(page, "drop-pictures"))[0] == [None, None, f"{WEBP}b25l"]
+    assert json.loads(block(page, "drop-pictures"))[0] == [None, None, f"{PNG}b25l"]
     assert json.loads(block(page, "data"))["sources"][2]["dropped"] == {"sky": 12}
     assert 'data-set="drops"' not in view_page(replace(data, sides=bare))
 
@@ -192,7 +192,7 @@ def test_what_no_view_shows_has_a_switch(data: ViewData) -> None:
     page = view_page(replace(data, sides=known, views=views, outside=outside))
     assert 'data-set="seen"' in page
     assert "--drop unseen" in page
-    assert json.loads(block(page, "seen-pictures"))[0] == [None, None, f"{WEBP}b25l"]
+    assert json.loads(block(page, "seen-pictures"))[0] == [None, None, f"{PNG}b25l"]
     assert json.loads(block(page, "faded-pictures")) == [None, None, f"{WEBP}b25l"]
     assert base64.b64decode(block(page, "support-1")) == b"two"
     assert json.loads(block(page, "data"))["sources"][2]["support"] == "support-1"

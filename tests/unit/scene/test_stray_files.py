@@ -53,6 +53,13 @@ def save(folder: Path, kind: str, *, cameras: bool = False) -> Path:
     return save_export(folder, SMOOTH, export_rows(SMOOTH, KINDS[kind]), cameras=cameras)
 
 
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Loaded]:
+    """What each kind of file is without anything beside it."""
+    folder = tmp_path_factory.mktemp("alone")
+    return {kind: load_scene(save(folder / kind, kind)) for kind in KINDS}
+
+
 def same(actual: Loaded, alone: Loaded) -> bool:
     scenes = actual.scene, alone.scene
     means = [scene.gaussians.means for scene in scenes]
@@ -61,16 +68,17 @@ def same(actual: Loaded, alone: Loaded) -> bool:
 
 @sweep("stray", STRAY, often=3)
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_belongs_to_something_else_is_left_out(tmp_path: Path, kind: str, stray: str) -> None:
-    alone = load_scene(save(tmp_path / "alone", kind))
+def test_what_belongs_to_something_else_is_left_out(
+    tmp_path: Path, alone: dict[str, Loaded], kind: str, stray: str
+) -> None:
     folder = save(tmp_path / "scene", kind)
     STRAY[stray](folder)
     actual = load_scene(folder)
-    assert same(actual, alone)
+    assert same(actual, alone[kind])
     assert actual.left_out is not None
     assert actual.files.cameras is None
     others = [note for note in actual.notes if note != actual.left_out]
-    assert [note for note in others if "photos" not in note or kind == "voxels"] == list(alone.notes)
+    assert [note for note in others if "photos" not in note or kind == "voxels"] == list(alone[kind].notes)
     assert actual.recognised["left_out"] == actual.left_out
     with pytest.warns(UserWarning, match="left out"):
         read_scene(folder)
