@@ -139,12 +139,13 @@ class Optimiser:
         moves = rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change
         widest = max(photos.width for photos in self.run.job.photos)  # of the size whose pixels the least scale counts
         ratio, long = log(np.array([rates.max_ratio, rates.long_share * widest / (3 * max(rates.min_scale, 1e-9))]))
+        beta1 = rates.long_beta1 if options.grows else rates.beta1
         if not options.grows or step.progress < GROWTH:  # none come that could fill what is cut
             ratio = np.inf
         return {
             "rates": step_sizes(rates, step.progress, options.steps),
             "limits": np.array([*moves, ratio, long], np.float32),
-            "betas": np.array([rates.beta1, rates.beta2], np.float32),
+            "betas": np.array([beta1, rates.beta2], np.float32),
             "regs": np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32),
         }
 
