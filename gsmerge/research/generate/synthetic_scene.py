@@ -91,7 +91,7 @@ class GenerateOptions(Settings):
     """Settings of synthetic scenes."""
 
     views: int = setting(
-        6, "Number of views in a scene.", "One target is between any two neighbours.", least=2, most=200
+        6, "Number of views in a scene.", "One target is between any two neighbours.", least=2, most=1000
     )
     width: int = setting(320, "Width of the views.", least=16, most=2048, unit="pixels")
     height: int = setting(240, "Height of the views.", least=16, most=2048, unit="pixels")
