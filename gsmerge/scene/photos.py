@@ -411,7 +411,8 @@ def _explain(proposal: Proposal, view: int, name: str) -> str:
 def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None]) -> list[str]:
     """Note photos beside those that are used that have no camera, where most have one."""
     used = [proposal.pool[each.photo] for each in chosen if each is not None]
-    folders, stems = {path.parent for path in used}, {path.stem for path in used}
+    named = [proposal.pool[photo] for photo in proposal.named if photo is not None]
+    folders, stems = {path.parent for path in used}, {path.stem for path in (*used, *named)}
     spare = [path for path in proposal.pool if path.parent in folders and path.stem not in stems]
     if not proposal.exact or not 0 < len(spare) < len(used):
         return []

@@ -111,6 +111,17 @@ def test_a_photo_without_a_camera_is_named(folder: Path, truth: np.ndarray) -> N
     assert not any("without a camera" in text for text in load_scene(folder).notes)
 
 
+def test_a_photo_of_something_else_has_a_camera(folder: Path) -> None:
+    """One note says so; none that its camera is missing."""
+    other = photos_in(folder)[0]
+    stripes = np.zeros_like((read(other) * 255).astype(np.uint8))
+    stripes[::3, :, 1] = 200
+    Image.fromarray(stripes).save(other)
+    notes = load_scene(folder).notes
+    assert any(names(text, "1 of 4 views are left out", other.name, "shows something else") for text in notes)
+    assert not any("without a camera" in text for text in notes)
+
+
 def test_a_photo_in_a_format_that_is_not_read(folder: Path) -> None:
     path = photos_in(folder)[1]
     path.rename(path.with_suffix(".HEIC"))
