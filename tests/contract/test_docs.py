@@ -144,10 +144,11 @@ def benchmark_calls() -> list[str]:
     """Every call of a benchmark inside the text of a page."""
     texts = [re.sub(r"```.*?```", "", read(page), flags=re.DOTALL).replace("\n", " ") for page in WRITTEN]
     calls = {call for text in texts for call in re.findall(r"`python (benchmarks/[^`]+)`", text)}
-    return sorted(calls - {TRAINING})
+    return sorted(calls - {TRAINING, GROWTH})
 
 
-TRAINING = "benchmarks/training.py made"  # the only one that needs no captures
+# Those that need no captures; one takes minutes, and is not run here
+TRAINING, GROWTH = "benchmarks/training.py made", "benchmarks/growth.py"
 
 
 @pytest.mark.slow
