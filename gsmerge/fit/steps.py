@@ -94,12 +94,12 @@ class Optimiser:
         drawn = tile_view(state.splats, **camera, opacities=opacities)
         all_colors = state.view_colors()
         colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
-        image, transmittance = blend(drawn, colors, step.background, early=True)
+        image, transmittance = blend(drawn, colors, step.background)
         rates = self.run.job.options.tuning
         weights = loss_weights(rates, step.progress)
         gradient, error = image_gradient(image, photo, weight, *weights)
         with_viewmat = self.poses is not None
-        g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=with_viewmat, early=True)
+        g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=with_viewmat)
         if self.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
             self.poses.step(step.view, g.viewmat, rates, step.progress)
         self._move(state, g, step)
@@ -139,13 +139,12 @@ class Optimiser:
         moves = rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change
         widest = max(photos.width for photos in self.run.job.photos)  # of the size whose pixels the least scale counts
         ratio, long = log(np.array([rates.max_ratio, rates.long_share * widest / (3 * max(rates.min_scale, 1e-9))]))
-        beta1 = rates.long_beta1 if options.grows else rates.beta1
         if not options.grows or step.progress < GROWTH:  # none come that could fill what is cut
             ratio = np.inf
         return {
             "rates": step_sizes(rates, step.progress, options.steps),
             "limits": np.array([*moves, ratio, long], np.float32),
-            "betas": np.array([beta1, rates.beta2], np.float32),
+            "betas": np.array([rates.beta1, rates.beta2], np.float32),
             "regs": np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32),
         }
 

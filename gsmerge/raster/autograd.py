@@ -57,7 +57,7 @@ class _Render(torch.autograd.Function):
                 for tensor in (images[view], lefts[view], grad_images[view], grad_alphas[view, ..., 0])
             )
             colors, moves = view_colors(tiled), ctx.needs_input_grad[-1]
-            shape = gradients_of(tiled, colors, image, left, grad_image, -grad_alpha, with_viewmat=moves)
+            shape = gradients_of(tiled, colors, image, left, grad_image, -grad_alpha, moves)
             shade = color_gradients(tiled, shape.colors, colors, used=shade)
             rows = [shape.means + shade.means, shape.quats, shape.scales, shape.opacities, shade.sh0, shade.shN]
             for total, row in zip(totals, rows, strict=True):

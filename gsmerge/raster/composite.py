@@ -39,16 +39,13 @@ def view_colors(tiled: TiledView) -> Array:
     return colors
 
 
-def blend(tiled: TiledView, colors: Array, background: Array, *, early: bool = False) -> tuple[Array, Array]:
-    """Blend ``colors [m,3]`` of the Gaussians of a view; return image ``[h,w,3]`` and transmittance ``[h,w]``.
-
-    ``early``: whether pixels stop where all but 1 / 255 of their light is taken, which is less than a step of 8 bits.
-    """
+def blend(tiled: TiledView, colors: Array, background: Array) -> tuple[Array, Array]:
+    """Blend ``colors [m,3]`` of the Gaussians of a view; return image ``[h,w,3]`` and transmittance ``[h,w]``."""
     image = np.empty((tiled.height, tiled.width, 3), np.float32)
     transmittance = np.empty((tiled.height, tiled.width), np.float32)
 
     def tiles(span: tuple[int, int]) -> None:
-        kernels.blend(*tiled.lists, colors, *span, tiled.top, early, background, image, transmittance)
+        kernels.blend(*tiled.lists, colors, *span, tiled.top, background, image, transmittance)
 
     with use_threads() as threads:
         parallel_map(tiles, tile_ranges(tiled, threads))

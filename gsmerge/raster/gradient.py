@@ -63,16 +63,14 @@ def gradients_of(
     transmittance: Array,
     grad_image: Array,
     grad_left: Array | None,
-    *,
     with_viewmat: bool,
-    early: bool = False,
 ) -> Gradients:
     """Return the gradients of a loss on the image that :func:`gsmerge.raster.composite` made of a view.
 
     All arrays are float32 and contiguous. ``grad_image [h,w,3]`` and ``grad_left [h,w]`` (None: zero) are those of the
     loss by the image and by the transmittance; ``image [h,w,3]``, with its background, and ``transmittance [h,w]`` are
-    what ``composite`` returned, ``colors [m,3]`` those of the view's Gaussians. ``early``: as of ``blend``. Gradients
-    are zero where alpha is clamped at 0.99, and through what decides which weights are drawn at all.
+    what ``composite`` returned, ``colors [m,3]`` those of the view's Gaussians. Gradients are zero where alpha is
+    clamped at 0.99, and through what decides which weights are drawn at all.
     """
     m, splats = len(tiled.ids), tiled.splats
     slots = np.empty((len(tiled.flatten_ids), SUMS), np.float32)
@@ -83,7 +81,7 @@ def gradients_of(
     poses = np.empty((num_blocks, POSE), np.float32) if with_viewmat else None
 
     def tiles(span: tuple[int, int]) -> None:
-        blend_backward(*tiled.lists, colors, *span, early, image, transmittance, grad_image, grad_left, slots)
+        blend_backward(*tiled.lists, colors, *span, image, transmittance, grad_image, grad_left, slots)
 
     def project(span: tuple[int, int]) -> None:
         gather_slots(tiled.flatten_ids, slots, *span, sums)

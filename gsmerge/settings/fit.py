@@ -28,7 +28,6 @@ class Tuning:
     poses_lr: float = 0.1  # First step of a moved camera: turns and shifts by so many pixels
     decay: float = 0.4  # Factor on the other steps at the end; less beyond 300 steps
     beta1: float = 0.5  # Decay of Adam's first moment
-    long_beta1: float = 0.7  # The same of Gaussians in runs that grow, which have time for a mean over more steps
     beta2: float = 0.9  # Decay of its second moment
     max_mean_shift: float = 2.0  # Largest shift of a mean, in units of the Gaussian's size
     max_scale_change: float = 2.5  # Largest change of a log scale

@@ -120,7 +120,6 @@ def render_reference(
     far: float = 1e10,
     eps2d: float = 0.3,
     max_alpha: float = 0.99,
-    early: bool = False,
 ) -> Reference:
     """Blend Gaussians of given colours ``[n,3]``, nearest first."""
     means2d, covars2d, depths = footprints(means, quats, scales, viewmat, K, width, height)
@@ -142,7 +141,7 @@ def render_reference(
         alpha = torch.clamp(alpha, max=max_alpha)
         drawn = going & (alpha >= 1 / 255)
         following = transmittance * (1 - alpha)
-        going = going & ~(transmittance <= 1 / 255 if early else drawn & (following <= 1e-4))
+        going = going & ~(drawn & (following <= 1e-4))
         drawn = drawn & going
         weights[g] = torch.where(drawn, transmittance * alpha, 0.0)
         transmittance = torch.where(drawn, following, transmittance)

@@ -23,13 +23,13 @@ static inline void add_total(float *own, const Weights w[2]) {
 
 // Blend Gaussian j of a batch over rows y0 to y1 of eight columns; planes 1 to 3 collect the colour, if there are such ->
 // its weights, if anybody asks.
-INLINE Weights blend_rows(float *columns, const v8f *alphas, const Batch *b, int64_t j, int32_t y0, int32_t y1,
-                                 bool colored, bool early) {
+static inline Weights blend_rows(float *columns, const v8f *alphas, const Batch *b, int64_t j, int32_t y0, int32_t y1,
+                                 bool colored) {
   Weights weights = {{0}, {0}};
   float red = b->red[j], green = b->green[j], blue = b->blue[j];
   for (int32_t y = y0; y <= y1; y++) {
     float *row = columns + y * TILE;
-    Share s = take_share(load8(row), alphas[y], early);
+    Share s = take_share(load8(row), alphas[y]);
     store8(row, s.left);
     if (colored) {
       store8(row + PLANE, load8(row + PLANE) + s.weight * red);
@@ -43,14 +43,14 @@ INLINE Weights blend_rows(float *columns, const v8f *alphas, const Batch *b, int
 }
 
 // Blend Gaussian j of a batch over the eight columns in which it shows, or over both halves of the tile.
-INLINE void blend_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, bool early) {
+static inline void blend_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
   Curve curve;
   v8f alphas[TILE];
   trace(&curve, b, j);
   bool wide = b->x0[j] == WIDE;
   for (int32_t x = wide ? 0 : b->x0[j]; x <= (wide ? HALF : b->x0[j]); x += HALF) {
     fill_alphas(alphas, &curve, x, y0, y1);
-    blend_rows(state + x, alphas, b, j, y0, y1, true, early);
+    blend_rows(state + x, alphas, b, j, y0, y1, true);
   }
 }
 
@@ -63,30 +63,31 @@ static inline void survey_one(float *state, const Batch *b, int64_t j, int32_t y
   trace(&curve, b, j);
   for (int half = 0; half < 2; half++) {
     fill_alphas(alphas, &curve, half * HALF, y0, y1);
-    weights[half] = blend_rows(state + half * HALF, alphas, b, j, y0, y1, colored, false);
+    weights[half] = blend_rows(state + half * HALF, alphas, b, j, y0, y1, colored);
   }
   add_total(own, weights);
 }
 
-INLINE int32_t blend_tiles(const Lists *lists, const float *restrict colors, int64_t first, int64_t last,
-                                  int64_t top, const float *restrict background, float *restrict image,
-                                  float *restrict transmittance, int64_t h, int64_t w, bool early) {
-  const int32_t *flatten_ids = lists->flatten_ids;
-  const int64_t *isect_offsets = lists->isect_offsets;
+API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_ids,
+                  const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
+                  int64_t first, int64_t last, int64_t top, const float *restrict background, float *restrict image,
+                  float *restrict transmittance, int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
+  if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
   float state[4 * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
   for (int64_t tile = first; tile < last; tile++) {
-    Tile t = open_tile(state, 4, tile, lists->tile_width, top + h, w);
+    Tile t = open_tile(state, 4, tile, tile_width, top + h, w);
     if (t.top < top) continue;
     int64_t end = isect_offsets[tile + 1];
     for (int64_t start = isect_offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
-      if (!gather(&batch, &t, lists, start, stop, end)) return OUTSIDE;
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       gather_colors(&batch, colors, flatten_ids, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++) {
         int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
-        if (y0 <= y1) blend_one(state, &batch, j, y0, y1, early);
+        if (y0 <= y1) blend_one(state, &batch, j, y0, y1);
       }
       narrow_tile(&t, state);
     }
@@ -102,18 +103,6 @@ INLINE int32_t blend_tiles(const Lists *lists, const float *restrict colors, int
   return 0;
 }
 
-API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_ids,
-                  const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
-                  int64_t first, int64_t last, int64_t top, int64_t early, const float *restrict background,
-                  float *restrict image, float *restrict transmittance, int64_t m, int64_t n, int64_t ends, int64_t h,
-                  int64_t w) {
-  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
-  if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
-  if (early)  // as a constant, so that each has a loop of its own
-    return blend_tiles(&lists, colors, first, last, top, background, image, transmittance, h, w, true);
-  return blend_tiles(&lists, colors, first, last, top, background, image, transmittance, h, w, false);
-}
-
 // Weights of Gaussian j times the planes of some channels, summed over the tile.
 static inline void sum_weights(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, int channels,
                                float *slot) {
@@ -124,7 +113,7 @@ static inline void sum_weights(float *state, const Batch *b, int64_t j, int32_t 
     fill_alphas(alphas, &curve, half * HALF, y0, y1);
     for (int32_t y = y0; y <= y1; y++) {
       float *row = state + y * TILE + half * HALF;
-      Share s = take_share(load8(row), alphas[y], false);
+      Share s = take_share(load8(row), alphas[y]);
       store8(row, s.left);
       for (int c = 0; c < channels; c++) sums[half][c] += s.weight * load8(row + (c + 1) * PLANE);
     }

@@ -25,18 +25,13 @@ TILES = {"first": i8(), "last": i8()}
 
 
 @native(
-    STATUS, **LISTS, colors=f4("m", 3), **TILES, top=i8(least=0, below=MAX_SIZE), early=i8(least=0, below=2),
-    background=f4(3),
+    STATUS, **LISTS, colors=f4("m", 3), **TILES, top=i8(least=0, below=MAX_SIZE), background=f4(3),
     image=f4("h", "w", 3, out=True), transmittance=f4("h", "w", out=True),
 )  # fmt: skip
-def blend(
-    conics, flatten_ids, isect_offsets, tile_width, colors, first, last, top, early,
-    background, image, transmittance,
-):  # fmt: skip
+def blend(conics, flatten_ids, isect_offsets, tile_width, colors, first, last, top, background, image, transmittance):
     """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``.
 
-    These arrays hold the view's rows from ``top`` on; tiles that begin outside them are skipped. ``early``: whether a
-    pixel stops where all but 1 / 255 of its light is taken.
+    These arrays hold the view's rows from ``top`` on; tiles that begin outside them are skipped.
     """
 
 
@@ -83,18 +78,16 @@ def parts_of_tile(conics, flatten_ids, left, top, parts):
 
 
 @native(
-    STATUS, **LISTS, colors=f4("m", 3), **TILES, early=i8(least=0, below=2),
-    image=f4("h", "w", 3), transmittance=f4("h", "w"),
+    STATUS, **LISTS, colors=f4("m", 3), **TILES, image=f4("h", "w", 3), transmittance=f4("h", "w"),
     grad_image=f4("h", "w", 3), grad_left=f4("h", "w", optional=True), slots=f4("n", SUMS, out=True),
 )  # fmt: skip
 def blend_backward(
-    conics, flatten_ids, isect_offsets, tile_width, colors, first, last, early,
+    conics, flatten_ids, isect_offsets, tile_width, colors, first, last,
     image, transmittance, grad_image, grad_left, slots,
 ):  # fmt: skip
     """Write the gradient sums of a range of tiles, one row per intersection.
 
     Args:
-        early: As of :func:`blend`.
         image: ``[h,w,3]`` float32, the blended image, background included.
         transmittance: ``[h,w]`` float32, what is left of it.
         grad_image: ``[h,w,3]`` float32, gradient with respect to ``image``.

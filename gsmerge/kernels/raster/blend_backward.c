@@ -17,13 +17,13 @@ typedef struct {
 } Wants;
 
 // Take Gaussian j of a batch off the pixels of rows y0 to y1, or of every second, of eight columns -> what they want.
-INLINE Wants walk_rows(float *columns, const v8f *alphas, const Batch *b, int64_t j, int32_t y0, int32_t y1,
-                              int32_t step, bool early) {
+static inline Wants walk_rows(float *columns, const v8f *alphas, const Batch *b, int64_t j, int32_t y0, int32_t y1,
+                              int32_t step) {
   float my = b->my[j], red = b->red[j], green = b->green[j], blue = b->blue[j];
   Wants w = {{0}, {0}, {0}, {0}, {0}, {0}};
   for (int32_t y = y0; y <= y1; y += step) {
     float *row = columns + y * TILE, dy = (float)y - my;
-    Share s = take_share(load8(row), alphas[y], early);
+    Share s = take_share(load8(row), alphas[y]);
     v8f g0 = load8(row + 2 * PLANE), g1 = load8(row + 3 * PLANE), g2 = load8(row + 4 * PLANE);
     v8f own = s.weight * (red * g0 + green * g1 + blue * g2), rest = load8(row + PLANE) - own;
     v8f v = sel8(s.goes & s.unclamped, own - s.alpha * rest / (1.f - s.alpha), splat8(0.f)), vy = v * dy;
@@ -49,35 +49,37 @@ static inline void add_columns(Wants a, Wants b, v16f dx, float *slot) {
 
 // Take Gaussian j of a batch off the pixels of rows y0 to y1 and write what they want of it. Sixteen sums are kept by
 // column: of both halves of the tile, or of the even and the odd rows of the eight columns in which it shows.
-INLINE void walk_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot, bool early) {
+static inline void walk_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
   Curve curve;
   v8f alphas[TILE];
   trace(&curve, b, j);
   if (b->x0[j] == WIDE) {
     fill_alphas(alphas, &curve, 0, y0, y1);
-    Wants left = walk_rows(state, alphas, b, j, y0, y1, 1, early);
+    Wants left = walk_rows(state, alphas, b, j, y0, y1, 1);
     fill_alphas(alphas, &curve, HALF, y0, y1);
-    add_columns(left, walk_rows(state + HALF, alphas, b, j, y0, y1, 1, early), COLUMNS - b->mx[j], slot);
+    add_columns(left, walk_rows(state + HALF, alphas, b, j, y0, y1, 1), COLUMNS - b->mx[j], slot);
   } else {
     int32_t odd = y0 > 0 && (y1 - y0) % 2 == 0, x = b->x0[j];  // whether the rows begin with the second of a pair
     fill_alphas(alphas, &curve, x, y0, y1);
-    Wants first = walk_rows(state + x, alphas, b, j, y0 + odd, y1, 2, early);
-    Wants second = walk_rows(state + x, alphas, b, j, y0 + 1 - odd, y1, 2, early);
+    Wants first = walk_rows(state + x, alphas, b, j, y0 + odd, y1, 2);
+    Wants second = walk_rows(state + x, alphas, b, j, y0 + 1 - odd, y1, 2);
     add_columns(first, second, PAIR_COLUMNS + (float)x - b->mx[j], slot);
   }
 }
 
-INLINE int32_t walk_tiles(const Lists *lists, const float *restrict colors, int64_t first, int64_t last,
-                                 const float *restrict image, const float *restrict transmittance,
-                                 const float *restrict grad_image, const float *restrict grad_left,
-                                 float *restrict slots, int64_t h, int64_t w, bool early) {
-  const int32_t *flatten_ids = lists->flatten_ids;
-  const int64_t *isect_offsets = lists->isect_offsets;
+API int32_t blend_backward(const float *restrict conics, const int32_t *restrict flatten_ids,
+                           const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
+                           int64_t first, int64_t last, const float *restrict image,
+                           const float *restrict transmittance, const float *restrict grad_image,
+                           const float *restrict grad_left, float *restrict slots, int64_t m, int64_t n, int64_t ends,
+                           int64_t h, int64_t w) {
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
+  if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
   float state[5 * PLANE] __attribute__((aligned(64)));
   Batch batch;
   clear_batch(&batch);
   for (int64_t tile = first; tile < last; tile++) {
-    Tile t = open_tile(state, 5, tile, lists->tile_width, h, w);
+    Tile t = open_tile(state, 5, tile, tile_width, h, w);
     for (int y = 0; y < t.num_y; y++)
       for (int x = 0; x < t.num_x; x++) {
         int64_t pixel = (t.top + y) * w + t.left + x;
@@ -92,7 +94,7 @@ INLINE int32_t walk_tiles(const Lists *lists, const float *restrict colors, int6
     int64_t start = isect_offsets[tile], end = isect_offsets[tile + 1];
     for (; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
-      if (!gather(&batch, &t, lists, start, stop, end)) return OUTSIDE;
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       gather_colors(&batch, colors, flatten_ids, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++) {
         int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
@@ -100,26 +102,13 @@ INLINE int32_t walk_tiles(const Lists *lists, const float *restrict colors, int6
         if (y0 > y1)
           for (int c = 0; c < SUMS; c++) slot[c] = 0.f;
         else
-          walk_one(state, &batch, j, y0, y1, slot, early);
+          walk_one(state, &batch, j, y0, y1, slot);
       }
       narrow_tile(&t, state);
     }
     for (int64_t i = SUMS * start; i < SUMS * end; i++) slots[i] = 0.f;
   }
   return 0;
-}
-
-API int32_t blend_backward(const float *restrict conics, const int32_t *restrict flatten_ids,
-                           const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
-                           int64_t first, int64_t last, int64_t early, const float *restrict image,
-                           const float *restrict transmittance, const float *restrict grad_image,
-                           const float *restrict grad_left, float *restrict slots, int64_t m, int64_t n, int64_t ends,
-                           int64_t h, int64_t w) {
-  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
-  if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
-  if (early)  // as a constant, so that each has a loop of its own
-    return walk_tiles(&lists, colors, first, last, image, transmittance, grad_image, grad_left, slots, h, w, true);
-  return walk_tiles(&lists, colors, first, last, image, transmittance, grad_image, grad_left, slots, h, w, false);
 }
 
 // Intersections of other ranges' Gaussians are left out without a branch, which would be mispredicted.

@@ -82,7 +82,7 @@ static inline void basis_4(Block *b, int j) {
 }
 
 // Rows of the first harmonics of a block from its planes. The loops over a known number unroll.
-INLINE void turn(Block *b, int count) {
+static inline __attribute__((always_inline)) void turn(Block *b, int count) {
   for (int j = 0; j < BLOCK; j++)
     for (int k = 0; k < count; k++) b->rows[j][k] = b->planes[k][j];
 }
@@ -120,7 +120,7 @@ static inline v16f sum_colors(v16f v) {
 }
 
 // Colours of at most three harmonics: too few for blocks.
-INLINE void
+static inline __attribute__((always_inline)) void
 few_colors(const float *restrict means, const float *restrict sh0, const float *restrict shN,
            const int32_t *restrict ids, const float *restrict eye, int64_t first, int64_t last,
            int num, float *restrict colors) {

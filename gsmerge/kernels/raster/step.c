@@ -12,11 +12,11 @@ API void sort_bits(const uint32_t *, int32_t *, uint64_t *, uint64_t *, int64_t)
 API int32_t count_boxes(const int16_t *, int64_t, int64_t, int64_t *, int64_t *, int64_t, int64_t, int64_t);
 API int32_t deal_tiles(const int32_t *, const int16_t *, int64_t, int64_t *, int32_t *, int64_t, int64_t, int64_t);
 API int32_t blend(const float *, const int32_t *, const int64_t *, int64_t, const float *, int64_t, int64_t, int64_t,
-                     int64_t, const float *, float *, float *, int64_t, int64_t, int64_t, int64_t, int64_t);
+                     const float *, float *, float *, int64_t, int64_t, int64_t, int64_t, int64_t);
 API int32_t loss_gradient(const float *, const float *, const float *, float, float, int64_t, int64_t, float *,
                              float *, float *, float *, int64_t, int64_t, int64_t, int64_t);
 API int32_t blend_backward(const float *, const int32_t *, const int64_t *, int64_t, const float *, int64_t, int64_t,
-                              int64_t, const float *, const float *, const float *, const float *, float *, int64_t, int64_t,
+                              const float *, const float *, const float *, const float *, float *, int64_t, int64_t,
                               int64_t, int64_t, int64_t);
 API int32_t gather_slots(const int32_t *, const float *, int64_t, int64_t, float *, int64_t, int64_t);
 API int32_t project_backward(const float *, const float *, const float *, const float *, const int32_t *,
@@ -115,7 +115,7 @@ static int32_t deal_span(Step *s, int64_t i) {
 
 static int32_t blend_range(Step *s, int64_t i) {
   int64_t num = RANGES * s->threads;
-  return blend(s->conics, s->flatten_ids, s->offsets, columns_of(s), s->tints, cut(s, i, num), cut(s, i + 1, num), 0, 1,
+  return blend(s->conics, s->flatten_ids, s->offsets, columns_of(s), s->tints, cut(s, i, num), cut(s, i + 1, num), 0,
                s->background, s->image, s->transmittance, s->num_visible, s->num_intersections, s->ends, s->height,
                s->width);
 }
@@ -130,7 +130,7 @@ static int32_t loss_rows(Step *s, int64_t i) {
 static int32_t backward_range(Step *s, int64_t i) {
   int64_t num = RANGES * s->threads;
   return blend_backward(s->conics, s->flatten_ids, s->offsets, columns_of(s), s->tints, cut(s, i, num),
-                        cut(s, i + 1, num), 1, s->image, s->transmittance, s->gradient, 0, s->slots, s->num_visible,
+                        cut(s, i + 1, num), s->image, s->transmittance, s->gradient, 0, s->slots, s->num_visible,
                         s->num_intersections, s->ends, s->height, s->width);
 }
 

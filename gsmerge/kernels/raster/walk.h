@@ -1,8 +1,8 @@
 // A Gaussian of a batch over the rows of a tile, eight pixels at a time: what the blending kernels share.
 //
 // A tile's state lives in planes of 16 x 16 floats. The weights are gsplat's: alpha clamped at 0.99, cut below 1/255,
-// and a pixel stops before the Gaussian that would take its transmittance to 1e-4 or below, or early: behind the one that
-// takes it to 1/255 or below. Plane 0 of the state is the transmittance; its sign bit marks pixels that stopped.
+// and a pixel stops before the Gaussian that would take its transmittance to 1e-4 or below. Plane 0 of the state is the
+// transmittance; its sign bit marks pixels that stopped.
 #pragma once
 #include "native.h"
 
@@ -11,7 +11,6 @@ enum { TILE = 16, HALF = TILE / 2, PLANE = TILE * TILE, BATCH = 32, CONIC = 8, S
 #define LN_CUT -5.541263545158426f  // ln(1/255)
 #define MAX_ALPHA 0.99f
 #define MIN_TRANSMITTANCE 1e-4f
-#define SPENT (1.f / 255.f)  // what such a share of the light shows is less than a step of 8 bits
 #define HIDDEN -1e4f  // an exponent that shows nothing
 #define SPARE 0.02f  // rows and columns beside those in which a Gaussian shows, for rounding
 
@@ -51,10 +50,10 @@ static inline v8f alphas_at(v8f p) {
   return sel8(p >= LN_CUT, sel8(e < MAX_ALPHA, e, splat8(MAX_ALPHA)), splat8(0.f));
 }
 
-static inline Share take_share(v8f t, v8f alpha, bool early) {
+static inline Share take_share(v8f t, v8f alpha) {
   Share s = {alpha, alpha * t, t, alpha < MAX_ALPHA, {0}};
   s.left = t - s.weight;
-  s.goes = early ? t > SPENT : s.left > MIN_TRANSMITTANCE;
+  s.goes = s.left > MIN_TRANSMITTANCE;
   s.weight = sel8(s.goes, s.weight, splat8(0.f));
   s.left = sel8(s.goes, s.left, (v8f)((v8i)t | INT32_MIN));
   return s;
@@ -232,7 +231,7 @@ static inline void weigh_rows(float *state, const Batch *b, int64_t j, int32_t y
     fill_alphas(alphas, &curve, x, y0, y1);
     for (int32_t y = y0; y <= y1; y++) {
       float *row = state + y * TILE + x;
-      Share s = take_share(load8(row), alphas[y], false);
+      Share s = take_share(load8(row), alphas[y]);
       store8(row, s.left);
       store8(row + PLANE, s.weight);
     }

@@ -12,7 +12,6 @@ from sweeps import sweep
 from gsmerge import Cameras, Gaussians
 from gsmerge.kernels import elementary
 from gsmerge.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
-from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.metrics import psnr
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile
@@ -53,21 +52,6 @@ def test_antialiased_images_match() -> None:
     rendering = render(gaussians, cameras, antialiased=True)
     assert_alike(rendering.images[0], reference(gaussians, cameras, antialiased=True).image)
     assert psnr(rendering.images[0], render(gaussians, cameras).images[0]) < 60
-
-
-def test_early_stops_match_and_are_near() -> None:
-    """What is behind all but a step of 8 bits of the light is left out."""
-    gaussians, cameras = random_gaussians(300, 11), turned_camera()
-    gaussians = replace(gaussians, scales=gaussians.scales * 2)
-    camera = cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT
-    tiled, black = tile_view(make_splats(gaussians.numpy()), *camera), np.zeros(3, np.float32)
-    colors = view_colors(tiled)
-    (image, left), (whole, _) = (blend(tiled, colors, black, early=early) for early in (True, False))
-    expected = reference(gaussians, cameras, early=True)
-    assert_alike(image, expected.image)
-    assert_alike(left, expected.transmittance)
-    assert 0 < (left < 1 / 255).mean() < 1
-    assert 0 < np.abs(image - whole).max() < 2 * colors.max() / 255
 
 
 def test_depth_range_matches() -> None:

@@ -14,7 +14,7 @@ from view_gradients_of import assert_near, full, normal, turned_view
 
 from gsmerge import Gaussians
 from gsmerge.raster import TiledView, composite, make_splats, tile_view
-from gsmerge.raster.composite import blend, view_colors
+from gsmerge.raster.composite import view_colors
 from gsmerge.raster.gradient import Gradients, color_gradients, gradients_of
 from gsmerge.runtime.threads import use_threads
 
@@ -23,26 +23,23 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 
-def gradients_of_view(
-    tiled: TiledView, colors: np.ndarray, grad_left: np.ndarray | None, early: bool = False
-) -> Gradients:
-    seen = colors[tiled.ids]
-    image, left = blend(tiled, seen, np.array(BACKGROUND, np.float32), early=early)
-    grad_image = normal(HEIGHT, WIDTH, 3)
-    return gradients_of(tiled, seen, image, left, grad_image, grad_left, with_viewmat=True, early=early)
+def gradients_of_view(tiled: TiledView, colors: np.ndarray, grad_left: np.ndarray | None) -> Gradients:
+    image, transmittance = composite(tiled, colors, BACKGROUND)
+    return gradients_of(
+        tiled, colors[tiled.ids], image, transmittance, normal(HEIGHT, WIDTH, 3), grad_left, with_viewmat=True
+    )
 
 
 @sweep("eps2d", [0.075, 0.3, 1.0])
 @sweep("with_left", [False, True])
-@pytest.mark.parametrize("early", [False, True])
-def test_any_colours_dilations_and_transmittances(eps2d: float, with_left: bool, early: bool) -> None:
+def test_any_colours_dilations_and_transmittances(eps2d: float, with_left: bool) -> None:
     gaussians, cameras, colors = random_gaussians(40, 0, 1), turned_cameras(1), normal(40, 3, seed=2)
     grad_left = normal(HEIGHT, WIDTH, seed=3) if with_left else None
-    actual = gradients_of_view(turned_view(gaussians, eps2d=eps2d), colors, grad_left, early)
+    actual = gradients_of_view(turned_view(gaussians, eps2d=eps2d), colors, grad_left)
     names = ("means", "quats", "scales", "opacities")
     inputs = [getattr(gaussians, name).double() for name in names] + [torch.from_numpy(colors).double()]
     inputs = [tensor.requires_grad_() for tensor in [*inputs, cameras.viewmats[0].clone()]]
-    drawn = render_reference(*inputs, cameras.Ks[0], WIDTH, HEIGHT, background=BACKGROUND, eps2d=eps2d, early=early)
+    drawn = render_reference(*inputs, cameras.Ks[0], WIDTH, HEIGHT, background=BACKGROUND, eps2d=eps2d)
     loss = (drawn.image * torch.from_numpy(normal(HEIGHT, WIDTH, 3))).sum()
     if grad_left is not None:
         loss = loss + (drawn.transmittance * torch.from_numpy(grad_left)).sum()

@@ -41,11 +41,11 @@ def walks(given: dict[str, Any], first: int = 0, last: int = 4) -> list[Any]:
     walked = list(given.values())
     slots = np.empty((len(walked[1]), SUMS), np.float32)
     return [
-        lambda: blend(*walked, colors, first, last, 0, 0, np.zeros(3, np.float32), image, left),
+        lambda: blend(*walked, colors, first, last, 0, np.zeros(3, np.float32), image, left),
         lambda: weighted_sums(*walked, first, last, image, np.empty((len(walked[1]), 4), np.float32)),
         lambda: survey(*walked, colors, image, np.zeros((M, 2), np.float32)),
         lambda: contributions(*walked, SIDE, SIDE, np.zeros((M, 2), np.float32)),
-        lambda: blend_backward(*walked, colors, first, last, 0, image, left, image, None, slots),
+        lambda: blend_backward(*walked, colors, first, last, image, left, image, None, slots),
         lambda: list_weights(*walked, SIDE, SIDE),
     ]
 
