@@ -25,9 +25,12 @@ def test_a_protected_part_of_the_photos_is_shown_better(run: Run, made_scene: Pa
         assert cv2.imwrite(str(path), picture)
     for words in ([], ["--protect", tmp_path / "signs"]):
         out = tmp_path / "small.ply"
-        done = run("compact", made_scene, "-o", out, "--budget", "2%", "--json", "--overwrite", *words)
-        drawn = gsmerge.render(gsmerge.read_gaussians(out).gaussians, scene.cameras).images
-        errors = [psnr(drawn[view].clip(0, 1)[SIGN], scene.images[view][SIGN]) for view in range(len(scene))]
+        errors = []
+        for seed in (0, 1):  # between which results of so few pixels differ by some tenths of a dB
+            call = "compact", made_scene, "-o", out, "--budget", "2%", "--json", "--overwrite", "--seed", seed, *words
+            done = run(*call)
+            drawn = gsmerge.render(gsmerge.read_gaussians(out).gaussians, scene.cameras).images
+            errors += [psnr(drawn[view].clip(0, 1)[SIGN], scene.images[view][SIGN]) for view in range(len(scene))]
         after.append((np.mean(errors), json.loads(done.out)))
     (plain, without), (better, report) = after
     assert without["psnr_protected"] is None
