@@ -16,7 +16,7 @@ import numpy as np
 from gsmerge.alignment.frames import solve_pose
 from gsmerge.alignment.score import Correspondences, check_pairs, is_as_near, photo_colors, pixel_errors, pixel_limit
 from gsmerge.errors import SceneError
-from gsmerge.geometry import camera_depths, project_points, robust_weights
+from gsmerge.geometry import camera_depths, is_inside, project_points, robust_weights
 from gsmerge.io.cameras.camera_file import (
     CONVENTIONS,
     Convention,
@@ -152,7 +152,7 @@ def _disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray
     for view in range(len(cameras)):
         with np.errstate(all="ignore"):
             xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
-        inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1) & (pairs.views != view)
+        inside = (depth > 0) & is_inside(xy, cameras) & (pairs.views != view)
         column, row = xy[inside].astype(np.int64).T
         errors.append(np.abs(photo_colors(images, np.full(len(row), view), row, column) - own[inside]).mean(1))
     values = np.concatenate(errors)

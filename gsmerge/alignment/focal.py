@@ -23,7 +23,7 @@ from gsmerge.alignment.layouts import exact_layouts, subsample, view_orders
 from gsmerge.alignment.row_grid import find_layouts
 from gsmerge.alignment.score import Correspondences, find_correspondences, is_clearly_nearer, pixel_limit
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
-from gsmerge.geometry import project_points, sh0_to_rgb
+from gsmerge.geometry import is_inside, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, Size, as_floats, photo_size, resize_to
@@ -225,7 +225,7 @@ def _color_error(points: np.ndarray, colors: np.ndarray, cameras: Cameras, image
     for view, image in enumerate(images):
         with np.errstate(all="ignore"):
             xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
-        inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
+        inside = (depth > 0) & is_inside(xy, cameras)
         x, y = xy[inside].T - 0.5
         errors = np.abs(colors[inside] - sample_bilinear(image, x, y)).mean(1)
         total += float(np.minimum(errors, _MOST).sum()) + _MOST * (len(points) - len(errors))

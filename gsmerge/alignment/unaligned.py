@@ -11,7 +11,7 @@ from gsmerge.alignment.cameras import Poses, describe_reading, other_conventions
 from gsmerge.alignment.frames import usual_frames
 from gsmerge.alignment.score import MARGIN, RANDOM_SHARE, SAME_COLORS, AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
-from gsmerge.geometry import IDENTITY, Similarity, lower_median, project_points, sh0_to_rgb
+from gsmerge.geometry import IDENTITY, Similarity, is_inside, lower_median, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention
 from gsmerge.kernels.elementary import exp
 from gsmerge.types import Cameras, Gaussians
@@ -81,8 +81,7 @@ def check_cameras(
         some = cameras[first : first + at_once]
         with np.errstate(all="ignore"):
             xy, depth = project_points(points[None], some.viewmats, some.Ks)
-            x, y = np.floor(xy[..., 0]), np.floor(xy[..., 1])
-        inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < cameras.width) & (y < cameras.height)
+        inside, x, y = (depth > 0) & is_inside(xy, cameras), xy[..., 0], xy[..., 1]
         visible |= inside.any(0)
         for view in np.flatnonzero(inside.any(1)) if len(images) else ():
             seen = np.flatnonzero(inside[view])

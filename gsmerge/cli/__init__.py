@@ -71,8 +71,9 @@ def _keep_memory() -> None:
     import ctypes
 
     with suppress(AttributeError, OSError, TypeError):  # another C library
+        mallopt = ctypes.CDLL(None).mallopt
         for parameter in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
-            ctypes.CDLL(None).mallopt(*parameter)
+            mallopt(*parameter)
 
 
 def stop_at_once(*_: object) -> NoReturn:

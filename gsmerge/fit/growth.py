@@ -36,11 +36,9 @@ def grow_to(state: FitState, half: Photos, count: int) -> FitState:
 def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.ndarray]:
     """Split the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
 
-    Returns the state and its masses; each half has half the mass of its parent.
-
     Each is split at most once, so the number at most doubles. Gaussians that no photo shows are not split. Both halves
     inherit momentum, share of the box and least size. First halves keep the rows of their parents, second halves are
-    appended.
+    appended. Returns the state and its masses, of which each half has half of its parent's.
     """
     num = min(count - len(state.x), int((masses > 0).sum()))
     if num <= 0:

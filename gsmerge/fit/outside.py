@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.geometry import depths_inside, middle_depth, project, step_outside
+from gsmerge.geometry import depths_inside, is_inside, middle_depth, project, step_outside
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster import Splats, make_splats, tile_view
 from gsmerge.raster.composite import blend, blend_depths, depth_colors
@@ -63,9 +63,9 @@ class Outside:
 
     def contradict(self, points: np.ndarray, share: float) -> np.ndarray:
         """Return a mask ``[n]`` of points ``[n,3]`` that some view sees before a ``share`` of its limit."""
-        width, height = self.views.width, self.views.height
-        pixels, z = project(points, Cameras(self.views.viewmats, self.views.Ks, width, height))
-        inside = (z > self.near[:, None]) & ((pixels >= 0) & (pixels < (width, height))).all(2)
+        cameras = Cameras(self.views.viewmats, self.views.Ks, self.views.width, self.views.height)
+        pixels, z = project(points, cameras)
+        inside = (z > self.near[:, None]) & is_inside(pixels, cameras)
         view, point = np.nonzero(inside)
         column, row = pixels[inside].astype(np.int64).T
         wrong = z[inside] < share * self.limits[view, row, column]

@@ -14,7 +14,7 @@ from functools import reduce
 import cv2
 import numpy as np
 
-from gsmerge.geometry import correlation, project
+from gsmerge.geometry import correlation, is_inside, project
 from gsmerge.kernels.pictures import blur, sobel
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.photos import NEAR_PLANE
@@ -75,7 +75,7 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
 def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
     """Return whether a region ``[h,w]`` shows things several times as far away as the rest of the picture."""
     (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // MAX_SAMPLE_GAUSSIANS))], camera)
-    inside = (depths > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
+    inside = (depths > 0) & is_inside(pixels, camera)
     x, y = pixels[inside].astype(int).T
     hit, depths = region[y, x], depths[inside]
     return bool(hit.any() and not hit.all() and np.median(depths[hit]) > FAR * np.median(depths[~hit]))

@@ -18,7 +18,7 @@ from gsmerge.research.charts.lines import (
     ours_first,
     size_label,
 )
-from gsmerge.research.charts.measure_run import HELD_OUT, INPUT, MAX_ERROR, SCORES, RunRecord, picture_path
+from gsmerge.research.charts.measure_run import INPUT, MAX_ERROR, SCORES, RunRecord, judging_notes, picture_path
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.settings.compact import OURS
 
@@ -40,8 +40,7 @@ def make_page(
     scenes = list(dict.fromkeys(record.scene for record in records))
     names = ", ".join(scenes[:12]) + (", ..." if len(scenes) > 12 else "")
     words = f"{len(records)} runs on {len(scenes)} scene{'' if len(scenes) == 1 else 's'}: {names}"
-    judging = {record.scene: note for record in records for note in record.notes if note.startswith(HELD_OUT)}
-    words += "".join(f"; {scene}: {note}" for scene, note in judging.items())
+    words = "; ".join([words, *judging_notes(records)])
     return render_template(
         "charts.html",
         policy=PICTURES,

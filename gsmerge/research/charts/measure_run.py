@@ -6,7 +6,7 @@ import math
 import os
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
@@ -241,6 +241,12 @@ def _load(
         return scene, None, tuple(load.notes)
     names = ", ".join(held_out.names)
     return scene, held_out, (*load.notes, f"{HELD_OUT}: {names}")
+
+
+def judging_notes(records: Iterable[RunRecord]) -> list[str]:
+    """List the photos that judge the runs on each scene without targets, once a scene."""
+    notes = (f"{record.scene}: {note}" for record in records for note in record.notes if note.startswith(HELD_OUT))
+    return list(dict.fromkeys(notes))
 
 
 def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:

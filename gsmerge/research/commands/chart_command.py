@@ -114,14 +114,13 @@ def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     from gsmerge.research.charts.chart_page import make_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures
     from gsmerge.research.charts.lines import Results
-    from gsmerge.research.charts.measure_run import HELD_OUT, read_runs
+    from gsmerge.research.charts.measure_run import judging_notes, read_runs
 
     out = args.output
     records, more = read_runs(out)
     if not records:
         raise UsageError(f"{out}: expected finished runs, found none; name scenes to run")
-    judging = [f"{record.scene}: {note}" for record in records for note in record.notes if note.startswith(HELD_OUT)]
-    say_notes([*more, *dict.fromkeys(judging)], quiet=args.silent)
+    say_notes([*more, *judging_notes(records)], quiet=args.silent)
     figures = make_figures(Results(records))
     drawings = draw_figures(figures, out / CHARTS)
     command = shlex.join(["gsmerge", "lab", "chart", "--output", str(out)])
