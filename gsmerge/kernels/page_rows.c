@@ -19,11 +19,16 @@ static inline int32_t to_byte(double x) {
   return (int32_t)(x < 255.0 ? x : 255.0);
 }
 
-// Writes the differences of a row from the one before, their signs as lowest bits.
+// The difference of a number from the one before, its sign as the lowest bit.
+static inline uint32_t step_from(int32_t before, int32_t now) {
+  uint32_t by = (uint32_t)now - (uint32_t)before;
+  return (by << 1) ^ (by >> 31 ? UINT32_MAX : 0);
+}
+
+// Writes the differences of a row from the one before.
 static inline void put(const int32_t *row, int32_t *before, uint32_t *out, int64_t i, int64_t m, int64_t columns) {
   for (int64_t c = 0; c < columns; c++) {
-    uint32_t by = (uint32_t)row[c] - (uint32_t)before[c];
-    out[c * m + i] = (by << 1) ^ (by >> 31 ? UINT32_MAX : 0);
+    out[c * m + i] = step_from(before[c], row[c]);
     before[c] = row[c];
   }
 }
@@ -90,10 +95,7 @@ static void pack_harmonics(const double *restrict values, int32_t step, int64_t 
 
 // Writes the differences of a column from row to row, and keeps its last row for the next block.
 static void put_column(int32_t *restrict numbers, int64_t count, uint32_t *restrict out) {
-  for (int64_t i = 0; i < count; i++) {
-    uint32_t by = (uint32_t)numbers[1 + i] - (uint32_t)numbers[i];
-    out[i] = (by << 1) ^ (by >> 31 ? UINT32_MAX : 0);
-  }
+  for (int64_t i = 0; i < count; i++) out[i] = step_from(numbers[i], numbers[1 + i]);
   numbers[0] = numbers[count];
 }
 
