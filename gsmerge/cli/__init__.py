@@ -13,9 +13,6 @@ from contextlib import suppress
 from typing import NoReturn
 
 INTERRUPTED = 130  # exit code
-# Of glibc, see mallopt(3): bytes from which an array has pages of its own, which are given back when it goes, and bytes
-# that a process keeps for the next ones. Clearing new pages for each array was a tenth of a page's time.
-M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 GC_THRESHOLDS = 200_000, 10, 10  # a command imports 115,000 objects: looking for cycles in them takes 30 ms each time
 
 
@@ -66,16 +63,6 @@ def _open_streams() -> None:
             reconfigure(errors="backslashreplace")
 
 
-def _keep_memory() -> None:
-    """Let arrays take the places of those that went before, where the C library can."""
-    import ctypes
-
-    with suppress(AttributeError, OSError, TypeError):  # another C library
-        mallopt = ctypes.CDLL(None).mallopt
-        for parameter in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
-            mallopt(*parameter)
-
-
 def stop_at_once(*_: object) -> NoReturn:
     """End the process with a line, as the handler of SIGINT while there is nothing to clean up, such as in imports."""
     with suppress(OSError):
@@ -91,7 +78,6 @@ def program() -> NoReturn:
     """
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
         signal.signal(signal.SIGINT, stop_at_once)
-    _keep_memory()
     code = main()
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):

@@ -286,6 +286,9 @@ def command(*parameters: str | Parameter) -> Callable[[Callable[[Args], None]], 
             plain = {name: value.value if isinstance(value, Enum) else value for name, value in values.items()}
             args = Args(**plain)
             with opening_line(quiet=args.silent):
+                from gsmerge.runtime.memory import keep_memory
+
+                keep_memory()
                 function(args)
 
         run.__signature__ = Signature(list(listed.values()))  # type: ignore[attr-defined]
