@@ -224,6 +224,21 @@ def nearest_views(centres: np.ndarray, view: int) -> np.ndarray:
     return order[order != view]
 
 
+def camera_distances(cameras: Cameras) -> np.ndarray:
+    """Compute distances ``[v,v]`` between cameras: between centres in canonical units, plus between directions."""
+    viewmats = cameras.viewmats.astype(np.float64)
+    both = (camera_centres(viewmats), viewmats[:, 2, :3])
+    differences = [vectors[:, None] - vectors[None] for vectors in both]
+    return np.asarray(sum(np.sqrt((vectors * vectors).sum(-1)) for vectors in differences))
+
+
+def order_others(distances: np.ndarray) -> np.ndarray:
+    """Return for each view, by distances ``[v,v]``, the other views ``[v,v-1]``, the nearest first."""
+    apart = distances.copy()
+    np.fill_diagonal(apart, -1)
+    return np.argsort(apart, axis=1, kind="stable")[:, 1:]
+
+
 def median(values: np.ndarray) -> float:
     """Return the median of ``values [n]``, n >= 1, without the checks of ``np.median``; no value may be NaN."""
     middle = len(values) // 2

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.facts.photo_change import CLIPPED, PhotoChange, change_large
-from gsmerge.geometry import camera_centres, correlation, rgb_to_sh0, sh0_to_rgb
+from gsmerge.geometry import camera_distances, correlation, order_others, rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels.compare_views import find_surfaces
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import solve_symmetric
@@ -135,25 +135,10 @@ def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
 
     ``gains [v,3]`` are logarithms; ``distances [v,v]`` are the distances between cameras.
     """
-    nearest = _order_others(distances)[:, :2]
+    nearest = order_others(distances)[:, :2]
     away = gains - gains[nearest].mean(1)
     random = root_mean_square(gains) * np.sqrt(len(gains) / (len(gains) - 1) * (1 + 1 / nearest.shape[1]))
     return float(np.sqrt((away * away).mean()) / max(random, 1e-9))
-
-
-def camera_distances(cameras: Cameras) -> np.ndarray:
-    """Compute distances ``[v,v]`` between cameras: between centres in canonical units, plus between directions."""
-    viewmats = cameras.viewmats.astype(np.float64)
-    both = (camera_centres(viewmats), viewmats[:, 2, :3])
-    differences = [vectors[:, None] - vectors[None] for vectors in both]
-    return np.asarray(sum(np.sqrt((vectors * vectors).sum(-1)) for vectors in differences))
-
-
-def _order_others(distances: np.ndarray) -> np.ndarray:
-    """Return for each view the other views ``[v,v-1]``, the nearest first."""
-    apart = distances.copy()
-    np.fill_diagonal(apart, -1)
-    return np.argsort(apart, axis=1, kind="stable")[:, 1:]
 
 
 @dataclass(frozen=True)
@@ -215,7 +200,7 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
 
     The nearest views share the most surfaces; views at equal steps of rank connect groups of cameras.
     """
-    order = _order_others(distances)
+    order = order_others(distances)
     if order.shape[1] > NEAREST + FARTHER:
         steps = np.linspace(NEAREST, order.shape[1] - 1, FARTHER).round().astype(int)
         order = order[:, [*range(NEAREST), *steps]]
@@ -243,7 +228,7 @@ def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
     """
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT)).any(-1)
     pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
-    order = _order_others(camera_distances(scene.cameras))[:, :NEIGHBOURS]
+    order = order_others(camera_distances(scene.cameras))[:, :NEIGHBOURS]
 
     def confirm(view: int) -> np.ndarray:
         left, shown = np.flatnonzero(flat[view] & pixels.valid[view]), np.zeros_like(flat[view])

@@ -32,7 +32,9 @@ LOW, HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 PLACES = 42  # views outside, at most, or as many as there are photos
 SAMPLE = 2000  # Gaussians that say how far away the middle of a view lies
-ROWS = 4000  # Gaussians of the input for each photo that stand for all, made as much larger as they are fewer
+# Gaussians of the input for each photo, and of no more photos than there are places at most, that stand for all, made
+# as much larger as they are fewer: a picture has as many pixels, however many photos there are
+ROWS = 4000
 NEAREST = 0.25  # of the depth of what a view sees: nearer to a camera nothing is looked at
 # Quantile of depths in a view, and times that, from which on all count as one: a flyaway moves its pixel's mean depth
 LAST, FARTHEST = 0.98, 4.0
@@ -82,7 +84,7 @@ def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOpt
     looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
     if looks == 0:
         return None
-    rows = _sample(scene, ROWS * len(photos)) if len(scene.gaussians) else start
+    rows = _sample(scene, ROWS * min(len(photos), PLACES)) if len(scene.gaussians) else start
     if len(rows) == 0 or len(photos) == 0:
         return None
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)

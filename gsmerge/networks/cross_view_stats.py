@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from gsmerge.geometry import camera_distances, order_others
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, make_tree, nearest_of_others, sum_cross_view
 from gsmerge.pooling import Members
@@ -23,14 +24,14 @@ FEW = 16
 
 
 def cross_view_stats(
-    means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras
+    means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras, most: int | None = None
 ) -> np.ndarray:
     """Measure how well points agree with the Gaussians that they project onto in every other view.
 
-    Points ``means [g,3]`` with base colours ``sh0 [g,1,3]`` belong to ``views [g]`` int64, which are left out. The
-    statistics ``[g,7]`` float32 are: the logarithm of the number of views that see the point; the shares of these views
-    with a surface at the point, behind it and in front of it; the mean differences of colours and of relative depths;
-    the logarithm of the number of all views.
+    Points ``means [g,3]`` with base colours ``sh0 [g,1,3]`` belong to ``views [g]`` int64, which are left out. Of each
+    view's points the ``most`` nearest views are asked; None: all. The statistics ``[g,7]`` float32 are: the logarithm
+    of the number of views that see the point; the shares of these views with a surface at the point, behind it and in
+    front of it; the mean differences of colours and of relative depths; the logarithm of the number of all views.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, 6] = math.log(len(cameras)) / 4
@@ -40,12 +41,13 @@ def cross_view_stats(
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
     size, limits = (cameras.width, cameras.height), (SH_C0, NEAR_LOG, FAR, MIN_OPACITY)
     sums, m = np.zeros((len(points), COLUMNS)), members
+    asked = np.sort(order_others(camera_distances(cameras))[:, :most], 1).astype(np.int32)
 
     def add(first: int) -> None:
         last = min(first + ROWS, len(points))
         sum_cross_view(
-            points, colors, views, viewmats, Ks, *size, m.fronts, m.means, m.opacities, m.sh0, *limits, first, last,
-            sums,
+            points, colors, views, asked, viewmats, Ks, *size, m.fronts, m.means, m.opacities, m.sh0, *limits, first,
+            last, sums,
         )  # fmt: skip
 
     parallel_map(add, range(0, len(points), ROWS))

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # Factors on the optical depth of groups that other views see through: those at whose place no other view has its
 # surface, and those of which fewer views have it there than see through it
 ALONE, DISPUTED = 0.15, 0.39
+ASKED = 64  # views, the nearest, that say so: a vote that more of them hardly change
 
 
 def make_corrector(
@@ -106,6 +107,6 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
     """Lower the optical depth of single-view groups that other views see through."""
-    _, same, behind, *_ = cross_view_stats(features.means, features.sh0, features.views, members, cameras).T
+    _, same, behind, *_ = cross_view_stats(features.means, features.sh0, features.views, members, cameras, ASKED).T
     disputed = np.where(same > 0, DISPUTED, ALONE)
     return replace(features, gains=features.gains * np.where(behind > same, disputed, 1).astype(np.float32))

@@ -12,10 +12,9 @@ from gsmerge.alignment import check_cameras
 from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
-from gsmerge.facts.exposure import camera_distances
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
-from gsmerge.geometry import camera_centres
+from gsmerge.geometry import camera_centres, camera_distances
 from gsmerge.io.photo_files import photo_array
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import Progress, record_run

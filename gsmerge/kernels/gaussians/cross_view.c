@@ -47,22 +47,27 @@ static inline bool add_view(const surface *s, const double *m, const double *K, 
 }
 
 API int32_t sum_cross_view(const double *restrict points, const float *restrict colors,
-                           const int64_t *restrict own, const double *restrict viewmats,
-                           const double *restrict Ks, int64_t width, int64_t height,
-                           const int32_t *restrict fronts, const float *restrict means,
-                           const float *restrict opacities, const float *restrict sh0,
-                           double color_scale, double near, double far, double min_opacity,
-                           int64_t first, int64_t last, double *restrict out, int64_t g,
-                           int64_t views, int64_t n) {
+                           const int64_t *restrict own, const int32_t *restrict asked,
+                           const double *restrict viewmats, const double *restrict Ks, int64_t width,
+                           int64_t height, const int32_t *restrict fronts,
+                           const float *restrict means, const float *restrict opacities,
+                           const float *restrict sh0, double color_scale, double near, double far,
+                           double min_opacity, int64_t first, int64_t last, double *restrict out,
+                           int64_t g, int64_t views, int64_t most, int64_t n) {
   if (last > g || (!fronts && views > 0 && width * height > n / views)) return OUTSIDE;
   surface s = {fronts, means, opacities, sh0, color_scale, near,
                far, min_opacity, width, height, n};
-  for (int64_t v = 0; v < views;
-       v++)  // views outside: neighbouring points read neighbouring pixels
-    for (int64_t i = first; i < last; i++)
-      if (v != own[i]
-          && !add_view(&s, viewmats + 16 * v, Ks + 9 * v, v * width * height, points + 3 * i,
-                       colors + 3 * i, out + COLUMNS * i))
-        return OUTSIDE;
+  for (int64_t start = first, stop; start < last; start = stop) {
+    int64_t view = own[start], count = view < 0 ? views : most;
+    for (stop = start + 1; stop < last && own[stop] == view; stop++);
+    if (view >= views) return OUTSIDE;
+    for (int64_t q = 0; q < count; q++) {  // views outside: neighbouring points read neighbouring pixels
+      int64_t v = view < 0 ? q : asked[most * view + q];
+      for (int64_t i = start; i < stop && v != view; i++)
+        if (!add_view(&s, viewmats + 16 * v, Ks + 9 * v, v * width * height, points + 3 * i,
+                      colors + 3 * i, out + COLUMNS * i))
+          return OUTSIDE;
+    }
+  }
   return 0;
 }

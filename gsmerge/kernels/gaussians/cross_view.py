@@ -72,21 +72,23 @@ def partition(values, order, low, high, place):
 
 
 @native(
-    STATUS, points=f8("g", 3), colors=f4("g", 3), own=i8("g"), viewmats=f8("views", 4, 4), Ks=f8("views", 3, 3),
+    STATUS, points=f8("g", 3), colors=f4("g", 3), own=i8("g"), asked=i4("views", "most", least=0, below="views"),
+    viewmats=f8("views", 4, 4), Ks=f8("views", 3, 3),
     width=i8(least=0, below=1 << 31), height=i8(least=0, below=1 << 31),
     fronts=i4("views", "height", "width", optional=True), means=f4("n", 3), opacities=f4("n"), sh0=f4("n", 1, 3),
     color_scale=f8(), near=f8(), far=f8(), min_opacity=f8(), first=i8(least=0), last=i8(),
     out=f8("g", COLUMNS, out=True),
 )  # fmt: skip
 def sum_cross_view(
-    points, colors, own, viewmats, Ks, width, height, fronts, means, opacities, sh0, color_scale, near, far,
-    min_opacity, first, last, out,
+    points, colors, own, asked, viewmats, Ks, width, height, fronts, means, opacities, sh0, color_scale, near,
+    far, min_opacity, first, last, out,
 ):  # fmt: skip
-    """Sum over the views that see each point, for the points from ``first`` to before ``last``.
+    """Sum over the views that are asked and see each point, for the points from ``first`` to before ``last``.
 
     Args:
         colors: ``[g,3]`` float32 base colours less a half.
-        own: ``[g]`` int64 view of each, which is left out.
+        own: ``[g]`` int64 view of each, which is left out; below 0 for none: all views are asked.
+        asked: ``[v,most]`` int32 views that the points of each are shown to.
         width: Of the views, pixels.
         height: Of the views, pixels.
         fronts: ``[v,h,w]`` int32 Gaussian of each pixel, -1 for none; None: the pixel's own number.

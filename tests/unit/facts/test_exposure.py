@@ -18,7 +18,6 @@ from gsmerge.facts.exposure import (
     _divide,
     _measure_pairs,
     _solve_gains,
-    camera_distances,
     choose_partners,
     equalise_exposure,
     is_metered,
@@ -27,6 +26,7 @@ from gsmerge.facts.exposure import (
     share_unexpected,
 )
 from gsmerge.frame import canonicalise
+from gsmerge.geometry import camera_distances
 from gsmerge.kernels import elementary
 
 VIEWS = range(5)
