@@ -76,7 +76,7 @@ EFFORTS = {
     "draft": Effort(36, 1.0, 0, merges=False, refines=False, prunes=False, large_photos=False, report_views=2),
     "fast": Effort(55, 1.0, 0, refines=False, large_photos=False),
     "default": Effort(STEPS, 2.0, 0),
-    "best": Effort(1000, 3.0, 1),
+    "best": Effort(900, 3.0, 1),
 }
 
 

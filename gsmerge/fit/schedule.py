@@ -219,6 +219,15 @@ def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     return (np.repeat(each, [3, 3, 4, 1, 3]) * power(decay, progress)).astype(np.float32)
 
 
+def first_decay(rates: Tuning, looks: float) -> float:
+    """Return the decay of the first moment after so many looks at each view.
+
+    Its mean reaches over two steps that show a Gaussian at first, and over one more for each four looks at the views:
+    early on gradients change from step to step, later they differ between views most.
+    """
+    return min(rates.beta1, 1 - 1 / (2 + looks / 4))
+
+
 def affordable_steps(seconds: float, run: FitRun) -> int:
     """Return how many steps fit into the time budget, given the ``seconds`` of the first PROBE steps.
 

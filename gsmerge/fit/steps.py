@@ -11,7 +11,7 @@ from gsmerge.fit.fit_state import FitState
 from gsmerge.fit.loss import image_gradient
 from gsmerge.fit.outside import veil_gradients
 from gsmerge.fit.prepared_step import StepTables, is_prepared
-from gsmerge.fit.schedule import GROWTH, FitRun, Step, loss_weights, step_sizes
+from gsmerge.fit.schedule import GROWTH, FitRun, Step, first_decay, loss_weights, step_sizes
 from gsmerge.geometry import motion_matrices
 from gsmerge.kernels.elementary import log, power
 from gsmerge.kernels.gaussians import optimise as kernels
@@ -49,10 +49,12 @@ class PoseState:
         (_, ab, ac), (ba, _, bc), (ca, cb, _) = turns[:, :3]
         slope = np.array([cb - bc, ac - ca, ba - ab, *turns[:, 3]])
         self.counts[view] += 1
-        for moment, beta, value in ((self.m, rates.beta1, slope), (self.v, rates.beta2, slope**2)):
+        betas = first_decay(rates, self.counts[view]), rates.beta2
+        for moment, beta, value in zip((self.m, self.v), betas, (slope, slope**2), strict=True):
             moment[view] += (1 - beta) * (value - moment[view])
-        first_left, second_left = power([rates.beta1, rates.beta2], self.counts[view])
-        first, second = self.m[view] / (1 - first_left), self.v[view] / (1 - second_left)
+        ahead = betas[0] * self.m[view] + (1 - betas[0]) * slope
+        first_left, second_left = power(betas, self.counts[view] + np.array([1, 0]))
+        first, second = ahead / (1 - first_left), self.v[view] / (1 - second_left)
         self.x[view] -= rates.poses_lr * self.pixel * (1 - progress) * first / (np.sqrt(second) + EPS)
         self.x -= self.x.mean(0)
         self.viewmats[:] = matmul(self.start, motion_matrices(self.x))
@@ -135,7 +137,7 @@ class Optimiser:
     def _constants(self, state: FitState, step: Step) -> dict[str, np.ndarray]:
         """Return the optimiser's constants at a step."""
         options, count = self.run.job.options, max(len(state.x), 1)
-        rates = options.tuning
+        rates, looks = options.tuning, step.number / len(self.photos[0])
         moves = rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change
         widest = max(photos.width for photos in self.run.job.photos)  # of the size whose pixels the least scale counts
         ratio, long = log(np.array([rates.max_ratio, rates.long_share * widest / (3 * max(rates.min_scale, 1e-9))]))
@@ -144,7 +146,7 @@ class Optimiser:
         return {
             "rates": step_sizes(rates, step.progress, options.steps),
             "limits": np.array([*moves, ratio, long], np.float32),
-            "betas": np.array([rates.beta1, rates.beta2], np.float32),
+            "betas": np.array([first_decay(rates, looks), rates.beta2], np.float32),
             "regs": np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32),
         }
 

@@ -27,7 +27,7 @@ class Tuning:
     colors_lr: float = 0.03  # Step of a colour, sRGB in [0, 1]
     poses_lr: float = 0.1  # First step of a moved camera: turns and shifts by so many pixels
     decay: float = 0.4  # Factor on the other steps at the end; less beyond 300 steps
-    beta1: float = 0.5  # Decay of Adam's first moment
+    beta1: float = 0.8  # Largest decay of Adam's first moment, see gsmerge.fit.schedule.first_decay
     beta2: float = 0.9  # Decay of its second moment
     max_mean_shift: float = 2.0  # Largest shift of a mean, in units of the Gaussian's size
     max_scale_change: float = 2.5  # Largest change of a log scale
@@ -88,9 +88,8 @@ class FitOptions(Settings):
         "By default 0.1 for at most five views and at least 150 steps, 0.05 from 600 steps and 30 looks at each view "
         "on, otherwise 0.", least=0, below=1)  # fmt: skip
     half_res_share: float | None = setting(None, "Share of the steps, the first ones, that draw every second pixel of "
-        "every second row.", "By default 0.66, from 600 steps on 0.5, below 150 0.7, below 20 all; less for more than "
-        "6 % of the Gaussians.",
-        least=0, most=1)  # fmt: skip
+        "every second row.", "By default 0.7, from 600 steps on 0.5, below 20 all; less for more than 4.4 % of the "
+        "Gaussians.", least=0, most=1)  # fmt: skip
     holdout: float = setting(0.05, "Share of the photos' patches that decides whether a fit is accepted.", above=0,
         below=1)  # fmt: skip
     min_contribution: float = setting(1 / 255, "Least blending weight at some pixel of some photo; Gaussians below it "
@@ -115,10 +114,9 @@ class FitOptions(Settings):
             return self.half_res_share
         if self.steps < HASTY_STEPS:
             return 1.0
-        if not self.grows:
-            return 0.7
-        most = 0.5 if self.steps >= LONG_STEPS else 0.66  # details come last, and long runs have time for them
-        return most if self.share is None else min(most, 0.7 * math.sqrt(USUAL_SHARE / max(self.share, USUAL_SHARE)))
+        most = 0.5 if self.steps >= LONG_STEPS else 1.0  # details come last, and long runs have time for them
+        share = 1.0 if self.share is None or not self.grows else self.share / USUAL_SHARE
+        return min(most, 0.7 / math.sqrt(max(share, 1.0)))
 
     @property
     def needs_photos(self) -> bool:

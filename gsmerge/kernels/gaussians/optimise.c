@@ -67,7 +67,8 @@ static inline void move(Block *b, int64_t j, Step s, const float *x, const float
   store_row(v, second);
   v16f root;
   for (int c = 0; c < LANES; c++) root[c] = sqrtf4(second[c] * s.second);
-  v16f step = s.rates * first / (root + 1e-15f);
+  v16f ahead = s.beta1 * first + (1.f - s.beta1) * gradient;
+  v16f step = s.rates * ahead / (root + 1e-15f);
   v16f moved = load_row(x) - sel(OF_MEAN, step * b->unit[j], step);
   v16f away = sel(OF_MEAN, moved - load_row(x0), moved), squares = sum_groups(away * away);
   b->distance[j] = squares[MEAN];
@@ -134,7 +135,7 @@ API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m,
                  int64_t n, int64_t k) {
   if (any_outside(ids + first, last - first, n)) return OUTSIDE;
   (void)k;
-  float first_share = (float)(1.0 - power(betas[0], step));
+  float first_share = (float)(1.0 - power(betas[0], step + 1));
   float second_share = (float)(1.0 - power(betas[1], step));
   Step s = {.rates = load_row(rates) / first_share,
             .beta1 = betas[0],

@@ -25,6 +25,7 @@ def adam(
 ):  # fmt: skip
     """Take an Adam step of rows ``ids[first]`` to ``ids[last - 1]`` of ``x [n,COLUMNS]``; clip to the box about ``x0``.
 
+    As of Nesterov, the first moment counts one step further, with the gradient at hand (Dozat, 2016).
     The components of the mean share one second moment, and so do those of the quaternion, so that the step rotates with
     the scene. The step is sparse: rows that a view does not show keep their parameters and moments.
 

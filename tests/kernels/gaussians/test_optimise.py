@@ -93,7 +93,7 @@ def step_kernel(run: Run, g: Wanted, step: int, pieces: list[int] | None = None,
 
 
 def step_slowly(run: Run, g: Wanted, step: int) -> None:
-    """The textbook, row by row and in float64 (Kingma and Ba, 2015), with what is said in the kernel's docstring."""
+    """The textbook (Kingma and Ba, 2015; Dozat, 2016), row by row in float64, with what the kernel's docstring says."""
     for k, i in enumerate(g.ids):
         alpha = run.opacities[i]
         row = np.concatenate([
@@ -104,7 +104,8 @@ def step_slowly(run: Run, g: Wanted, step: int) -> None:
         energy[MEAN], energy[TURN] = energy[MEAN].mean(), energy[TURN].sum() / 3  # a rotation has three freedoms
         run.m[i] = BETAS[0] * run.m[i] + (1 - BETAS[0]) * row
         run.v[i] = BETAS[1] * run.v[i] + (1 - BETAS[1]) * energy
-        first, second = run.m[i] / (1 - BETAS[0] ** step), run.v[i] / (1 - BETAS[1] ** step)
+        ahead = BETAS[0] * run.m[i] + (1 - BETAS[0]) * row
+        first, second = ahead / (1 - BETAS[0] ** (step + 1)), run.v[i] / (1 - BETAS[1] ** step)
         move = RATES * first / (np.sqrt(second) + 1e-15)
         move[MEAN] *= run.units[i]
         x, x0 = run.x[i] - move, run.x0[i]
