@@ -14,7 +14,7 @@ import numpy as np
 
 from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.growth import grow_to
-from gsmerge.fit.report import FitReport, FitResult
+from gsmerge.fit.report import TIME_SPENT, FitReport, FitResult
 from gsmerge.fit.schedule import GROWTH, PROBE, FitRun, Schedule, affordable_steps
 from gsmerge.fit.steps import make_optimiser
 from gsmerge.fit.survey import Survey, score_state, survey_photos
@@ -72,7 +72,7 @@ def fit_full(
         return gaussians, FitReport("none", False, step, before, after, why, origins=np.arange(len(gaussians)))
     if grows and len(state.x) < job.count:  # a time budget may end before the growth
         state = grow_to(state, half, job.count)
-    why = "time budget spent" if options.time_budget is not None else "all steps done"
+    why = TIME_SPENT if options.time_budget is not None else "all steps done"
     fitted = gaussians_of(tail.of(state.x), state.splats.shN)
     return fitted, FitReport("full", True, step, before, after, why, optimiser.viewmats, origins=state.origins)
 

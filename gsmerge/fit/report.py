@@ -12,6 +12,7 @@ from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
 
 SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, in steps: .3 to .6 on two captures
+TIME_SPENT = "time budget spent"  # why a fit ended
 HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewer
 
 
@@ -49,11 +50,13 @@ class Fitted:
     outside: Outside | None = None  # Where it was to put nothing; None: not known
 
 
-def record_fit(report: FitReport | None) -> None:
-    """Add the report of a fit to the current record; None: there was no fit."""
+def record_fit(report: FitReport | None, planned: int) -> None:
+    """Add the report of a fit of so many ``planned`` steps to the current record; None: there was no fit."""
     if report is None:
         return
     choose(fit=report.to_dict())
+    if report.stopped == TIME_SPENT and report.steps < planned:
+        note(f"time_budget ended the fit after {report.steps} of {planned} steps")
     if report.fog is not None and report.fog > HAZE:
         seen = f"seen from outside, the result shows haze where the scene is empty: fog {report.fog:.2f}"
         note(f"{seen}; --fit none makes less, and is farther from the photos" if report.accepted else seen)

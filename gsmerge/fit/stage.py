@@ -51,7 +51,7 @@ def fit_scene(
         if options.fit != "none":
             job = replace(job, outside=look_outside(scene, decoded.gaussians, job.judges(1), options))
         gaussians, report = fit(decoded.gaussians, job)
-        record_fit(report)
+        record_fit(report, options.steps)
     cameras = scene.cameras
     if report is not None and report.viewmats is not None:
         viewmats = cameras.viewmats.astype(np.float64)

@@ -67,7 +67,7 @@ class CompactOptions(Settings):
     method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel or contribution.",
         "All but `gsmerge` need a number of Gaussians.", choices=method_names, metavar="NAME", common=True,
         whole="value", replaces=True)  # fmt: skip
-    effort: str = setting("default", "Quality for time: best is sharper and takes three times as "
+    effort: str = setting("default", "Quality for time: best is sharper and takes two to three times as "
         "long; fast and draft take less than half.",
         "It decides what their own settings leave open.", choices=EFFORT_NAMES)  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
