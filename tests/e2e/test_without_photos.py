@@ -59,13 +59,16 @@ def test_every_setting_works(options: tuple[object, ...], bare: Path, tmp_path: 
 def test_as_good_as_with_photos(
     effort: str, small_scene: Path, tmp_path: Path, target_psnr: Callable[[Path, Path], float]
 ) -> None:
-    """Judged by photos that neither has seen."""
-    scene, actual = gsmerge.read_scene(small_scene), []
-    for one in (scene, replace(scene, images=None)):
-        out = tmp_path / f"{len(actual)}.ply"
-        gsmerge.write_ply(out, gsmerge.compact(one, effort=effort, threads=1).gaussians)
-        actual.append(target_psnr(small_scene / "targets", out))
-    assert actual[1] > actual[0] - CLOSE
+    """Judged by photos that neither has seen, over five seeds, between which results so small differ by 0.5 dB."""
+    scene, differences = gsmerge.read_scene(small_scene), []
+    for seed in range(5):
+        actual = []
+        for name, one in (("with", scene), ("without", replace(scene, images=None))):
+            out = tmp_path / f"{name}-{seed}.ply"
+            gsmerge.write_ply(out, gsmerge.compact(one, effort=effort, threads=1, seed=seed).gaussians)
+            actual.append(target_psnr(small_scene / "targets", out))
+        differences.append(actual[1] - actual[0])
+    assert sum(differences) / 5 > -CLOSE
 
 
 def test_the_summary_says_what_the_result_is_measured_against(bare: Path, tmp_path: Path, run: Run) -> None:

@@ -180,13 +180,18 @@ def test_a_state_comes_back_from_its_file(room: Scene, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 2, 3])
 def test_batches_of_any_size(size: int) -> None:
-    """For as many Gaussians no more than 0.3 dB below all views at once, on average over scenes of six views."""
+    """For as many Gaussians no more than 0.3 dB below all views at once, on average over scenes of six views.
+
+    Over three seeds, too: of the wall with its 40 dB they differ by 6.
+    """
     differences = []
     for shape in SHAPES.values():
         scene = scenes.make_scene(shape(), scenes.arc(6, 48, 36), noise=0.005)
-        results = compact(scene, budget=400, checkpoint="none"), fed(*parts_of(scene, size)).compact(budget=400)
-        whole, batched = (scenes.psnr_of(result.gaussians, scene) for result in results)
-        differences.append(batched - whole)
+        state = fed(*parts_of(scene, size))
+        for seed in range(3):
+            results = compact(scene, budget=400, checkpoint="none", seed=seed), state.compact(budget=400, seed=seed)
+            whole, batched = (scenes.psnr_of(result.gaussians, scene) for result in results)
+            differences.append(batched - whole)
     assert np.mean(differences) > -0.3
 
 
