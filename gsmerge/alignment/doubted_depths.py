@@ -72,12 +72,12 @@ def _count_votes(scene: Scene, placed: np.ndarray, differ: np.ndarray) -> np.nda
     def ask(view: int) -> np.ndarray:
         rows = view * pixels + np.flatnonzero(differ[view])
         near = nearest_views(centres, view)[:: min(max(1, views // _NEIGHBORS), _STEP)][:_NEIGHBORS]
-        nobody, own = np.full(len(rows), -1), np.empty((len(near), 0), np.int32)  # all that are near are asked
+        own, asked = np.full(len(rows), -1), np.empty((len(near), 0), np.int32)  # points of no view: all are asked
         sums = np.zeros((2, len(rows), COLUMNS))
         for points, out in zip(sources, sums, strict=True):
             for surface in sources:  # right points agree with whichever is right there
                 sum_cross_view(
-                    points[rows].astype(np.float64), colors[rows], nobody, own, viewmats[near], Ks[near],
+                    points[rows].astype(np.float64), colors[rows], own, asked, viewmats[near], Ks[near],
                     cameras.width, cameras.height, ids[near], surface, opaque, colors[:, None], 1.0, _SAME, 1.0, 0.0,
                     0, len(rows), out,
                 )  # fmt: skip

@@ -88,7 +88,7 @@ def sum_cross_view(
     Args:
         colors: ``[g,3]`` float32 base colours less a half.
         own: ``[g]`` int64 view of each, which is left out; below 0 for none: all views are asked.
-        asked: ``[v,most]`` int32 views that the points of each are shown to.
+        asked: ``[v,most]`` int32 views that are asked about the points of each.
         width: Of the views, pixels.
         height: Of the views, pixels.
         fronts: ``[v,h,w]`` int32 Gaussian of each pixel, -1 for none; None: the pixel's own number.

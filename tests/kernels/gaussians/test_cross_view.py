@@ -116,26 +116,9 @@ def random_sums(num: int, pixels: int, first: int = 0, last: int | None = None) 
     out = np.zeros((num, 6))
     last = num if last is None else last
     sum_cross_view(
-        points,
-        colors,
-        own,
-        asked,
-        viewmats,
-        Ks,
-        6,
-        4,
-        None,
-        means,
-        opacities,
-        sh0,
-        0.3,
-        0.5,
-        2.0,
-        0.1,
-        first,
-        last,
+        points, colors, own, asked, viewmats, Ks, 6, 4, None, means, opacities, sh0, 0.3, 0.5, 2.0, 0.1, first, last,
         out,
-    )
+    )  # fmt: skip
     return out
 
 
