@@ -25,7 +25,7 @@ DOUBT = 2.0  # standard deviations of noise up to which two scores are one, and 
 ALIKE = 4  # photos most like a view that are compared with it part by part
 FLAT = 1 / 255  # root mean square of a picture's contrast below which it shows nothing to go by: a rounding of 8 bits
 FAR = 1e6  # cost of a pair that cannot be
-TOGETHER = 8  # photos that are compared by one task: what the views show is looked at once for all
+TOGETHER, TASKS = 8, 16  # least photos that one task compares, and most tasks: each looks at what all views show
 AT_ONCE = 256  # photos of a film that are compared first, at equal distances; then those around the most alike
 
 
@@ -85,10 +85,12 @@ class Assigner:
         ids = tuple(dict.fromkeys(photos))
         new = [photo for photo in ids if photo not in self._correlations]
 
-        def compare(first: int) -> np.ndarray:
-            return self._comparer.correlate([self.candidates.read(photo) for photo in new[first : first + TOGETHER]])
+        size = max(TOGETHER, -(-len(new) // TASKS))
 
-        compared = parallel_map(compare, range(0, len(new), TOGETHER))
+        def compare(first: int) -> np.ndarray:
+            return self._comparer.correlate([self.candidates.read(photo) for photo in new[first : first + size]])
+
+        compared = parallel_map(compare, range(0, len(new), size))
         self._correlations |= dict(zip(new, itertools.chain(*compared), strict=True))
         correlations = np.stack([self._correlations[photo] for photo in ids], 1)
         z = fisher_z(correlations)

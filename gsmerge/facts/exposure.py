@@ -24,7 +24,7 @@ from gsmerge.facts.photo_change import CLIPPED, PhotoChange, change_large
 from gsmerge.geometry import camera_distances, correlation, order_others, rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels.compare_views import find_surfaces
 from gsmerge.kernels.elementary import exp, log
-from gsmerge.kernels.matrices import solve_symmetric
+from gsmerge.kernels.matrices import solve
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
@@ -217,7 +217,7 @@ def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:
         matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])
         right[ends] += weight * np.array([-pair.ratios, pair.ratios])
     matrix[np.diag_indices(num_views)] += 1e-6  # of views without pairs
-    gains: np.ndarray = solve_symmetric(matrix, right)
+    gains: np.ndarray = solve(matrix, right)
     return gains
 
 

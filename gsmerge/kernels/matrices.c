@@ -5,19 +5,40 @@
 #include "native.h"
 
 enum { PANEL = 16 };   // columns that are eliminated together, so that large matrices stay in the caches
+enum { ROWS = 4, COLUMNS = 8 };  // of a product, whose sums stay in registers
+enum { TERMS = 256 };            // of each sum, so that those of b stay in the nearest cache
 enum { SWEEPS = 50 };  // of Jacobi's method at most; it needs about six
 static const double TINY = 1e-300;
+
+// out[i,k] += a[i,j] b[j,k] over the terms from..to of each sum, of some rows and columns, in registers.
+static inline void add_terms(const double *restrict a, const double *restrict b, double *restrict out,
+                             int64_t from, int64_t to, int64_t j, int64_t k, int64_t rows,
+                             int64_t columns) {
+  double sums[ROWS][COLUMNS];
+  for (int64_t r = 0; r < rows; r++)
+    for (int64_t c = 0; c < columns; c++) sums[r][c] = out[r * k + c];
+  for (int64_t t = from; t < to; t++)
+    for (int64_t r = 0; r < rows; r++)
+      for (int64_t c = 0; c < columns; c++) sums[r][c] += a[r * j + t] * b[t * k + c];
+  for (int64_t r = 0; r < rows; r++)
+    for (int64_t c = 0; c < columns; c++) out[r * k + c] = sums[r][c];
+}
 
 // out[i,k] = a[i,j] b[j,k]
 static inline void multiply_rows(const double *restrict a, const double *restrict b, double *restrict out, int64_t i,
                                  int64_t j, int64_t k) {
-  for (int64_t row = 0; row < i; row++) {
-    double *to = out + row * k;
-    for (int64_t c = 0; c < k; c++) to[c] = 0.0;
-    for (int64_t t = 0; t < j; t++) {
-      double factor = a[row * j + t];
-      for (int64_t c = 0; c < k; c++) to[c] += factor * b[t * k + c];
-    }
+  for (int64_t at = 0; at < i * k; at++) out[at] = 0.0;
+  for (int64_t from = 0; from < j; from += TERMS) {
+    int64_t to = mini(from + TERMS, j);
+    for (int64_t row = 0; row < i; row += ROWS)
+      for (int64_t column = 0; column < k; column += COLUMNS) {
+        const double *left = a + row * j, *right = b + column;
+        double *sums = out + row * k + column;
+        if (row + ROWS <= i && column + COLUMNS <= k)
+          add_terms(left, right, sums, from, to, j, k, ROWS, COLUMNS);
+        else
+          add_terms(left, right, sums, from, to, j, k, mini(ROWS, i - row), mini(COLUMNS, k - column));
+      }
   }
 }
 
