@@ -19,7 +19,7 @@ from gsmerge.facts.scene_size import SceneSize
 from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
-from gsmerge.settings.budget import AUTO
+from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 from gsmerge.settings.fit import STEPS, USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
@@ -281,6 +281,12 @@ def usual_blocks(num_gaussians: int, num_views: int) -> int:
     if num_gaussians > WHOLE_GAUSSIANS:
         return -(-num_gaussians // BLOCK_GAUSSIANS)
     return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
+
+
+def note_surplus(size: SceneSize, budget: BudgetOptions) -> None:
+    """Note where a budget is more Gaussians than there are."""
+    if budget.number is not None and budget.number > size.num_gaussians:
+        note(f"budget {budget.budget}: the input has {size.num_gaussians:,} Gaussians, and the result no more")
 
 
 def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:

@@ -209,6 +209,7 @@ class Totals:
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.io.formats.columns import UNUSED
         from gsmerge.report import text_table
+        from gsmerge.runtime.memory import human_share
 
         header = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
         lines = text_table([header, *sorted(self.rows)], columns=columns, least=(2, 7, 5, 6, 3)) if self.rows else []
@@ -228,8 +229,8 @@ class Totals:
         left = self.total - self.counts.total()
         line = f"{self.total:,} scenes: {', '.join(counts)}" + (f", {left:,} left" if left else "")
         if self.num_input:
-            share = 100 * self.num_output / self.num_input
-            line += f"; {self.num_input:,} -> {self.num_output:,} Gaussians ({share:.2f} %)"
+            share = human_share(self.num_output / self.num_input)
+            line += f"; {self.num_input:,} -> {self.num_output:,} Gaussians ({share})"
         line += f"; {self.unmet:,} missed the target" if self.unmet else ""
         line += f"; {len(self.worse):,} worse than the input" if self.worse else ""
         return [*lines, line]
@@ -246,13 +247,15 @@ def _describe_lack(num_views: int) -> str:
 
 
 def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
+    from gsmerge.runtime.memory import human_share
+
     psnr = report["psnr_input_views"]
     quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
     if judged := report["choices"].get("fidelity"):
         quality = ["the input", f"{judged['psnr']:.2f}"]  # which it is compared with, for lack of photos
     counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
     gain = "" if new is None else f"{new['low']:+.1f} to {new['high']:+.1f} dB"
-    return output, *counts, f"{100 * report['ratio']:.2f} %", gain, *quality, f"{report['total_seconds']:.1f}"
+    return output, *counts, human_share(report["ratio"]), gain, *quality, f"{report['total_seconds']:.1f}"
 
 
 def print_plan(

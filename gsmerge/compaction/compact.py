@@ -24,7 +24,7 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import Build
-from gsmerge.plan import Plan, choose_for_scene, make_plan, note_engine
+from gsmerge.plan import Plan, choose_for_scene, make_plan, note_engine, note_surplus
 from gsmerge.runtime.record import Progress, Record, add_seconds, adopt, choose, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
@@ -76,6 +76,7 @@ def compact(
         size = measure_size(scene)
         choices = choose_for_scene(size, options)  # what needs no work to decide
         note_engine(size, options, choices.blocks)
+        note_surplus(size, options.budget)
         if choices.blocks > 1:
             from gsmerge.compaction.blocks import compact_in_blocks, cut_views
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from gsmerge.compaction.new_views import NewViews
 from gsmerge.report import document_head, file_sha256, html_table, seconds_document, seconds_line, text_table, wrap_line
-from gsmerge.runtime.memory import human_bytes
+from gsmerge.runtime.memory import human_bytes, human_share
 
 
 @dataclass(frozen=True)
@@ -110,8 +110,8 @@ class CompactReport:
 
     def _facts(self) -> list[tuple[str, str]]:
         """List what a reader wants first, by name."""
-        share = 100 * self.num_output / max(1, self.num_input)
-        facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share:.2f} %)")]
+        share = human_share(self.num_output / max(1, self.num_input))
+        facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share})")]
         if new := self.new_views:
             facts += [("PSNR of new views, expected", f"{new.low:+.1f} to {new.high:+.1f} dB from {new.before:.1f} dB")]
         if self.psnr_before is not None and self.psnr_after is not None:
@@ -213,7 +213,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     Paths and the next step, which people copy, are never broken.
     """
     before, after, psnr = document["input"], document["output"], document["psnr_input_views"]
-    ratio = f"{100 * document['ratio']:.2f} %"
+    ratio = human_share(document["ratio"])
     rows = [
         ("Gaussians", f"{before['num_gaussians']:,}", f"{after['num_gaussians']:,}", ratio),
         ("file", human_bytes(before["bytes"]), human_bytes(after["bytes"]), ""),
@@ -302,7 +302,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
         quality += f", {protected['before']:.2f} -> {protected['after']:.2f} dB where they are protected"
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
-        f" ({100 * document['ratio']:.2f} %), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
+        f" ({human_share(document['ratio'])}), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
         f"{quality}; {seconds_line(document)}{cameras}"
     )
 

@@ -12,7 +12,7 @@ from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.raster.photos import WHOLE
 from gsmerge.report import csv_text, document_head, text_table, wrap_line
-from gsmerge.runtime.memory import human_bytes
+from gsmerge.runtime.memory import human_bytes, human_share
 
 Row = Sequence[str]
 Table = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
@@ -182,7 +182,7 @@ def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
     return (
         result["name"],
         f"{result['num_gaussians']:,}",
-        f"{100 * result['ratio']:.2f} %",
+        human_share(result["ratio"]),
         "" if size is None else human_bytes(size),
         "" if result is first or not (size and whole) else f"{whole / size:.1f} x",
         f"{each:.1f}" if each else "",

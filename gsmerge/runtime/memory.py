@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import mmap
 import os
 import sys
 import tempfile
 from collections.abc import Iterable
 from contextlib import suppress
-from math import prod
 from pathlib import Path
 from weakref import WeakSet
 
@@ -92,7 +92,7 @@ def make_array(shape: tuple[int, ...], dtype: type[np.generic], mapped_bytes: in
     A mapped array takes memory only while it is in use, and none after :func:`free_pages`. The file is in the system's
     temporary folder (``TMPDIR``), and is removed with the array.
     """
-    size = prod(shape) * np.dtype(dtype).itemsize
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     if size >= min(MAPPED_BYTES, mapped_bytes or MAPPED_BYTES) and hasattr(os, "posix_fallocate"):
         with suppress(OSError), tempfile.TemporaryFile() as file:
             os.posix_fallocate(file.fileno(), 0, size)  # a page without room on the disk would end the process
@@ -123,6 +123,13 @@ def gather(array: np.ndarray, *ids: np.ndarray) -> np.ndarray:
         values.append(array[part])
         free_pages([array])
     return np.concatenate(values)
+
+
+def human_share(share: float) -> str:
+    """Format a share in [0, 1] in hundredths of a percent, or in its first digit below: ``0.044`` -> ``4.40 %``."""
+    percent = 100 * share
+    digits = 2 if percent <= 0 else max(2, -math.floor(math.log10(percent)))
+    return f"{percent:.{digits}f} %"
 
 
 def human_bytes(count: float) -> str:

@@ -77,6 +77,13 @@ class BudgetOptions(Settings):
         return not self.fill and (self.in_bytes or word in DEVICES or word.strip().endswith("%"))
 
     @property
+    def number(self) -> int | None:
+        """The number of Gaussians that the budget names; None where it is a share, a size, a device, or left out."""
+        if self.budget is None or self.auto or self.in_bytes or str(self.budget) in DEVICES or "%" in str(self.budget):
+            return None
+        return parse_budget(self.budget, sys.maxsize)
+
+    @property
     def in_bytes(self) -> bool:
         """Whether the budget is a file size."""
         return re.fullmatch(r"[^a-z]*[kmg]?i?b", str(self.budget).strip().lower()) is not None

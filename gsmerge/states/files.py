@@ -25,7 +25,7 @@ from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.write import output_notes
 from gsmerge.io.locks import lock_folder
 from gsmerge.report import document_head, seconds_document, seconds_line
-from gsmerge.runtime.memory import human_bytes, peak_memory
+from gsmerge.runtime.memory import human_bytes, human_share, peak_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.content_hash import content_hash, read_files
 from gsmerge.scene.exporters import AUTO, ReadHints
@@ -183,7 +183,7 @@ def decoding_line(document: Mapping[str, Any]) -> str:
         return f"would write  {after['path']}: at most {after['num_gaussians_at_most']:,} Gaussians"
     return (
         f"{after['path']}: {before['num_groups']:,} Feature Gaussians -> {after['num_gaussians']:,} Gaussians"
-        f" ({100 * document['ratio']:.2f} % of the scene's), {human_bytes(before['bytes'])} ->"
+        f" ({human_share(document['ratio'])} of the scene's), {human_bytes(before['bytes'])} ->"
         f" {human_bytes(after['bytes'])}; {seconds_line(document)}"
     )
 

@@ -52,6 +52,13 @@ def test_the_finest_level_is_the_result_without_levels(scene: Scene) -> None:
     assert alone.coarser == ()
 
 
+def test_no_more_are_made_than_there_are(scene: Scene) -> None:
+    result = compact(scene, budget="1M", fit="none")
+    assert len(result.gaussians) <= scene.num_gaussians
+    assert noted(result.report.notes, "1M", f"{scene.num_gaussians:,}")
+    assert not noted(compact(scene, budget=200, fit="none").report.notes, "200")
+
+
 def test_sizes_and_shares_are_limits(small_scene: Path, tmp_path: Path, run: Run) -> None:
     """No more Gaussians are taken than new views gain from, unless all are asked for; a number is met exactly."""
     out, quick = tmp_path / "limited.ply", ("--set", "fit_steps=8", "--overwrite", "--json")

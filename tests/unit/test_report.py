@@ -7,7 +7,7 @@ import pytest
 
 from gsmerge import report
 from gsmerge.report import text_table
-from gsmerge.runtime.memory import human_bytes
+from gsmerge.runtime.memory import human_bytes, human_share
 
 
 @pytest.mark.parametrize(
@@ -16,6 +16,13 @@ from gsmerge.runtime.memory import human_bytes
 )
 def test_human_bytes(count: float, text: str) -> None:
     assert human_bytes(count) == text
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(0, "0.00 %"), (0.044, "4.40 %"), (1, "100.00 %"), (1e-4, "0.01 %"), (3.26e-5, "0.003 %")]
+)
+def test_human_share(share: float, text: str) -> None:
+    assert human_share(share) == text
 
 
 def test_text_in_tables_is_no_formula() -> None:

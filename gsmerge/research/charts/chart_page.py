@@ -19,7 +19,7 @@ from gsmerge.research.charts.lines import (
     size_label,
 )
 from gsmerge.research.charts.measure_run import INPUT, MAX_ERROR, SCORES, RunRecord, judging_notes, picture_path
-from gsmerge.runtime.memory import human_bytes
+from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.settings.compact import OURS
 
 MAX_SCENES = 6  # with pictures on the page
@@ -89,7 +89,7 @@ def _results(results: Results) -> Table:
     for (name, size), group in groups.items():
         values = ("count", "percent", "bytes", "seconds", "render_ms")
         count, kept, num_bytes, seconds, ms = (_mean(group, value) for value in values)
-        row = [name, size, str(len(group)), _number(count, 0), "" if kept is None else f"{kept:.2f} %"]
+        row = [name, size, str(len(group)), _number(count, 0), "" if kept is None else human_share(kept / 100)]
         row += ["" if num_bytes is None else human_bytes(num_bytes), _number(seconds or None, 2), _number(ms, 1)]
         for metric in results.metrics:
             interval, digits = intervals.get((metric, name, size)), METRICS[metric].digits
