@@ -1,6 +1,6 @@
 """How seconds and memory grow with the views of a scene, and with the Gaussians of a file without photos.
 
-python benchmarks/growth.py                                        # 8 to 128 views, .5 to 8 million; what is done stays
+python benchmarks/growth.py                                        # 8 to 512 views, .5 to 8 million; what is done stays
 python benchmarks/growth.py --views 8 32 --millions .5 2 --chart docs/results/growth.png
 
 Scenes are those of ``examples/01_make_scene.py`` in 240 x 160, files without photos their rows alone. Every run is a
@@ -31,8 +31,8 @@ from gsmerge.research.charts.figures import COLORS, RC
 
 WIDTH, HEIGHT = 240, 160
 EFFORTS = "draft", "default"
-VIEWS, MILLIONS = (8, 32, 128), (0.5, 2.0, 7.99)
-SECONDS, GIGABYTES = (2, 5, 10, 20, 50, 100), (0.2, 0.5, 1)  # ticks
+VIEWS, MILLIONS = (8, 32, 128, 512), (0.5, 2.0, 7.99)
+SECONDS, GIGABYTES = (2, 5, 10, 20, 50, 100, 200), (0.2, 0.5, 1, 2, 4)  # ticks
 MAKE = Path(__file__).parents[1] / "examples" / "01_make_scene.py"
 
 
@@ -118,12 +118,12 @@ def draw_chart(records: list[dict[str, Any]], path: Path) -> None:
                     some = [one for one in records if one["effort"] == effort and one["name"].endswith(kind)]
                     name = f"{effort}, {'with photos' if kind == 'views' else 'rows alone'}"
                     millions, values = [one["gaussians"] / 1e6 for one in some], [one[key] / unit for one in some]
-                    axes.plot(millions, values, style, color=color, marker="o", markersize=3.5, label=name)
+                    axes.plot(millions, values, style, color=color, marker="o", markersize=3, label=name)
             axes.set(xscale="log", yscale="log", xlabel="million Gaussians", ylabel=label)
-            for axis, ticks in ((axes.xaxis, (0.5, 1, 2, 4, 8)), (axes.yaxis, SECONDS if unit == 1 else GIGABYTES)):
+            for axis, ticks in ((axes.xaxis, (0.5, 1, 2, 4, 8, 16)), (axes.yaxis, SECONDS if unit == 1 else GIGABYTES)):
                 axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
                 axis.set_minor_locator(NullLocator())
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", handlelength=3)
         figure.savefig(path, dpi=150, metadata={"Software": None})
 
 
