@@ -210,7 +210,7 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         "auto": _describe_auto(scene, agreement),
         "agreement": agreement and agreement.to_dict(),
     }
-    if is_result and len(scene):
+    if is_result and len(scene) and not scene.aligned:  # rows of pixels hide each other where views overlap
         facts["num_unseen"] = int((count_views_in_world(scene.finite_gaussians, scene.cameras) == 0).sum())
     if not is_result:
         is_known = scene.aligned or any(exporter.is_marked for exporter in load.exporters)
@@ -234,7 +234,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.3g} % beyond ten times that box",
         f"floaters   about {round(size['share_floaters'] * scene['count']):,}: isolated, or beyond that;"
         " compact --drop floaters leaves them out",
-        f"unseen     {scene['num_unseen']:,}: no view shows them; --drop unseen leaves them out"
+        f"unseen     {scene['num_unseen']:,}: hidden or outside all views; --drop unseen leaves them out"
         if scene["num_unseen"]
         else "",
         f"sky        in {scene['num_sky_views']} photos; compact --drop sky leaves it out"

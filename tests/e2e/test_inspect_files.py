@@ -141,3 +141,13 @@ def test_a_scene_that_shows_nothing_is_refused_as_compact_refuses_it(
     assert run("inspect", scene, "-q", code=code).err == refused
     problem = refused.removeprefix(ERROR).strip()
     assert problem in run("inspect", scene, smallest_scene, code=code).out
+
+
+def test_what_no_view_shows_is_counted_in_results_alone(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    """Rows of pixels hide each other where views overlap: their cameras show them all the same."""
+    out = tmp_path / "compact.ply"
+    run("compact", small_scene, "-o", out, "--fit", "none", code=0)
+    run("convert", small_scene / "scene.ply", tmp_path / "scene.ply", code=0)  # which says who wrote it
+    files, views = (out, tmp_path / "scene.ply"), ("--cameras", small_scene)
+    documents = [json.loads(run("inspect", file, *views, "--json", code=0).out) for file in files]
+    assert [document["num_unseen"] is None for document in documents] == [False, True]
