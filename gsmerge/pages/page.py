@@ -18,7 +18,7 @@ import numpy as np
 from gsmerge import __version__
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.pages.data import PageView, ViewData
-from gsmerge.runtime.memory import human_bytes
+from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.types import Cameras
 
 if TYPE_CHECKING:
@@ -128,8 +128,8 @@ def headline(data: ViewData, place: int = 1) -> str:
         return f"{before.num_gaussians:,} Gaussians" + (f", {quality:.1f} dB" if has_quality else "")
     after, reference = data.sides[place], PHOTOS if data.held_out else data.reference
     old, new = before.mean.psnr, after.mean.psnr
-    share = 100 * after.num_gaussians / max(before.num_gaussians, 1)
-    said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
+    share = after.num_gaussians / max(before.num_gaussians, 1)
+    said = f"{human_share(share, 1 if share >= 0.01 else 2)} of the Gaussians"
     if after.new_gain is not None and not data.held_out:
         return f"{said}, new views expected {describe_gain(*after.new_gain)}"
     if new is None or old is None or not np.isfinite(new):
@@ -177,9 +177,9 @@ def speed_words(ratio: float | None) -> str:
 def size_words(data: ViewData, place: int) -> str:
     """Describe the size of a result: share, bytes, quality."""
     side = data.sides[place]
-    share = 100 * side.num_gaussians / max(data.sides[0].num_gaussians, 1)
+    share = human_share(side.num_gaussians / max(data.sides[0].num_gaussians, 1), 1)
     quality = _number(side.mean.psnr, 1)
-    words = [f"{share:.1f} %", human_bytes(side.file_bytes), *([f"{quality} dB"] if quality != NONE else [])]
+    words = [share, human_bytes(side.file_bytes), *([f"{quality} dB"] if quality != NONE else [])]
     return _unbroken(" · ".join(words))
 
 
@@ -239,7 +239,7 @@ def results_table(data: ViewData) -> tuple[list[str], list[list[str]]]:
     for head, name, digits in (("PSNR (dB)", "psnr", 2), ("SSIM", "ssim", 3), ("LPIPS", "lpips_alex", 3)):
         columns[head] = [_number(getattr(side.mean, name), digits) for side in data.sides]
     columns["Gaussians"] = [f"{side.num_gaussians:,}" for side in data.sides]
-    columns["Share"] = [f"{100 * side.num_gaussians / max(first.num_gaussians, 1):.1f} %" for side in data.sides]
+    columns["Share"] = [human_share(side.num_gaussians / max(first.num_gaussians, 1), 1) for side in data.sides]
     if data.lacks_pixels:
         columns["PSNR, covered"] = [_number(side.covered.psnr, 2) for side in data.sides]
     filled = {head: cells for head, cells in columns.items() if set(cells) != {NONE}}

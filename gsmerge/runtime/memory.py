@@ -125,10 +125,10 @@ def gather(array: np.ndarray, *ids: np.ndarray) -> np.ndarray:
     return np.concatenate(values)
 
 
-def human_share(share: float) -> str:
-    """Format a share in [0, 1] in hundredths of a percent, or in its first digit below: ``0.044`` -> ``4.40 %``."""
+def human_share(share: float, digits: int = 2) -> str:
+    """Format a share in [0, 1] in percent with so many digits, or with its first one: ``0.044`` -> ``4.40 %``."""
     percent = 100 * share
-    digits = 2 if percent <= 0 else max(2, -math.floor(math.log10(percent)))
+    digits = digits if percent <= 0 else max(digits, -math.floor(math.log10(percent)))
     return f"{percent:.{digits}f} %"
 
 
