@@ -24,6 +24,10 @@ WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
 # Many containers ask for none, and each process of the run would compile the package and the tests anew
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# The processes of a run take all processors; threads of each would only wait for one another. No result depends on
+# their number, which the tests of that choose themselves
+if WORKER:
+    os.environ.setdefault("GSMERGE_THREADS", "1")
 if not os.access(ROOT, os.W_OK):  # where hypothesis keeps its examples
     import hypothesis
 
