@@ -6,12 +6,16 @@ import ast
 import json
 import re
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from batches import InlinePool
 from scripts import load_script
+
+from gsmerge.cli import main
 
 
 def test_examples_are_numbered_without_gaps(root: Path) -> None:
@@ -25,7 +29,16 @@ def test_examples_are_numbered_without_gaps(root: Path) -> None:
 def test_examples_run_one_after_the_other(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Two fits, which take a second."""
+    """Two fits, which take a second. What an example calls runs in this process, which is twice as fast."""
+    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
+    monkeypatch.setattr("time.sleep", lambda _: None)
+
+    def run_here(call: list[str], *, check: bool) -> subprocess.CompletedProcess[str]:
+        assert call[:3] == [sys.executable, "-m", "gsmerge"]
+        assert not check
+        return subprocess.CompletedProcess(call, main(call[3:]))
+
+    monkeypatch.setattr(subprocess, "run", run_here)
 
     def run_example(name: str, *arguments: object) -> str:
         script = str(root / "examples" / name)

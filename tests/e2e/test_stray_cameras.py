@@ -10,11 +10,18 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from batches import InlinePool
 from messages import ERROR, names
 
 from .conftest import Run, assert_refused
 
 FEW = ("--budget", "20%", "--fit", "none", "--effort", "draft", "--threads", 1)
+
+
+@pytest.fixture(autouse=True)
+def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process of a batch takes a second to start."""
+    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
 
 
 @pytest.fixture
