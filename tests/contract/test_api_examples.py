@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from splat_transform_programs import put_stand_in
+from splat_transform_programs import put_stand_in, run_here
 
 import gsmerge
 
@@ -30,7 +30,7 @@ def test_example_runs(
     shutil.copytree(small_scene, tmp_path / "demo")
     monkeypatch.chdir(tmp_path)
     if name == "write_levels":
-        put_stand_in(tmp_path / "program", monkeypatch)
+        run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
     text = getattr(gsmerge, name).__doc__
     monkeypatch.setattr(gsmerge, "compact", compact)
     monkeypatch.setattr("gsmerge.pages.data.OUTLINE_SIDE", 48)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import noted, refuses
-from splat_transform_programs import put_stand_in
+from splat_transform_programs import put_stand_in, run_here
 from sweeps import sweep
 
 import gsmerge
@@ -61,7 +61,7 @@ def read(path: Path) -> Gaussians:
 def test_every_format_is_written_with_the_cameras(
     result: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    put_stand_in(tmp_path / "program", monkeypatch)
+    run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
     document = convert_files(ConvertOptions([result], tmp_path / "new" / name))
     written = read(tmp_path / "new" / name)
     assert document["output"]["num_gaussians"] == len(written) == 400

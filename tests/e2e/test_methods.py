@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from splat_transform_programs import put_stand_in
+from splat_transform_programs import put_stand_in, run_here
 
 from gsmerge import read_ply
 from gsmerge.settings.compact import method_names
@@ -18,7 +18,7 @@ from .conftest import Run, assert_refused, listing
 def test_every_method_plans_and_writes_a_ply(
     method: str, smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    put_stand_in(tmp_path, monkeypatch)
+    run_here(monkeypatch, put_stand_in(tmp_path, monkeypatch))
     out, settings = tmp_path / "small.ply", ["--set", "fit_steps=8"] if method == "unmerged-fit" else []
     words = ("compact", smallest_scene, "--set", f"method={method}")
     said = run(*words, "-o", out, "--budget", 100, *settings, "--json", code=0)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from splat_transform_programs import needs_program, put_stand_in
+from splat_transform_programs import needs_program, put_stand_in, run_here
 
 import gsmerge
 from gsmerge.io import read_gaussians
@@ -24,7 +24,7 @@ QUICK = ("--set", "superpixels=200", "--fit", "none", "--set", "checkpoint=none"
 @pytest.fixture(autouse=True)
 def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stand-in for splat-transform, in each test that does not take the program itself."""
-    put_stand_in(tmp_path / "program", monkeypatch)
+    run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
 
 
 @pytest.fixture
@@ -37,7 +37,8 @@ def index(tmp_path: Path) -> Path:
 def test_the_program_itself_writes_them(
     small_scene: Path, index: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delenv(VARIABLE) if FOUND is None else monkeypatch.setenv(VARIABLE, FOUND)
+    monkeypatch.undo()
+    monkeypatch.delenv(VARIABLE, raising=False) if FOUND is None else monkeypatch.setenv(VARIABLE, FOUND)
     document = json.loads(run("compact", small_scene, "-o", index, *QUICK, "--json", code=0).out)
     counts = [document["output"]["num_gaussians"], *(level["num_gaussians"] for level in document["levels"])]
     assert read_index(index).counts == counts

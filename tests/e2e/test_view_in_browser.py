@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
+from shared import make_once
 
 import gsmerge
+from gsmerge.cli import main
 from gsmerge.geometry import middle_depth, rotmat_to_quat
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import near_plane
@@ -50,20 +53,27 @@ def opened(page: tuple[Browser, Any]) -> tuple[Browser, Any]:
 
 
 @pytest.fixture(scope="module")
-def page(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, Any]]:
-    from gsmerge.cli import main
+def written(make_scene: Any, shared: Path) -> Path:
+    """``page.html`` of the scene ``room``, beside it: once in a run, since it takes seconds. Read only."""
+    return make_once(shared / "view-page", lambda place: write_page(make_scene, place))
 
-    folder = tmp_path_factory.mktemp("view")
+
+def write_page(make_scene: Any, folder: Path) -> None:
     scene = make_scene(folder / "room", num_views=3, width=WIDTH, height=HEIGHT)
     small, page = scene / "small<b>.ply", folder / "page.html"
     assert main(["compact", str(scene), "-o", str(small), "--effort", "draft", "-q"]) == 0
-    results = [gsmerge.read_ply(small).gaussians]
-    results += [with_one_from_outside(results[0], gsmerge.read_scene(scene).cameras[[0]])]
-    gsmerge.write_ply(wide := scene / "wide.ply", results[1])
+    longer = with_one_from_outside(gsmerge.read_ply(small).gaussians, gsmerge.read_scene(scene).cameras[[0]])
+    gsmerge.write_ply(wide := scene / "wide.ply", longer)
     targets = ["--targets", str(scene / "targets")]
     assert main(["view", str(scene), str(small), str(wide), *targets, "-o", str(page), "--no-open", "-q"]) == 0
-    with browser(CHROMIUM, folder / "profile", "--enable-unsafe-swiftshader") as tab:
-        tab.open(page)
+
+
+@pytest.fixture(scope="module")
+def page(written: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, Any]]:
+    scene = written / "room"
+    results = [gsmerge.read_ply(scene / name).gaussians for name in ("small<b>.ply", "wide.ply")]
+    with browser(CHROMIUM, tmp_path_factory.mktemp("view"), "--enable-unsafe-swiftshader") as tab:
+        tab.open(written / "page.html")
         tab.wait("solid !== null")
         tab.run("clearInterval(blinking)")
         yield tab, (gsmerge.read_scene(scene), *results)

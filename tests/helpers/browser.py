@@ -39,7 +39,8 @@ class Browser:
     """One page; ``call`` sends a command of the DevTools protocol, ``events`` are what came meanwhile."""
 
     def __init__(self, write: int, read: int) -> None:
-        self.write, self.read, self.rest, self.number, self.session = write, read, b"", 0, ""
+        self.write, self.read, self.rest, self.number = write, read, b"", 0
+        self.target = self.session = ""  # of the page
         self.events: list[dict[str, Any]] = []
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
@@ -63,10 +64,13 @@ class Browser:
         return message
 
     def open(self, page: Path | str) -> None:
-        """Load a page, from disk or by its address."""
+        """Load a page, from disk or by its address, in place of the last one, whose 3D would draw on unseen."""
         url = page.as_uri() if isinstance(page, Path) else page
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        last, self.session = self.target, ""
+        self.target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        if last:
+            self.call("Target.closeTarget", targetId=last)
+        self.session = self.call("Target.attachToTarget", targetId=self.target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
         self.call("Page.navigate", url=url)

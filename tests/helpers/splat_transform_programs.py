@@ -6,9 +6,12 @@ import json
 import os
 import re
 import struct
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +19,7 @@ import pytest
 
 from gsmerge import Gaussians
 from gsmerge.errors import UsageError
-from gsmerge.io.formats import sog
+from gsmerge.io.formats import sog, splat_transform
 from gsmerge.io.formats.arrays import Columns, to_columns
 from gsmerge.io.formats.splat_transform import VARIABLE, find_program
 from gsmerge.kernels import elementary
@@ -53,6 +56,18 @@ def put_stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str = STAN
     path.chmod(0o755)
     monkeypatch.setenv(VARIABLE, str(path))
     return path
+
+
+def run_here(monkeypatch: pytest.MonkeyPatch, program: Path) -> None:
+    """Let a stand-in do its work in this process; one of its own takes a second to load what it needs."""
+
+    def run(command: Sequence[str], **_: Any) -> subprocess.CompletedProcess[bytes]:
+        assert command[0] == str(program)
+        stand_in(command[1:])
+        return subprocess.CompletedProcess(command, 0, b"", b"")
+
+    seen = SimpleNamespace(**{**vars(subprocess), "run": run})
+    monkeypatch.setattr(splat_transform, "subprocess", seen)
 
 
 def stand_in(words: Sequence[str]) -> None:

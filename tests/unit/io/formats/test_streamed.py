@@ -17,7 +17,7 @@ import scenes
 from hostile.case import sparse
 from messages import NO_FOLDER, refuses
 from slow_readers import corners, drawn
-from splat_transform_programs import needs_program, put_stand_in, write_set
+from splat_transform_programs import needs_program, put_stand_in, run_here, write_set
 
 from gsmerge import Scene
 from gsmerge.cli import main
@@ -98,7 +98,7 @@ def content(folder: Path) -> dict[str, bytes]:
 @pytest.fixture
 def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stand-in for it."""
-    put_stand_in(tmp_path / "program", monkeypatch)
+    run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
 
 
 @pytest.mark.slow
