@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from batches import InlinePool
 from tiny_scene import edited_json
 
 import gsmerge
@@ -221,7 +222,10 @@ def test_progress_is_lines_of_json(words: tuple[str, ...], small_scene: Path, tm
     assert seconds == sorted(seconds)
 
 
-def test_progress_of_a_batch_names_scenes(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_progress_of_a_batch_names_scenes(
+    small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
     (tmp_path / "bad.ply").write_bytes(b"ply")
     outcome = run("batch", small_scene, tmp_path / "bad.ply", "-o", tmp_path / "out", "--effort", "draft", "--progress",
                   "json", code=5)  # fmt: skip

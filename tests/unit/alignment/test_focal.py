@@ -86,7 +86,7 @@ def test_photos_larger_than_the_grid(tmp_path: Path) -> None:
 OBLONG = np.array([[FOCAL, 0, 44], [0, 80, 38], [0, 0, 1]])
 
 
-@pytest.mark.parametrize(("views", "K"), [(1, SCENE.K), (3, OBLONG)])
+@pytest.mark.parametrize(("views", "K"), [(1, SCENE.K), pytest.param(3, OBLONG, marks=pytest.mark.slow)])
 def test_photos_show_it_where_rows_are_no_pixels(tmp_path: Path, views: int, K: np.ndarray) -> None:
     """VicaSplat's rows: sorted by opacity, the least opaque dropped, not on the rays; a search of seconds."""
     rng = np.random.default_rng(0)

@@ -140,7 +140,7 @@ def test_damaged_depth_maps(tmp_path: Path, tiny: Tiny) -> None:
     write_npz(path, tiny, depth=depths, intrinsics=None)
     assert not holds_depth_maps(path)
     np.savez_compressed(
-        path, extrinsics=np.eye(4)[None], intrinsics=np.eye(3)[None], depth=np.ones((1, 4000, 9000), "i1")
+        path, extrinsics=np.eye(4)[None], intrinsics=np.eye(3)[None], depth=np.ones((1, 2000, 3000), "i1")
     )
     with refuses(SceneError, path.name, "memory"):
         read_gaussians(path)

@@ -118,7 +118,7 @@ DAMAGED = {
     "huge": sog_with(lambda meta, files: meta["means"].update(mins=[10**400] * 3)),
     "nan": sog_with(lambda meta, files: meta["means"].update(mins=[float("nan")] * 3)),
     "lossy": sog_with(lambda meta, files: files.update({"scales.webp": webp(4, 4, cv2.IMWRITE_WEBP_QUALITY, 50)})),
-    "pixels": sog_with(lambda meta, files: files.update({"scales.webp": webp(4096, 4096, *LOSSLESS)})),
+    "pixels": sog_with(lambda meta, files: files.update({"scales.webp": webp(1024, 1024, *LOSSLESS)})),
     "mode": sog_with(lambda meta, files: files.update({"quats.webp": files["sh0.webp"]})),
     "header": sog_with(lambda meta, files: files.update({"scales.webp": files["scales.webp"][:25]})),
     "harmonics": sog_with(lambda meta, files: meta.update(shN={"count": 10**9, "bands": 3, "files": ["a", "b"]})),

@@ -127,19 +127,19 @@ def test_a_stand_in_is_given_the_file(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(
-    ("script", "said"),
+    ("script", "limit", "said"),
     [
-        ("raise SystemExit('x\\n  Error: out of\\tmemory\\n at line 5\\nfailed')", ("code 1", "out of memory")),
-        ("raise SystemExit('first\\nlast')", ("code 1", "last")),
-        ("", ("code 0", "without output")),
-        ("import time; time.sleep(60)", ("1", "seconds")),
+        ("raise SystemExit('x\\n  Error: out of\\tmemory\\n at line 5\\nfailed')", 60, ("code 1", "out of memory")),
+        ("raise SystemExit('first\\nlast')", 60, ("code 1", "last")),
+        ("", 60, ("code 0", "without output")),
+        ("import time; time.sleep(60)", 0.2, ("0.2", "seconds")),
     ],
     ids=["fails", "says no error", "writes nothing", "does not end"],
 )
 def test_a_program_that_fails_is_one_line(
-    script: str, said: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    script: str, limit: float, said: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(splat_transform, "TIME_LIMIT", 1)
+    monkeypatch.setattr(splat_transform, "TIME_LIMIT", limit)
     put_stand_in(tmp_path, monkeypatch, f"#!{{python}}\n{script}\n")
     with refuses(GsmergeError, tmp_path / "splat-transform", *said):
         splat_transform.run_program("a.ply", tmp_path / "b.ply")
