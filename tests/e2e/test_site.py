@@ -105,7 +105,9 @@ def served(site: Path) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    with browser(CHROMIUM, tmp_path_factory.mktemp("profile"), "--enable-unsafe-swiftshader") as opened:
+    """Of a small window: a processor draws its 3D."""
+    flags = "--enable-unsafe-swiftshader", "--window-size=400,300"
+    with browser(CHROMIUM, tmp_path_factory.mktemp("profile"), *flags) as opened:
         yield opened
 
 

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import skimage.data
-import sklearn.datasets
 
 from gsmerge.kernels import elementary
 
@@ -18,6 +16,9 @@ DENSITIES = (5_000, 12_000, 23_000)
 
 def photos() -> dict[str, np.ndarray]:
     """Six photos, ``[h,w,3]`` uint8, the longer side 476 pixels."""
+    import skimage.data  # here, since the two take seconds that each process of a run of tests would spend
+    import sklearn.datasets
+
     actual = {name: getattr(skimage.data, name)() for name in ("astronaut", "coffee", "chelsea", "rocket")}
     actual |= {name: sklearn.datasets.load_sample_image(f"{name}.jpg") for name in ("china", "flower")}
     return {name: shrink(image) for name, image in actual.items()}

@@ -190,6 +190,7 @@ def test_thumbnails_stand_for_no_photo(folder: Path, truth: np.ndarray) -> None:
     assert absent(loaded) == []
 
 
+@pytest.mark.slow
 def test_photos_among_others_of_the_place(folder: Path, made: Path, truth: np.ndarray, make_scene: Any) -> None:
     """Some frames of a film, with names that no camera has."""
     other = make_scene(folder.parent / "other", num_views=6, width=192, height=144)
