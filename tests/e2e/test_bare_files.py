@@ -50,7 +50,8 @@ def test_compact_needs_no_hint(bare: Path, tmp_path: Path, run: Any) -> None:
 @sweep(
     "words",
     [
-        "compact BARE --dry-run", "inspect BARE", "evaluate BARE SMALL --lpips none", "render BARE SMALL -o OUT.png",
+        "compact BARE --dry-run", "inspect BARE", "evaluate BARE SMALL --lpips none",
+        "render BARE SMALL --views 2 -o OUT.png",
         "extend OUT.gsm BARE --set superpixels=40 --set checkpoint=none",
         "view BARE SMALL -o OUT.html --no-open", "render BARE --path orbit --frames 2 -o OUT",
     ],

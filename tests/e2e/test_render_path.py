@@ -179,13 +179,13 @@ def test_a_small_world_is_drawn_as_a_large_one(kind: str, small_copy: Path, tmp_
         assert error(picture, cv2.imread(str(tmp_path / "small out" / path.name))) < 0.1
 
 
-def test_an_overlay_colours_what_few_views_show(smallest_copy: Path, tmp_path: Path, run: Run) -> None:
+def test_an_overlay_colours_what_few_views_show(small_copy: Path, tmp_path: Path, run: Run) -> None:
     """Red where the scene's Gaussians stand again, behind all cameras, and nothing where many views show them."""
-    scene = gsmerge.read_scene(smallest_copy)
+    scene = gsmerge.read_scene(small_copy)
     some, forward = scene.finite_gaussians[::7], scene.cameras.viewmats[:, 2, :3].mean(0)
     behind = replace(some, means=some.means - 30 * forward.astype(np.float32))
     gsmerge.write_ply(tmp_path / "both.ply", gsmerge.Gaussians.concat([some, behind]))
-    cameras = smallest_copy / "transforms.json"
+    cameras = small_copy / "transforms.json"
     run("render", tmp_path / "both.ply", "--cameras", cameras, "-o", tmp_path / "own", "--overlay", "support", code=0)
     run("render", tmp_path / "both.ply", "--cameras", cameras, "-o", tmp_path / "plain", code=0)
     for path in sorted((tmp_path / "plain").iterdir()):
