@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from panoramas import cut_views, show, take_photos
-from scipy.stats import wilcoxon
 
 from gsmerge.evidence.pictures import ViewPictures, average, fit_size
 from gsmerge.evidence.scores import (
@@ -96,6 +95,8 @@ def test_noise_is_that_of_most_pairs() -> None:
 
 @pytest.mark.parametrize("shift", [-0.3, 0.0, 0.1, 0.5])
 def test_signed_ranks_are_wilcoxon_s(shift: float) -> None:
+    from scipy.stats import wilcoxon  # which takes a second to load in each process of a run
+
     gains = np.random.default_rng(1).standard_normal(200) + shift
     expected = wilcoxon(gains, method="asymptotic", alternative="greater").zstatistic
     assert signed_ranks(gains) == pytest.approx(expected, abs=1e-9)
