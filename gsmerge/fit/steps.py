@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -134,18 +135,23 @@ class Optimiser:
             drawn = state.splats.opacities if opacities is None else opacities
             return tables.take(step.number, photo, weight, drawn, numbers)
 
+    @cached_property
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Limits of parameters before the growth of a run, where none come that could fill what is cut, and after."""
+        rates = self.run.job.options.tuning
+        moves = rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change
+        widest = max(photos.width for photos in self.run.job.photos)  # of the size whose pixels the least scale counts
+        ratio, long = log(np.array([rates.max_ratio, rates.long_share * widest / (3 * max(rates.min_scale, 1e-9))]))
+        before, after = (np.array([*moves, most, long], np.float32) for most in (np.inf, ratio))
+        return before, after
+
     def _constants(self, state: FitState, step: Step) -> dict[str, np.ndarray]:
         """Return the optimiser's constants at a step."""
         options, count = self.run.job.options, max(len(state.x), 1)
         rates, looks = options.tuning, step.number / len(self.photos[0])
-        moves = rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change
-        widest = max(photos.width for photos in self.run.job.photos)  # of the size whose pixels the least scale counts
-        ratio, long = log(np.array([rates.max_ratio, rates.long_share * widest / (3 * max(rates.min_scale, 1e-9))]))
-        if not options.grows or step.progress < GROWTH:  # none come that could fill what is cut
-            ratio = np.inf
         return {
             "rates": step_sizes(rates, step.progress, options.steps),
-            "limits": np.array([*moves, ratio, long], np.float32),
+            "limits": self._limits[options.grows and step.progress >= GROWTH],
             "betas": np.array([first_decay(rates, looks), rates.beta2], np.float32),
             "regs": np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32),
         }
