@@ -58,7 +58,7 @@ def record_fit(report: FitReport | None, planned: int) -> None:
     if report.stopped == TIME_SPENT and report.steps < planned:
         note(f"time_budget ended the fit after {report.steps} of {planned} steps")
     if report.fog is not None and report.fog > HAZE:
-        seen = f"seen from outside, the result shows haze where the scene is empty: fog {report.fog:.2f}"
+        seen = f"seen from outside, the result shows haze where the scene is empty: far fog {report.fog:.2f}"
         note(f"{seen}; --fit none makes less, and is farther from the photos" if report.accepted else seen)
     if not report.accepted:
         note("the fit was not accepted: held-out patches of the photos did not get better")

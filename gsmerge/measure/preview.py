@@ -78,7 +78,7 @@ def view_pictures(
     """Render each scene in every view, in rows that begin with the photo if there is one.
 
     Every picture comes with a line of text: its name, its number of Gaussians, and, if it is ``scored``, its PSNR
-    against the photo ``[h,w,3]``, or without photos against the first scene; a photo with the number of its view in
+    to the whole photo ``[h,w,3]``, or without photos to the first scene; a photo with the number of its view in
     ``ids``. ``drawing`` is passed on to :func:`gsmerge.render`.
     """
     renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
@@ -89,7 +89,8 @@ def view_pictures(
             columns.insert(0, (f"photo, view {view}", photos[row]))
         first, *others = columns
         if scored:
-            others = [(f"{text}, {psnr(image, first[1]):.1f} dB", image) for text, image in others]
+            what = "the photo" if photos is not None else scenes[0][0]
+            others = [(f"{text}, {psnr(image, first[1]):.1f} dB to {what}", image) for text, image in others]
         views.append([(text, to_picture(image)) for text, image in (first, *others)])
     return views
 

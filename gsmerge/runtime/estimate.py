@@ -8,7 +8,7 @@ from typing import Any
 from gsmerge.runtime.memory import machine_memory
 
 # Processor seconds, measured on 7 views of 480 x 352 and 12 of 480 x 256 pixels
-IMPORT_SECONDS = 0.4
+IMPORT_SECONDS = 1.0  # and of what every run does
 # Per million pixels of all views together, or per million Gaussians, which is the same number:
 COST_MERGE = 1.0  # reading, superpixels and merging
 COST_SCORE = 0.3  # of input and result against the photos
@@ -20,7 +20,7 @@ COST_SLOW = {"bass-adaptive": 6.0, "slic": 4.5, "greedy": 25.0, "splat-transform
 # Of a step of the fit:
 COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.25  # per million Gaussians that it draws
-MORE = 0.6  # of a processor that each thread but the first is worth
+MORE = 0.35  # of a processor that each thread but the first is worth
 
 # Where views are placed, per million Gaussians of the input:
 COST_READ = 3.0  # of reading and judging
