@@ -106,5 +106,5 @@ class StepTables:
 
     def _run(self, size: tuple[int, int], phases: tuple[str, ...]) -> None:
         calls = self.tables[size][1]
-        for call in (calls[PHASES.index(phase)] for phase in phases):
-            parallel_map(lambda call: call(), [call] * self.threads) if self.threads > 1 else call()
+        for phase in phases:
+            parallel_map(lambda call: call(), [calls[PHASES.index(phase)]] * self.threads)

@@ -73,13 +73,12 @@ class BudgetOptions(Settings):
     @property
     def is_limit(self) -> bool:
         """Whether the budget is a share, a size or a device, of which no more is taken than new views gain from."""
-        word = str(self.budget)
-        return not self.fill and (self.in_bytes or word in DEVICES or word.strip().endswith("%"))
+        return not self.fill and not self.auto and self.budget is not None and self.number is None
 
     @property
     def number(self) -> int | None:
         """The number of Gaussians that the budget names; None where it is a share, a size, a device, or left out."""
-        if self.budget is None or self.auto or self.in_bytes or str(self.budget) in DEVICES or "%" in str(self.budget):
+        if self.budget is None or self.auto or self.in_bytes or self.budget in DEVICES or "%" in str(self.budget):
             return None
         return parse_budget(self.budget, sys.maxsize)
 
