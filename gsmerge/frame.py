@@ -75,9 +75,10 @@ def scene_depth(scene: Scene) -> float:
     """Measure the median depth of sampled Gaussians in their own views, or in all views that see them; 0 if unseen."""
     rows = sample_rows(scene)
     means = scene.gaussians.means[rows].astype(np.float64)
-    if scene.aligned:
-        viewmats = scene.cameras.viewmats[rows // scene.pixels_per_view]
-        return float(lower_median(np.abs(camera_depths(means, viewmats))))
+    if scene.pixels is not None and scene.pixels.own:
+        homes = scene.pixels.homes[rows]
+        viewmats = scene.cameras.viewmats[homes[homes >= 0] // scene.pixels_per_view]
+        return float(lower_median(np.abs(camera_depths(means[homes >= 0], viewmats))))
     views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
     pixels, depths = project(means, views)
     x, y = pixels[..., 0], pixels[..., 1]
@@ -86,15 +87,11 @@ def scene_depth(scene: Scene) -> float:
 
 
 def sample_rows(scene: Scene) -> np.ndarray:
-    """Choose evenly spread rows among the valid ones; raise ValueError if there is none."""
-    valid = None if scene.pixel_ids is None else scene.pixel_ids >= 0
-    count = len(scene.gaussians) if valid is None else int(np.count_nonzero(valid))
+    """Choose evenly spread rows; raise ValueError if there is none."""
+    count = len(scene.gaussians)
     if count == 0:
-        raise ValueError("expected at least one valid Gaussian, got none")
-    step = max(1, count // SAMPLE_GAUSSIANS)
-    if valid is None or count == len(valid):
-        return np.arange(0, count, step)
-    return np.flatnonzero(valid)[::step]
+        raise ValueError("expected at least one Gaussian, got none")
+    return np.arange(0, count, max(1, count // SAMPLE_GAUSSIANS))
 
 
 def canonicalise(scene: SceneT, frame: Frame | None = None) -> tuple[SceneT, Frame]:

@@ -156,12 +156,13 @@ def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
 
     Higher harmonics are not rotated: poses are off by a degree or two, which hardly changes the colours.
     """
-    g, size = scene.gaussians, scene.pixels_per_view
+    assert scene.pixels is not None, "views have Gaussians"
+    g, of_views = scene.gaussians, scene.pixels.rows_of_views
     motions = matmul(invert(viewmats), scene.cameras.viewmats.astype(np.float64))
-    turns, (means, quats) = rotmat_to_quat(motions[:, :3, :3]), (np.empty_like(a) for a in (g.means, g.quats))
+    turns, (means, quats) = rotmat_to_quat(motions[:, :3, :3]), (a.copy() for a in (g.means, g.quats))
 
     def move(view: int) -> None:
-        rows = slice(view * size, (view + 1) * size)
+        rows = of_views[view]
         means[rows] = matmul(g.means[rows], motions[view, :3, :3].T) + motions[view, :3, 3]
         quats[rows] = multiply_quats(turns[view], g.quats[rows])
 

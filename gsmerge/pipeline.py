@@ -115,7 +115,7 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
     """Merge the superpixels of all views; compacting and adding views to a state share this part."""
     scene = prepared.scene
     segmentation = segment_scene(scene, plan.superpixels, count)
-    members = assign(scene, segmentation.groups, draws=plan.draws)
+    members = assign(scene, segmentation.groups, by_contribution=plan.by_contribution)
     networks = make_corrector(plan.networks, members, scene.cameras, plan.seed)
     pooled = encode(scene, members, segmentation.groups)
     features = correct(pooled, members, scene.cameras, networks, weaken=plan.weakens)

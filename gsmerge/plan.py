@@ -117,9 +117,9 @@ class Plan:
         return {} if self.checkpoint is None else {"networks": self.checkpoint.facts()}
 
     @property
-    def draws(self) -> bool:
-        """Whether Gaussians without pixels are given to superpixels by their blending weights, as in the paper."""
-        return self.networks is None or self.networks.options.makes_children
+    def by_contribution(self) -> bool:
+        """Whether Gaussians are given to superpixels by their blending weights, as in the paper."""
+        return self.networks is not None and self.networks.options.makes_children
 
     @property
     def weakens(self) -> bool:
@@ -277,7 +277,7 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
 
 
 def usual_blocks(num_gaussians: int, num_views: int) -> int:
-    """Return the usual number of blocks for an aligned scene, or an upper bound if the number of views decides."""
+    """Return the usual number of blocks for a scene, or an upper bound if the number of views decides."""
     if num_gaussians > WHOLE_GAUSSIANS:
         return -(-num_gaussians // BLOCK_GAUSSIANS)
     return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
@@ -299,7 +299,10 @@ def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
 
 def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
     """List the reasons why a scene cannot be cut into blocks."""
-    return [*_whole_needed(options), *([] if scene.aligned else ["a scene without one Gaussian per pixel"])]
+    return [
+        *_whole_needed(options),
+        *([] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]),
+    ]
 
 
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
@@ -324,7 +327,7 @@ def keeps_input(scene: SceneSize, options: CompactOptions) -> bool:
     """
     budget = options.budget
     asked = options.decides_count or options.replaces_stages  # which seldom come so near
-    return not (asked or scene.aligned or (budget.auto and not scene.rendered))
+    return not (asked or scene.has_own_pixels or (budget.auto and not scene.rendered))
 
 
 def _check_photos(prepared: Prepared, options: CompactOptions) -> None:
@@ -361,7 +364,7 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     if options.checkpoint != "auto":
         return options.checkpoint
     photos, unfitted = size.pictures == "photos", options.fit.fit == "none"
-    return "shipped" if (size.aligned and (unfitted or not photos)) or (photos and unfitted) else "none"
+    return "shipped" if (size.has_own_pixels and (unfitted or not photos)) or (photos and unfitted) else "none"
 
 
 def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
@@ -485,7 +488,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
         return decode
     asked = options.budget.quality is not None or options.changed_counts
     fits = options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
-    lone = scene.aligned and scene.num_cameras == 1
+    lone = scene.has_own_pixels and scene.num_cameras == 1
     return replace(decode, k=LONE_K if lone and not (asked or options.replaces_stages or fits) else USUAL_K)
 
 

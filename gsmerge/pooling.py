@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ Rule = Literal["depth", "paper"]
 MIN_SCALE = 1e-12
 MAX_OPACITY = 0.999  # of a merged Gaussian: finite as a logit, and still differentiable for a later fit
 ROWS_PER_TASK = 4096
+ROWS = 65536  # Gaussians whose footprints one task computes
 
 
 @dataclass(frozen=True)
@@ -31,15 +32,8 @@ class Members:
     sh0: np.ndarray  # [n,1,3]
     shN: np.ndarray  # [n,k-1,3], separate: most of a scene of degree 4, read by pooling alone
     footprints: np.ndarray  # [n] size of the own view's pixel at the member's depth, world units
-    # [n] int64, the pixel (view-major, row-major over all views) that a member belongs to, -1 for
-    # none; None: one member per pixel, in order
-    pixels: np.ndarray | None = None
-    # [v,h,w] int32, the member that each pixel shows, -1 for none; None: the one of its own number
-    fronts: np.ndarray | None = None
-
-    def pixels_of(self, rows: np.ndarray) -> np.ndarray:
-        """Return the pixels of the members ``rows``, -1 for none."""
-        return rows if self.pixels is None else self.pixels[rows]
+    pixels: np.ndarray  # [n] int, the pixel (view-major, row-major over all views) of each member, -1 for none
+    fronts: np.ndarray  # [v,h,w] int32, the member that each pixel shows, -1 for none
 
 
 def _array(values: np.ndarray) -> np.ndarray:
@@ -47,44 +41,39 @@ def _array(values: np.ndarray) -> np.ndarray:
 
 
 def scene_members(scene: Scene) -> Members:
-    """Return the Gaussians of a canonical aligned scene as members, with pixel footprints in their own views."""
-    g, cameras = scene.gaussians, scene.cameras
-    means = _array(g.means)
-    footprints = np.empty(len(g), np.float32)
-    pixels = scene.pixels_per_view
+    """Return the Gaussians of a canonical scene with pixels as members, with footprints in the views of these."""
+    assert scene.pixels is not None, "stages have pixels"
+    g, cameras, homes = scene.gaussians, scene.cameras, scene.pixels.homes
+    means, footprints = _array(g.means), np.empty(len(g), np.float32)
+    viewmats, Ks = cameras.viewmats.astype(np.float32), cameras.Ks
+    focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in Ks])
 
-    def fill(view: int) -> None:
-        rows = slice(view * pixels, (view + 1) * pixels)
-        focal = float(np.sqrt(abs(cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1])))
-        depths = np.abs(camera_depths(means[rows], cameras.viewmats[view].astype(np.float32)))
-        footprints[rows] = np.maximum(depths, 1e-6) / focal
+    def fill(first: int) -> None:
+        rows = slice(first, first + ROWS)
+        views = homes[rows] // scene.pixels_per_view
+        depths = np.abs(camera_depths(means[rows], viewmats[views]))
+        footprints[rows] = np.maximum(depths, np.float32(1e-6)) / focals.astype(np.float32)[views]
 
-    parallel_map(fill, range(len(scene)))
-    return gaussian_members(g, footprints)
-
-
-def unaligned_members(scene: Scene, pixels: np.ndarray, fronts: np.ndarray | None = None) -> Members:
-    """Return the Gaussians of an unaligned scene as members, given their pixels ``[n]`` int64 (-1: none).
-
-    ``fronts [v,h,w]`` int32: the Gaussian that each pixel shows (-1: none), for statistics across views.
-    """
-    means, cameras = _array(scene.gaussians.means), scene.cameras
-    focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1])).astype(np.float64)
-    views = pixels // scene.pixels_per_view
-    depths = np.abs(camera_depths(means, cameras.viewmats.astype(np.float64)[views]))
-    footprints = np.maximum(depths, 1e-6) / focals[views]
-    alone = np.flatnonzero(pixels < 0)
+    parallel_map(fill, range(0, len(g), ROWS))
+    alone = np.flatnonzero(homes < 0)
     if len(alone):
         nearest = np.full(len(alone), np.inf)
         for centre, focal in zip(cameras.centres.astype(np.float64), focals, strict=True):
             np.minimum(nearest, np.linalg.norm(means[alone] - centre, axis=1) / focal, out=nearest)
         footprints[alone] = np.maximum(nearest, 1e-6)
-    return replace(gaussian_members(scene.gaussians, footprints.astype(np.float32)), pixels=pixels, fronts=fronts)
+    columns = {name: _array(column) for name, column in vars(g).items()}
+    return Members(**columns, footprints=footprints, pixels=homes, fronts=scene.pixels.fronts)
 
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray) -> Members:
-    """Return Gaussians as members, one per pixel, with the given footprints ``[n]``."""
-    return Members(**{name: _array(column) for name, column in vars(g).items()}, footprints=footprints)
+    """Return Gaussians that no view shows as members, with the given footprints ``[n]``."""
+    nowhere = np.full(len(g), -1, np.int32), np.zeros((0, 1, 1), np.int32)
+    return Members(
+        **{name: _array(column) for name, column in vars(g).items()},
+        footprints=footprints,
+        pixels=nowhere[0],
+        fronts=nowhere[1],
+    )
 
 
 @dataclass(frozen=True)

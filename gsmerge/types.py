@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -260,23 +261,80 @@ class Views:
 
 
 PROTECTED = np.float32(4)  # pixels that one counts as where a picture of --protect is white
-PER_PIXEL = ("images", "missing", "masks", "importance")  # arrays of a scene with a value for each pixel of its views
+PER_PIXEL = ("images", "masks", "importance")  # arrays of a scene with a value for each pixel of its views
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Which pixel each Gaussian belongs to, and which Gaussian each pixel shows.
+
+    Pixels are numbered over all views, ``(v·H + y)·W + x``.
+
+    Args:
+        homes: ``[n]`` int, the pixel in which each Gaussian shows most; -1: no view sees it.
+        fronts: ``[v,h,w]`` int32, the Gaussian that is first in each pixel; -1: none.
+        own: Whether each view has Gaussians of its own, one or more for a pixel, with the colours of its photo.
+    """
+
+    homes: np.ndarray
+    fronts: np.ndarray
+    own: bool
+
+    @staticmethod
+    def of_grid(there: np.ndarray) -> Pixels:
+        """Return those of Gaussians that are, in order, the pixels of the mask ``there [v,h,w]``."""
+        mask = np.asarray(there, bool)
+        count, small = mask.size, mask.size <= np.iinfo(np.int32).max
+        homes = np.arange(count, dtype=np.int32 if small else np.int64)
+        if mask.all():
+            return Pixels(homes, homes.astype(np.int32, copy=False).reshape(mask.shape), own=True)
+        homes, fronts = homes[mask.reshape(-1)], np.full(count, -1, np.int32)
+        fronts[homes] = np.arange(len(homes), dtype=np.int32)
+        return Pixels(homes, fronts.reshape(mask.shape), own=True)
+
+    @property
+    def shown(self) -> np.ndarray:
+        """Mask ``[v,h,w]`` of the pixels that a Gaussian is first in."""
+        return np.asarray(self.fronts >= 0)
+
+    @cached_property
+    def rows_of_views(self) -> list[np.ndarray]:
+        """Rows ``[m]`` of the Gaussians that belong to each view, ascending."""
+        views = self.homes // max(1, int(np.prod(self.fronts.shape[1:])))
+        order = np.arange(len(views))
+        if (views[1:] < views[:-1]).any():
+            order = np.argsort(views, kind="stable")
+            views = views[order]
+        starts = np.searchsorted(views, np.arange(len(self.fronts) + 1))
+        return [order[first:last] for first, last in pairwise(starts.tolist())]
+
+    def select(self, views: Sequence[int]) -> tuple[np.ndarray, Pixels]:
+        """Return the rows ``[m]`` of the Gaussians of some views, view by view, and their pixels in these views."""
+        size, of_views = int(np.prod(self.fronts.shape[1:])), [self.rows_of_views[view] for view in views]
+        homes, fronts, first = [self.homes[:0]], list[np.ndarray](), 0
+        for place, (view, rows) in enumerate(zip(views, of_views, strict=True)):
+            homes.append(self.homes[rows] + self.homes.dtype.type((place - view) * size))
+            front, found = self.fronts[view], np.searchsorted(rows, self.fronts[view])
+            fronts.append(np.where(front >= 0, first + found, -1).astype(np.int32))
+            first += len(rows)
+        shape = len(of_views), *self.fronts.shape[1:]
+        rows = np.concatenate([np.zeros(0, np.int64), *of_views])
+        return rows, Pixels(np.concatenate(homes), np.array(fronts, np.int32).reshape(shape), own=self.own)
 
 
 @dataclass(frozen=True)
 class Scene:
     """Gaussians, and the views that they were made from or that see them.
 
-    A scene is aligned where every row's pixel is known: row ``(v·H + y)·W + x`` belongs to pixel (x, y) of view v. Rows
-    that were not finite stay, fully transparent; pixels without a row are filled up like that, or from a depth map.
+    Gaussians are those rows of a file that are there: finite, and drawn by something. Where reading shows which pixel
+    each row belongs to, the scene has its ``pixels``; elsewhere :func:`gsmerge.facts.pixels.find_pixels` finds them.
 
     Args:
-        gaussians: n rows, in the frame of the cameras; V·H·W of an aligned scene.
+        gaussians: n Gaussians, in the frame of the cameras.
         cameras: The V views; none where none are known.
         images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None.
-        pixel_ids: ``[n]`` int32, each row's pixel, or -1 where the row is not finite; None: not known.
+        pixels: The pixel of each Gaussian, and the Gaussian in front of each pixel; None: not known yet.
         names: The views' names (image file names where known).
-        missing: ``[v,h,w]`` bool, True where the file has no row for the pixel; None: nowhere.
         large_photos: The photos with more pixels than the views, or None.
         masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. A view without a photo has none such.
         importance: ``[v,h,w]`` float32, how many pixels a photo's pixel counts as in a fit; None: one everywhere.
@@ -286,26 +344,24 @@ class Scene:
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
-        >>> scene.aligned, len(scene), scene.images.shape
+        >>> scene.pixels.own, len(scene), scene.images.shape
         (True, 5, (5, 32, 48, 3))
     """
 
     gaussians: Gaussians
     cameras: Cameras
     images: np.ndarray | None
-    pixel_ids: np.ndarray | None
+    pixels: Pixels | None
     names: tuple[str, ...]
-    missing: np.ndarray | None = None
     large_photos: LargePhotos | None = None
     masks: np.ndarray | None = None
     importance: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
-        if self.pixel_ids is not None:
-            if len(self.gaussians) != v * h * w:
-                raise ValueError(f"expected {v} x {h} x {w} = {v * h * w} Gaussians, got {len(self.gaussians)}")
-            _expect("pixel_ids", self.pixel_ids, (v * h * w,))
+        if self.pixels is not None:
+            _expect("homes", self.pixels.homes, (len(self.gaussians),))
+            _expect("fronts", self.pixels.fronts, (v, h, w))
         for name in PER_PIXEL:
             if getattr(self, name) is not None:
                 _expect(name, getattr(self, name), (v, h, w, 3) if name == "images" else (v, h, w))
@@ -319,30 +375,31 @@ class Scene:
     def __repr__(self) -> str:
         views = f"{len(self)} views of {self.cameras.width} x {self.cameras.height}" if len(self) else "no views"
         images = ", images" if self.images is not None else ""
-        pixels = ", aligned" if self.aligned else ""
-        return f"Scene({self.num_gaussians:,} Gaussians, {views}{images}{pixels})"
+        own = ", of pixels" if self.has_own_pixels else ""
+        return f"Scene({len(self.gaussians):,} Gaussians, {views}{images}{own})"
 
     def numpy(self) -> Scene:
         """Return the same scene with NumPy arrays in place of tensors."""
-        names = [name for name in ("pixel_ids", *PER_PIXEL) if getattr(self, name) is not None]
+        names = [name for name in PER_PIXEL if getattr(self, name) is not None]
         arrays: dict[str, Any] = {name: as_array(getattr(self, name)) for name in names}
         return replace(self, gaussians=self.gaussians.numpy(), cameras=self.cameras.numpy(), **arrays)
 
     @property
-    def aligned(self) -> bool:
-        """Whether the pixel of every row is known."""
-        return self.pixel_ids is not None
+    def has_own_pixels(self) -> bool:
+        """Whether it is known that each view has Gaussians of its own, with the colours of its photo."""
+        return self.pixels is not None and self.pixels.own
 
-    @cached_property
-    def valid(self) -> np.ndarray:
-        """Mask ``[v,h,w]`` of an aligned scene's pixels that have a finite Gaussian."""
-        assert self.pixel_ids is not None
-        return np.asarray(self.pixel_ids >= 0).reshape(len(self.cameras), self.cameras.height, self.cameras.width)
+    @property
+    def covered(self) -> np.ndarray | None:
+        """Mask ``[v,h,w]`` of pixels with a Gaussian of their view's own, where others have none; None elsewhere."""
+        if self.pixels is None or not self.pixels.own or self.pixels.shown.all():
+            return None
+        return self.pixels.shown
 
     @property
     def is_shown(self) -> bool:
-        """Whether photos, or the colours of rows that belong to pixels, show what the views see."""
-        return self.aligned or self.images is not None
+        """Whether photos, or the colours of Gaussians of the views' own, show what the views see."""
+        return self.has_own_pixels or self.images is not None
 
     @property
     def photo_views(self) -> list[int]:
@@ -360,34 +417,9 @@ class Scene:
         return mask if mask.any() else None
 
     @property
-    def num_missing(self) -> int:
-        """Number of pixels without a row in the file."""
-        return 0 if self.missing is None else int(self.missing.sum())
-
-    @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians in the file; budgets and ratios refer to it."""
-        return len(self.gaussians) - self.num_missing
-
-    @property
-    def finite_gaussians(self) -> Gaussians:
-        """Gaussians of finite rows; rows that replace invalid rows of the file are left out."""
-        return self.gaussians if self.pixel_ids is None else self.gaussians[self.pixel_ids >= 0]
-
-    @property
-    def stored(self) -> np.ndarray:
-        """Mask ``[v,h,w]`` of an aligned scene's pixels whose Gaussian is finite and comes from the file."""
-        return self.valid if self.missing is None else self.valid & ~self.missing
-
-    @property
-    def stored_rows(self) -> np.ndarray:
-        """Mask ``[n]`` of the rows that are finite Gaussians from the file; without pixels these are all."""
-        return np.ones(len(self.gaussians), bool) if self.pixel_ids is None else self.stored.reshape(-1)
-
-    @property
-    def file_gaussians(self) -> Gaussians:
-        """Gaussians that come from the file, without those added for missing pixels."""
-        return self.gaussians if self.missing is None else self.gaussians[~self.missing.reshape(-1)]
+        """Number of Gaussians, n; budgets and ratios refer to it."""
+        return len(self.gaussians)
 
     @property
     def pixels_per_view(self) -> int:
@@ -400,11 +432,12 @@ class PicturedScene(Scene):
     """A scene that has a picture of every view: its photo, or what stands in for it.
 
     Pictures are black, and do not count for scores, where ``empty [v,h,w]``, a mask or shares: nothing may be there;
-    None: nowhere.
+    None: nowhere. Gaussians that are True in ``filled [n]`` fill holes, and are not the file's; None: none are.
     """
 
     images: np.ndarray
     empty: np.ndarray | None = None
+    filled: np.ndarray | None = None
 
     @staticmethod
     def of(scene: Scene, images: np.ndarray, masks: np.ndarray | None) -> PicturedScene:
@@ -415,14 +448,6 @@ class PicturedScene(Scene):
     def without_pictures(self) -> Scene:
         """Return the scene without its pictures."""
         return Scene(**{field.name: getattr(self, field.name) for field in fields(Scene)} | {"images": None})
-
-
-def grid_ids(valid: np.ndarray) -> np.ndarray:
-    """Return the ``pixel_ids [n]`` of an aligned scene, given a mask ``[v,h,w]`` of its finite Gaussians."""
-    flat = np.asarray(valid).reshape(-1)
-    ids = np.arange(len(flat), dtype=np.int32)
-    ids[~flat] = -1
-    return ids
 
 
 @dataclass(frozen=True)

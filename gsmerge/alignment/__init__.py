@@ -27,12 +27,11 @@ from gsmerge.alignment.layouts import (
 )
 from gsmerge.alignment.rotations import choose_rotations, read_rotations, w_seems_last
 from gsmerge.alignment.rows_first import AlignmentResult, align
-from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels
+from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, check_pixels, sample_pixels
 
 if TYPE_CHECKING:
     from gsmerge.alignment.cameras import move_cameras, other_conventions
     from gsmerge.alignment.doubted_depths import choose_depths
-    from gsmerge.alignment.dropped_depths import fill_from_depths
     from gsmerge.alignment.estimate import estimate_cameras, estimate_from_rows
     from gsmerge.alignment.explain import explain_misalignment, misalignment_error
     from gsmerge.alignment.focal import estimate_focal
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
 _LATER = {
     "cameras": ("move_cameras", "other_conventions"),
     "doubted_depths": ("choose_depths",),
-    "dropped_depths": ("fill_from_depths",),
     "estimate": ("estimate_cameras", "estimate_from_rows"),
     "explain": ("explain_misalignment", "misalignment_error"),
     "focal": ("estimate_focal",),

@@ -24,16 +24,17 @@ _AROUND, _HERE, _ASKED = 12.0, 0.6, 0.4  # else the maps need this lead so many 
 
 
 def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> tuple[Scene, int]:
-    """Place Gaussians of an aligned scene at the depths ``maps [v,h,w]`` where other views confirm these, not them.
+    """Place Gaussians in front of pixels at the depths ``maps [v,h,w]`` where other views confirm these, not them.
 
     ``unit``: that of the maps in the scene's; if the maps are not confirmed in it, their median ratio to the Gaussians'
     depths is tried. Also returns how many were placed; the scene itself is returned where the Gaussians are as good.
     """
-    views, g = len(scene), scene.gaussians
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    views, g, fronts = len(scene), scene.gaussians, scene.pixels.fronts.reshape(len(scene), -1)
     viewmats, maps = scene.cameras.viewmats.astype(np.float64), maps.reshape(views, -1).astype(np.float64)
-    centres, means = camera_centres(viewmats), g.means.reshape(views, -1, 3)
+    centres, means = camera_centres(viewmats), g.means[fronts]
     depths = camera_depths(means, viewmats[:, None])
-    usable = scene.valid.reshape(views, -1) & (depths > 0) & (maps > 0) & np.isfinite(maps)
+    usable = (fronts >= 0) & (depths > 0) & (maps > 0) & np.isfinite(maps)
     ratios = np.where(usable, maps, 1) / np.where(usable, depths, 1)
     best = np.zeros_like(usable), means, ratios
     for scale in (unit, 1 / float(np.median(ratios[usable]))) if views > 1 and usable.any() else ():
@@ -42,31 +43,34 @@ def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> tuple[Scene, i
         if not differ.any():
             return scene, 0
         placed = np.stack([c + (m - c) * f[:, None] for c, m, f in zip(centres, means, factors, strict=True)])
-        votes = _count_votes(scene, placed, differ)
+        votes = _count_votes(scene, means, placed, differ)
         lead = float(votes.sum() / max(1, np.abs(votes).sum()))
         if scale == unit or lead > _CLEAR:
             best = _follow_votes(votes, differ) & usable, placed, factors
         if lead > _CLEAR:
             break
-    rows, placed, factors = (array.reshape(len(g), -1) for array in best)
-    if not rows.any():
+    chosen, placed, factors = best
+    rows = fronts[chosen]
+    if len(rows) == 0:
         return scene, 0
-    means, scales = np.where(rows, placed, g.means), np.where(rows, g.scales * factors, g.scales)
-    g = replace(g, means=means.astype(g.means.dtype), scales=scales.astype(g.scales.dtype))
-    return replace(scene, gaussians=g), int(rows.sum())
+    means, scales = g.means.copy(), g.scales.copy()
+    means[rows], scales[rows] = placed[chosen], g.scales[rows] * factors[chosen][:, None]
+    return replace(scene, gaussians=replace(g, means=means, scales=scales)), len(rows)
 
 
-def _count_votes(scene: Scene, placed: np.ndarray, differ: np.ndarray) -> np.ndarray:
-    """Ask other views which points show their surfaces: 1 for ``placed [v,p,3]``, -1 for the Gaussians.
+def _count_votes(scene: Scene, means: np.ndarray, placed: np.ndarray, differ: np.ndarray) -> np.ndarray:
+    """Ask other views which points show their surfaces: 1 for ``placed [v,p,3]``, -1 for the Gaussians at ``means``.
 
     ``differ [v,p]``: pixels that are asked for; the votes ``[v,h,w]`` of others, and in doubt, are 0.
     """
     cameras, (views, pixels) = scene.cameras, differ.shape
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    shown = sh0_to_rgb(scene.gaussians.sh0) if scene.images is None else scene.images
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    there = scene.pixels.shown
+    shown = sh0_to_rgb(scene.gaussians.sh0[scene.pixels.fronts]) if scene.images is None else scene.images
     colors, opaque = np.ascontiguousarray(shown, np.float32).reshape(-1, 3), np.ones(differ.size, np.float32)
-    sources = [np.ascontiguousarray(points, np.float32).reshape(-1, 3) for points in (scene.gaussians.means, placed)]
-    ids = np.where(scene.valid, np.arange(differ.size, dtype=np.int32).reshape(scene.valid.shape), -1)
+    sources = [np.ascontiguousarray(points, np.float32).reshape(-1, 3) for points in (means, placed)]
+    ids = np.where(there, np.arange(differ.size, dtype=np.int32).reshape(there.shape), -1)
     centres = camera_centres(viewmats)
 
     def ask(view: int) -> np.ndarray:
@@ -86,7 +90,7 @@ def _count_votes(scene: Scene, placed: np.ndarray, differ: np.ndarray) -> np.nda
         votes[rows - view * pixels] = np.sign(np.trunc((theirs - ours) / _WON))
         return votes
 
-    return np.stack(parallel_map(ask, range(views))).reshape(scene.valid.shape)
+    return np.stack(parallel_map(ask, range(views))).reshape(there.shape)
 
 
 def _follow_votes(votes: np.ndarray, differ: np.ndarray) -> np.ndarray:

@@ -37,21 +37,21 @@ def read_rotations(scene: Scene, quats: QuatChoice, turn: np.ndarray | None = No
     """Reinterpret the rotations of a scene, read as wxyz before, in another way; see :class:`ReadHints`.
 
     ``turn [3,3]`` is the rotation of the world, and of the Gaussians with it, that the exporter applied; None: none.
-    For "xyzw-root", the one of two square roots is taken whose thinnest axis follows the surface better. Where rows
-    belong to no pixels, only "xyzw" has an effect.
+    For "xyzw-root", the one of two square roots is taken whose thinnest axis follows the surface better. Where
+    views have no Gaussians of their own, only "xyzw" has an effect.
     """
-    if quats in ("auto", "wxyz") or not (scene.aligned or quats == "xyzw"):
+    if quats in ("auto", "wxyz") or not (scene.has_own_pixels or quats == "xyzw"):
         return scene
     stored = scene.gaussians.quats
     if quats == "xyzw":
         read = from_xyzw(stored)
     elif quats == "xyzw-root":
-        normals, thinnest = _smooth_normals(scene), scene.gaussians.scales.argmin(1)
+        normals, thinnest = _smooth_normals(scene)[_homes(scene)], scene.gaussians.scales.argmin(1)
         roots = square_roots(from_xyzw(stored))
         first, second = (_cosines(root, thinnest, normals) for root in roots)
         read = np.where((second > first)[:, None], roots[1], roots[0])
     else:
-        read = multiply_quats(_camera_quats(scene, turn).repeat(scene.pixels_per_view, 0), stored)
+        read = multiply_quats(_camera_quats(scene, turn)[_homes(scene) // scene.pixels_per_view], stored)
     return replace(scene, gaussians=replace(scene.gaussians, quats=read))
 
 
@@ -89,7 +89,7 @@ def choose_rotations(scene: Scene, turn: np.ndarray | None = None) -> tuple[Quat
     means = parallel_map(lambda read: float(_cosines(read, thinnest, normals).mean()), single)
     cosine: dict[QuatChoice, float] = dict(zip(_READINGS, means, strict=True))
     best: QuatChoice = max(_READINGS, key=lambda name: cosine[name])
-    gain = _SIGNED_GAIN if best == "xyzw" and w_seems_last(scene.file_gaussians.quats) else _MIN_GAIN
+    gain = _SIGNED_GAIN if best == "xyzw" and w_seems_last(scene.gaussians.quats) else _MIN_GAIN
     if _is_root(scene, rows, single, thinnest, normals):
         best, cosine["xyzw-root"] = "xyzw-root", _better_of(square_roots(as_xyzw), thinnest, normals, 0.0)
     elif best == "wxyz" or cosine[best] < max(_MIN_COSINE, cosine["wxyz"] + gain):
@@ -134,7 +134,7 @@ def _is_root(
     of_roots, *others = parallel_map(lambda pair: _better_of(pair, thinnest, normals, 0.0), [roots, *pairs])
     if of_roots <= max(others):
         return False
-    smooth = _smooth_normals(scene)[rows]
+    smooth = _smooth_normals(scene)[_homes(scene)[rows]]
     best_other = max(_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in pairs)
     return 1 - _better_of(roots, thinnest, smooth, _FOLLOWS) <= _MAX_LEFT * (1 - best_other)
 
@@ -155,10 +155,10 @@ def _half_a_turn_more(quats: np.ndarray) -> np.ndarray:
 
 
 def _smooth_normals(scene: Scene) -> np.ndarray:
-    """Compute surface normals ``[n,3]`` at all pixels from means averaged over neighbours; 0 on overflow."""
-    v, h, w = scene.valid.shape
-    weights = scene.valid[..., None].astype(np.float32)
-    means = scene.gaussians.means.reshape(v, h, w, 3)
+    """Compute surface normals ``[v·h·w,3]`` at all pixels from means averaged over neighbours; 0 on overflow."""
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    (_, h, w), shown = scene.pixels.fronts.shape, scene.pixels.shown
+    weights, means = shown[..., None].astype(np.float32), scene.gaussians.means[scene.pixels.fronts]
     middle = means.mean((0, 1, 2), np.float64, where=weights > 0).astype(means.dtype)
     with np.errstate(over="ignore"):
         both = np.concatenate([np.where(weights > 0, means - middle, 0).astype(np.float32), weights], 3)
@@ -181,20 +181,25 @@ def _average_around(picture: np.ndarray) -> np.ndarray:
 
 def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute surface normals ``[t,3]`` at a sample of pixels; also return the rows and views of these."""
-    v, h, w = scene.valid.shape
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    v, h, w = scene.pixels.fronts.shape
     inner = np.arange(h * w).reshape(h, w)[_STEP:-_STEP, _STEP:-_STEP].reshape(-1)
     step = spread_step(len(inner) // _SAMPLE_PIXELS, w - 2 * _STEP)
     views = np.arange(0, v, -(-v // _MOST_VIEWS))
-    rows = (h * w * views[:, None] + inner[::step]).reshape(-1)
-    valid, means = scene.valid.reshape(-1), scene.gaussians.means
-    good = valid[rows]
-    for offset in (_STEP, -_STEP, _STEP * w, -_STEP * w):
-        good = good & valid[rows + offset]
-    rows = rows[good]
+    places = (h * w * views[:, None] + inner[::step]).reshape(-1)
+    fronts, means = scene.pixels.fronts.reshape(-1), scene.gaussians.means
+    left, right, above, below = (fronts[places + away] for away in (-_STEP, _STEP, -_STEP * w, _STEP * w))
+    good = np.minimum.reduce([fronts[places], left, right, above, below]) >= 0
+    places, left, right, above, below = (each[good] for each in (places, left, right, above, below))
     with np.errstate(all="ignore"):  # means as large as 1e38 overflow: their pixels are left out
-        across = (means[rows + _STEP] - means[rows - _STEP]).astype(np.float32)
-        down = (means[rows + _STEP * w] - means[rows - _STEP * w]).astype(np.float32)
+        across, down = ((means[b] - means[a]).astype(np.float32) for a, b in ((left, right), (above, below)))
         normals = normalize(np.cross(across, down))
     finite = np.isfinite(normals).all(1)
-    rows = rows[finite]
-    return normals[finite], rows, rows // (h * w)
+    places = places[finite]
+    return normals[finite], fronts[places], places // (h * w)
+
+
+def _homes(scene: Scene) -> np.ndarray:
+    """Return the pixel ``[n]`` of each Gaussian of a scene whose views have Gaussians of their own."""
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    return scene.pixels.homes

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.alignment.layouts import Layout, plain_layout, subsample
+from gsmerge.alignment.layouts import Layout, plain_layout, spread_step, subsample
 from gsmerge.geometry import Similarity, lower_median, median, sh0_to_rgb
 from gsmerge.kernels import reproject
 from gsmerge.runtime.memory import free_pages, gather
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras, Gaussians, Scene
 
 MARGIN = 2.0  # by which the best reading must beat the next one
 SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
@@ -204,6 +204,21 @@ def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> 
         raise ValueError(f"expected {views} x {height} x {width} Gaussians, got {len(gaussians)}")
     layout = plain_layout(views, width, height)
     return find_correspondences(gaussians.means, valid.reshape(-1), subsample(layout, MAX_CHECKED))
+
+
+def check_pixels(scene: Scene) -> Alignment:
+    """Measure how far a sample of the Gaussians in front of every view projects from their pixels."""
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    free_pages(vars(scene.gaussians).values())
+    width, views = scene.cameras.width, len(scene)
+    step = spread_step(-(-scene.pixels_per_view // MAX_CHECKED), width)
+    places = np.arange(0, scene.pixels_per_view, step)
+    fronts = scene.pixels.fronts.reshape(views, -1)[:, places]
+    parts, columns = np.nonzero(fronts >= 0)
+    y, x = np.divmod(places[columns], width)
+    rows = fronts[parts, columns]
+    points = gather(scene.gaussians.means, rows).astype(np.float64)
+    return check_pairs(Correspondences(points, np.stack([x, y], 1) + 0.5, parts, parts, rows), scene.cameras)
 
 
 def check_pairs(pairs: Correspondences, cameras: Cameras, num_parts: int | None = None) -> Alignment:

@@ -62,7 +62,7 @@ SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is to
 
 
 def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[Block], Covisibility]:
-    """Cut the views of an aligned scene into ``count`` blocks, or fewer if only the number of views asks for blocks."""
+    """Cut the views of a scene into ``count`` blocks, or fewer if only the number of views asks for blocks."""
     with stage("partition"):
         covisibility = measure_covisibility(scene.numpy())
         fewer = options.blocks.blocks == "auto" and scene.num_gaussians <= WHOLE_GAUSSIANS
@@ -72,7 +72,7 @@ def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[B
 def compact_in_blocks(
     scene: Scene, options: CompactOptions, choices: SceneChoices, blocks: Sequence[Block], covisibility: Covisibility
 ) -> CompactResult:
-    """Compact an aligned scene in blocks of views.
+    """Compact a scene in blocks of views.
 
     The views of each block are merged first, and only the Gaussians that belong to the block are kept, so that all
     blocks together start from one set of Gaussians. Then each block fits what its views see, its neighbours' Gaussians
@@ -171,8 +171,8 @@ def without_gaussians(prepared: Prepared) -> Prepared:
         return moved[id(images)]
 
     def bare(scene: SceneT) -> SceneT:
-        images = move(np.asarray(scene.images))  # rows with pixels always have pictures
-        return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=images, pixel_ids=None, missing=None)
+        images = move(np.asarray(scene.images))  # views with Gaussians of their own always have pictures
+        return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=images, pixels=None)
 
     reference = prepared.reference
     if reference.photo_files is not None:

@@ -150,7 +150,7 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
         return build(prepared, plan, count)
     from gsmerge.stages.clean import faintest_dropped
 
-    most = len(prepared.scene.finite_gaussians)
+    most = len(prepared.scene.gaussians)
 
     def build_more(asked: int | None) -> tuple[int | None, Fitted, dict[str, int], Record]:
         with record_part() as record:

@@ -64,7 +64,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         machine has enough.
     """
     size = measure_size(scene)
-    if (options.budget.auto or options.budget.is_limit) and scene.aligned:
+    if (options.budget.auto or options.budget.is_limit) and scene.has_own_pixels:
         options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))
     choices = choose_for_scene(size, options)
     limits, settings = choices.limits, choices.settings(options)

@@ -123,13 +123,16 @@ def nothing_left(path: Path) -> SceneError:
 
 def shows_nothing(scene: Scene) -> bool:
     """Return whether a run would end with :func:`nothing_left`; a scene that covers little is merged to find out."""
-    gaussians = scene.finite_gaussians
+    gaussians = scene.gaussians
     sample = gaussians[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
     if len(sample) == 0:
         return False
     low, high = np.percentile(sample.means.astype(np.float64), BOX_QUANTILES, axis=0)
     areas = np.sort(sample.scales.astype(np.float64), axis=1)[:, 1:].prod(1)
-    covered, num_views = len(gaussians) * float((sample.opacities * areas).mean()), len(scene) if scene.aligned else 1
+    covered, num_views = (
+        len(gaussians) * float((sample.opacities * areas).mean()),
+        len(scene) if scene.has_own_pixels else 1,
+    )
     if covered > COVERED * num_views * float(np.square(high - low).sum()):
         return False
     settings = CompactOptions().with_settings({"effort": "draft", "fit": "none"})
@@ -175,7 +178,7 @@ def _compact_notes(loaded: Loaded) -> tuple[str, ...]:
     """Return a note if the scene is a result of gsmerge, by its header or by its small number of Gaussians."""
     scene, comments = loaded.scene, loaded.info.comments
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
-    few = is_from_gsmerge(comments) and not scene.aligned and scene.num_gaussians <= pixels / 2
+    few = is_from_gsmerge(comments) and not scene.has_own_pixels and scene.num_gaussians <= pixels / 2
     if not few and RESULT_COMMENT not in comments:
         return ()
     count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"

@@ -15,6 +15,7 @@ from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
+from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.prepare import missing_notes
 from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.facts.support import count_views_in_world
@@ -130,7 +131,7 @@ def _photo_notes(scene: Scene) -> list[str]:
 
 
 def _measure_agreement(scene: Scene) -> Agreement | None:
-    return confirm_depths(canonicalise(scene)[0]) if scene.aligned and scene.valid.any() else None
+    return confirm_depths(with_pixels(canonicalise(scene)[0])) if len(scene) > 1 and len(scene.gaussians) else None
 
 
 def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] | None:
@@ -176,13 +177,13 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     facts |= _describe_scene(load, is_result=is_result)
     if shows_nothing(load.scene):
         return facts | {"alignment_problem": str(nothing_left(files.ply)), "compact": None, "auto": None}
-    if load.recovery is None or load.alignment is None:
+    if load.recovery is None or load.alignment is None or load.scene.pixels is None:
         return facts | {"alignment_problem": load.problem}
     return facts | {
         "width": load.scene.cameras.width,
         "height": load.scene.cameras.height,
         "per_pixel": load.recovery.best.layout.per_pixel,
-        "num_missing": load.pixel_scene().num_missing,
+        "num_missing": int((load.scene.pixels.fronts < 0).sum()),
         "alignment": asdict(load.alignment),
         "rows": load.recovery.description,
     }
@@ -193,11 +194,11 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     scene, sight, num_sky_views = load.scene, None, 0
     if len(scene):
         gaussians = scene.gaussians
-        stored, images = scene.stored_rows, photo_array(scene.images)
-        sight = check_cameras(gaussians, stored, scene.cameras, images)
-        means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
+        images = photo_array(scene.images)
+        sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
+        means = gaussians.means[np.isfinite(gaussians.means).all(1)]
         num_sky_views = len(sky_regions(means, scene.cameras, images))
-    agreement, odd = _measure_agreement(scene), unlike_captures(scene.finite_gaussians)
+    agreement, odd = _measure_agreement(scene), unlike_captures(scene.gaussians)
     doubts = [odd, None if agreement is None else agreement.doubt]
     facts: dict[str, Any] = {
         "notes": [*load.notes, *missing_notes(scene), *_photo_notes(scene), *filter(None, doubts)],
@@ -210,10 +211,10 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         "auto": _describe_auto(scene, agreement),
         "agreement": agreement and agreement.to_dict(),
     }
-    if is_result and len(scene) and not scene.aligned:  # rows of pixels hide each other where views overlap
-        facts["num_unseen"] = int((count_views_in_world(scene.finite_gaussians, scene.cameras) == 0).sum())
+    if is_result and len(scene) and not scene.has_own_pixels:  # those of views hide each other where these overlap
+        facts["num_unseen"] = int((count_views_in_world(scene.gaussians, scene.cameras) == 0).sum())
     if not is_result:
-        is_known = scene.aligned or any(exporter.is_marked for exporter in load.exporters)
+        is_known = scene.has_own_pixels or any(exporter.is_marked for exporter in load.exporters)
         facts["exporter"] = exporter_names(load.exporters) if is_known else f"not known: {load.info.layout}"
     return facts
 

@@ -87,16 +87,20 @@ def choose_views(views: Sequence[int]) -> tuple[list[int], list[int]]:
 
 
 def can_leave_out(prepared: Prepared) -> bool:
-    """Return whether a scene has photos of so many views that some can be left out."""
-    return prepared.reference.name == PHOTOS and len(prepared.reference.score_views) >= LEAST_VIEWS
+    """Return whether a scene has photos of so many views, with Gaussians of their own, that some can be left out."""
+    return (
+        prepared.scene.has_own_pixels
+        and prepared.reference.name == PHOTOS
+        and len(prepared.reference.score_views) >= LEAST_VIEWS
+    )
 
 
 def file_rows(scene: PicturedScene) -> Gaussians:
     """Return the Gaussians that the file has, without those that fill holes."""
-    return scene.gaussians[scene.stored_rows]
+    return scene.gaussians if scene.filled is None else scene.gaussians[~scene.filled]
 
 
 def cover(rest: PicturedScene, views: PicturedScene) -> np.ndarray:
     """Mark the pixels ``[v,h,w]`` of views that surfaces which views of the ``rest`` see cover."""
-    points = file_rows(rest).means.astype(np.float64) if rest.aligned else context_points(rest, NEAR_PLANE)
+    points = file_rows(rest).means.astype(np.float64) if rest.has_own_pixels else context_points(rest, NEAR_PLANE)
     return visible_pixels(points, views.cameras, NEAR_PLANE, rest.cameras)

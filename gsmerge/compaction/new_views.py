@@ -29,7 +29,7 @@ from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import add_seconds, record_part
 from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
-from gsmerge.types import PicturedScene, grid_ids
+from gsmerge.types import PicturedScene, Pixels
 
 SIDE = 120  # pixels of the longer side, at least
 # Of the fit, at most: fewer than 150 fit few views in another way (gsmerge.fit.schedule.MANY_STEPS), and say less
@@ -84,8 +84,8 @@ class Trial:
 def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> Trial | None:
     """Try what views gain that a fit of ``count`` Gaussians leaves out.
 
-    None where views or photos are too few, or Gaussians too many; and where rows have no pixels, since these hold what
-    photos showed that are left out: errors of 2 dB for 1.2, for a quarter of a run's time.
+    None where views or photos are too few, or Gaussians too many; and where views have no Gaussians of their own, since
+    those hold what photos showed that are left out: errors of 2 dB for 1.2, for a quarter of a run's time.
     """
     scene = prepared.scene
     pixels = scene.pixels_per_view * len(scene)
@@ -120,25 +120,22 @@ def _score_round(left_out: LeftOut, small: PicturedScene, plan: Plan, build: Bui
 
 
 def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
-    """Keep every so many rows and columns of pixels; Gaussians without pixels all stay."""
+    """Keep every so many rows and columns of pixels, and the Gaussians in front of them."""
     cameras, shape = scene.cameras, scene.images.shape[1:3]
     height, width = (max(1, side // step) for side in shape)
     Ks = cameras.Ks / np.array([[step], [step], [1]], cameras.Ks.dtype)
     cut = slice(None), slice(0, height * step), slice(0, width * step)
     images = shrink_pictures(scene.images[cut], width, height)
     middle = slice(None), slice(step // 2, height * step, step), slice(step // 2, width * step, step)
-    masks, missing, empty, importance = (
-        None if values is None else values[middle]
-        for values in (scene.masks, scene.missing, scene.empty, scene.importance)
+    masks, empty, importance = (
+        None if values is None else values[middle] for values in (scene.masks, scene.empty, scene.importance)
     )
-    small = replace(
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    fronts = scene.pixels.fronts[middle]
+    rows, chosen = fronts[fronts >= 0], scene.gaussians[fronts[fronts >= 0]]
+    return replace(
         scene, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=images, masks=masks,
-        empty=empty, importance=importance, gaussians=scene.gaussians[:0],
-        pixel_ids=None, missing=None, large_photos=None,
+        empty=empty, importance=importance, large_photos=None,
+        gaussians=replace(chosen, scales=chosen.scales * np.float32(step)), pixels=Pixels.of_grid(fronts >= 0),
+        filled=None if scene.filled is None else scene.filled[rows],
     )  # fmt: skip
-    if not scene.aligned:
-        return replace(small, gaussians=scene.gaussians)
-    rows = np.arange(len(scene.gaussians)).reshape(scene.valid.shape)[middle].reshape(-1)
-    gaussians = scene.gaussians[rows]
-    gaussians = replace(gaussians, scales=gaussians.scales * np.float32(step))
-    return replace(small, gaussians=gaussians, pixel_ids=grid_ids(scene.valid[middle]), missing=missing)

@@ -1,4 +1,4 @@
-"""Aligned scene -> blocks of views that see the same surfaces, each with some views of its neighbours.
+"""Scene -> blocks of views that see the same surfaces, each with some views of its neighbours.
 
 Views are nodes of a graph whose edges say how much of one view another one sees. Blocks grow from its rim, each time
 by the view that shares most with those in it, and then exchange views while that cuts less.
@@ -65,14 +65,15 @@ class Covisibility:
 
 
 def measure_covisibility(scene: Scene) -> Covisibility:
-    """Measure the share of every view of an aligned scene that each other view sees, with occlusion."""
+    """Measure the share of every view of a scene with pixels that each other view sees, with occlusion."""
     cameras, step = scene.cameras, max(1, -(-max(scene.cameras.height, scene.cameras.width) // GRID))
     rows, columns = (np.arange(step // 2, side, step) for side in (cameras.height, cameras.width))
     picked = (rows[:, None] * cameras.width + columns).reshape(-1)
-    ids = np.arange(len(scene))[:, None] * scene.pixels_per_view + picked
-    means = scene.gaussians.means[ids].astype(np.float64)
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    fronts = scene.pixels.fronts.reshape(len(scene), -1)[:, picked]
+    means = scene.gaussians.means[fronts].astype(np.float64)
     free_pages([scene.gaussians.means])
-    valid = scene.valid.reshape(len(scene), -1)[:, picked]
+    valid = fronts >= 0
 
     def one_depth(view: int) -> np.ndarray:
         z = project(means[view], cameras[[view]])[1][0]

@@ -120,9 +120,7 @@ class CompactResult:
 
         middle = self.cameras.numpy()[[len(self.cameras) // 2]]
         given = self.scene() if isinstance(self.scene, ReferenceType) else None  # a path is not read again for this
-        drawn = (
-            {"after": self.gaussians} if given is None else {"before": given.file_gaussians, "after": self.gaussians}
-        )
+        drawn = {"after": self.gaussians} if given is None else {"before": given.gaussians, "after": self.gaussians}
         return (
             "".join(
                 picture_html(to_picture(render(each.numpy(), middle).images[0]), f"the middle view {name}")
@@ -237,14 +235,14 @@ def _written(gaussians: Gaussians, plan: Plan) -> Gaussians:
 
 
 def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
-    """Score the input's own Gaussians, over the pixels that have a row if rows have pixels."""
+    """Score the input's own Gaussians, also over the pixels that show any where views have Gaussians of their own."""
     if not prepared.reference.of_views:
         return None
     scene, shown = prepared.input_scene, prepared.scene
     if shown.empty is not None:  # where a result may show nothing, the input is not compared either
         scene = replace(scene, masks=prepared.result_views().masks)
-    covered = None if scene.missing is None else list(scene.stored[list(plan.scored_views)])
-    return _score_photos("input", scene.file_gaussians, scene, prepared, plan, covered)
+    covered = None if scene.covered is None else list(scene.covered[list(plan.scored_views)])
+    return _score_photos("input", scene.gaussians, scene, prepared, plan, covered)
 
 
 def _score_photos(
@@ -305,7 +303,7 @@ class InputScores:
 
 def score_input(prepared: Prepared, plan: Plan) -> InputScores:
     """Score the input's own Gaussians, unless the plan has that."""
-    photos, gaussians = plan.before or measure_input(prepared, plan), prepared.input_scene.file_gaussians
+    photos, gaussians = plan.before or measure_input(prepared, plan), prepared.input_scene.gaussians
     return InputScores(
         photos, measure_on_files(gaussians, prepared, plan), measure_protected(gaussians, prepared, plan)
     )

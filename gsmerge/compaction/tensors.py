@@ -34,10 +34,10 @@ from gsmerge.io.cameras.camera_file import (
     check_camera,
     check_size,
 )
-from gsmerge.io.formats.read import clear_invalid
+from gsmerge.io.formats.read import clear_empty, clear_invalid
 from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
-from gsmerge.types import NO_CAMERAS, Array, Cameras, Gaussians, Scene, as_array, grid_ids, to_float32
+from gsmerge.types import NO_CAMERAS, Array, Cameras, Gaussians, Pixels, Scene, as_array, to_float32
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -135,7 +135,7 @@ def compact_tensors(
     if order != "none" or viewmats is not None or images is not None:
         cameras, photos = _read_views(viewmats, Ks, images, shape)
     scene, more = make_scene(gaussians, valid, cameras, photos, names, order)
-    if scene.aligned and check_rotations:
+    if scene.has_own_pixels and check_rotations:
         _check_rotations(scene)
     more += _rotation_notes(scene, check_rotations=check_rotations)
     result = compact(scene, progress=progress, **settings)
@@ -168,7 +168,9 @@ def make_scene(
         problem = f"expected one Gaussian per pixel, {sizes} (views x height x width), found {len(gaussians)}"
         raise SceneError("means", problem, 'pass shape=(V, H, W) as the model has it, or order="none"')
     cameras, notes = _check_pixels(gaussians, cameras, valid, views)
-    return Scene(gaussians, cameras, images, grid_ids(valid), views), notes
+    there = valid.reshape(len(cameras), cameras.height, cameras.width)
+    kept = gaussians if valid.all() else gaussians[valid]
+    return Scene(kept, cameras, images, Pixels.of_grid(there), views), notes
 
 
 def _to_numpy(name: str, values: Any) -> np.ndarray:
@@ -213,6 +215,8 @@ def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, l
     out["quats"][off] = normalize(out["quats"][off])
     out["quats"][(out["quats"] == 0).all(1)] = (1, 0, 0, 0)
     notes = [f"{num_bad:,} row(s) with NaN or inf, set aside"] if num_bad else []
+    num_empty = clear_empty(out | {"valid": valid})
+    notes += [f"{num_empty:,} empty row(s) at the origin, set aside"] if num_empty else []
     return Gaussians(**out), valid, notes
 
 
@@ -376,9 +380,9 @@ def _check_rotations(scene: Scene) -> None:
 
 def _rotation_notes(scene: Scene, *, check_rotations: bool) -> list[str]:
     """Note quaternions whose w may come last; if pixels are known, the surface decides, otherwise the caller."""
-    if not w_seems_last(scene.file_gaussians.quats):
+    if not w_seems_last(scene.gaussians.quats):
         return []
-    last_w = choose_rotations(scene)[0] == "xyzw" if scene.aligned else check_rotations
+    last_w = choose_rotations(scene)[0] == "xyzw" if scene.has_own_pixels else check_rotations
     return ["the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]"] * last_w
 
 

@@ -91,7 +91,7 @@ def average(pictures: np.ndarray, weights: np.ndarray, small: np.ndarray) -> np.
 def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
     """Pair ``photos [v,h,w,3]`` with what a canonical scene's Gaussians show in its views."""
     shown = show_views(scene, frame=_CANONICAL)
-    if scene.aligned:
+    if scene.has_own_pixels:
         return Pairs(photos[_every(scene.cameras, SIDE)], shown)
     level = max(1.0, max(scene.cameras.width, scene.cameras.height) / SIDE)
     return Pairs(photos_of(photos, scene.cameras, level).images, shown)
@@ -102,11 +102,11 @@ def show_views(
 ) -> ViewPictures:
     """Make small pictures of what a scene's Gaussians show in its views; its canonical ``frame`` may be known.
 
-    Where rows belong to pixels these are the colours of some of them, else drawings of a sample of all Gaussians.
+    Where each view has Gaussians of its own these are the colours of some of them, else drawings of a sample of all.
     """
-    if scene.aligned:
+    if scene.has_own_pixels:
         return _show_rows(scene, SIDE) if side is None else _show_rows(scene, 2 * side).shrink(side)
-    few = Scene(thin_out(scene.finite_gaussians, samples), scene.cameras, None, None, scene.names)
+    few = Scene(thin_out(scene.gaussians, samples), scene.cameras, None, None, scene.names)
     canonical, _ = canonicalise(few, frame)
     shown = draw_views(canonical.gaussians, canonical.cameras, side or SIDE)
     inside = pixel_weights(scene.masks, *shown.weights.shape[2:0:-1])
@@ -114,13 +114,14 @@ def show_views(
 
 
 def _show_rows(scene: Scene, side: int) -> ViewPictures:
-    """Return the colours of rows, every so many columns and lines."""
+    """Return the colours of the views' own Gaussians, every so many columns and lines."""
+    assert scene.pixels is not None, "views have Gaussians of their own"
     some = _every(scene.cameras, side)
-    grid = len(scene), scene.cameras.height, scene.cameras.width
-    weights = np.where(scene.valid, scene.gaussians.opacities.reshape(grid), 0)[some]
+    rows = scene.pixels.fronts[some]
+    weights = np.where(rows >= 0, scene.gaussians.opacities[rows], 0)
     if scene.masks is not None:
         weights = weights * scene.masks[some]
-    colors = sh0_to_rgb(scene.gaussians.sh0.reshape(*grid, 3)[some]).clip(0, 1)
+    colors = sh0_to_rgb(scene.gaussians.sh0[rows, 0]).clip(0, 1)
     return ViewPictures(colors, weights.astype(np.float32), drawn=False)
 
 

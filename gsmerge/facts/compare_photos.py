@@ -73,7 +73,7 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     changes = [PhotoChange(bool(wrong), curve) for wrong, curve in zip(order, tones, strict=True)]
     _note_tones(scene, changes, right)
     hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
-    if scene.aligned:
+    if scene.has_own_pixels:
         hidden, pictures = _find_hidden(scene, changes)
         _note_hidden(scene, hidden, right)
     changed = [view for view in right if hidden[view].any() or changes[view]]
@@ -242,13 +242,14 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
 
     def differ_drawn(views: np.ndarray, rows: RowPicture) -> None:
         for view in views:
-            known = scene.stored[view] & inside[view] & rows.known  # what spills over from beside says nothing
+            known = shown[view] & inside[view] & rows.known  # what spills over from beside says nothing
             pictures[view] = rows.picture
             hidden[view] = differ(view, rows.picture, known) & differ(view, rows.drawing, known)
 
     inside = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
-    pictures = row_pictures(scene)
-    known = scene.stored & (scene.gaussians.opacities.reshape(inside.shape) > FAINT) & inside
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    pictures, shown = row_pictures(scene), scene.pixels.shown
+    known = shown & (scene.gaussians.opacities[scene.pixels.fronts] > FAINT) & inside
     hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
     picture_rows(scene, differ_drawn, np.asarray((hidden | ~inside).any((1, 2))))
     return hidden, pictures

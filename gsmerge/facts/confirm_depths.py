@@ -1,4 +1,4 @@
-"""Aligned scene -> how much of its depth other views confirm: what says before a fit whether it can succeed.
+"""Scene with pixels -> how much of its depth other views confirm: what says before a fit whether it can succeed.
 
 Each pixel's Gaussian is looked up in the other views, and the Gaussian there is projected back: the depth is confirmed
 where the two agree, and contradicted where more views see through it than confirm it. Where no other view looks, it is
@@ -81,20 +81,20 @@ class Agreement:
 
 
 def confirm_depths(scene: Scene) -> Agreement | None:
-    """Measure how far the views of a scene confirm each other's depth; None with fewer than two or without pixels."""
-    views = len(scene)
-    if not scene.aligned or views < 2 or not scene.valid.any():
+    """Measure how far the views of a scene with pixels confirm each other's depth; None with fewer than two."""
+    views, pixels_of = len(scene), scene.pixels
+    if views < 2 or pixels_of is None or not pixels_of.shown.any():
         return None
     means, centres = scene.gaussians.means, scene.cameras.centres
-    cameras, valid = scene.cameras, scene.valid.reshape(views, -1)
+    cameras, fronts = scene.cameras, pixels_of.fronts.reshape(views, -1)
     width, height = cameras.width, cameras.height
     reach = max(PIXELS, REACH * max(width, height))
 
     def count(view: int) -> np.ndarray:
-        rows = np.flatnonzero(valid[view])
+        rows = np.flatnonzero(fronts[view] >= 0)
         rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), SAMPLE_PIXELS))]
         points, pixels = (
-            means[view * width * height + rows].astype(np.float64),
+            means[fronts[view, rows]].astype(np.float64),
             np.stack([rows % width, rows // width], 1) + 0.5,
         )
         others = nearest_views(centres, view)[:NEIGHBORS]
@@ -104,9 +104,10 @@ def confirm_depths(scene: Scene) -> Agreement | None:
         number, ids = np.nonzero(inside)  # of the other view, and the pixel that it sees
         column, row = x[number, ids].astype(np.int64), y[number, ids].astype(np.int64)
         there, other = row * width + column, others[number]
-        known = valid[other, there]
-        number, ids, there, other = number[known], ids[known], there[known], other[known]
-        surface = means.take(other * width * height + there, 0).astype(np.float64)
+        front = fronts[other, there]
+        known = front >= 0
+        number, ids, other = number[known], ids[known], other[known]
+        surface = means.take(front[known], 0).astype(np.float64)
         (back,), (ahead,) = project(surface, cameras[[view]])
         right, down = (back - pixels[ids]).T
         away = np.where(ahead > TINY, np.sqrt(right * right + down * down), np.inf) / reach

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.errors import UsageError
+from gsmerge.facts.views import take_rows
 from gsmerge.frame import canonicalise
 from gsmerge.geometry import rgb_to_sh0, turn_by
 from gsmerge.kernels.matrices import matmul
@@ -36,7 +37,7 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
 
     Counts, fit and scores are then those of what is left. UsageError if that is nothing.
     """
-    inside = inside_crop(scene.gaussians.means, crop) & scene.stored_rows
+    inside = inside_crop(scene.gaussians.means, crop)
     count = int(inside.sum())
     if count == 0:
         remedy = "gsmerge inspect says where the scene is"
@@ -48,13 +49,7 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
     if scene.images is not None:
         shown = show_rows(scene, inside)
         masks = shown if masks is None else masks & shown
-    if scene.pixel_ids is None:
-        return replace(scene, gaussians=scene.gaussians[inside], masks=masks)
-    rows = scene.gaussians  # every pixel keeps its row
-    gaussians = replace(rows, opacities=np.where(inside, rows.opacities, 0).astype(rows.opacities.dtype))
-    missing = ~inside.reshape(scene.valid.shape)
-    ids = np.where(inside, scene.pixel_ids, -1).astype(scene.pixel_ids.dtype)
-    return replace(scene, gaussians=gaussians, pixel_ids=ids, missing=missing, masks=masks)
+    return replace(take_rows(scene, np.flatnonzero(inside)), masks=masks)
 
 
 def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:

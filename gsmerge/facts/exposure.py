@@ -1,4 +1,4 @@
-"""Aligned scene -> the same in one exposure, where its photos and their Gaussians differ in it at random.
+"""Scene -> the same in one exposure, where its photos and their Gaussians differ in it at random.
 
 Cameras that choose exposure and white balance for each photo, and models that copy them into their
 Gaussians, show one surface in several tones. Pixels of a view are looked up in the others, where
@@ -67,9 +67,9 @@ class _Pair:
 def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> PicturedScene:
     """Divide each view's photo and its pixels' Gaussians by the exposure gain of the view, where needed.
 
-    ``views`` are the views of the aligned scene whose photos show it. Clipped pixels of brighter photos no longer count
-    if another photo shows their surface unclipped. The record gets a note, and the choice ``exposure``: the gain of
-    each view in red, green and blue. If photos differ and are left unchanged, a note says why.
+    ``views`` are those whose photos show the scene; each has Gaussians of its own. Clipped pixels of brighter photos no
+    longer count if another photo shows their surface unclipped. The record gets a note, and the choice ``exposure``:
+    the gain of each view in red, green and blue. If photos differ and are left unchanged, a note says why.
     """
     if exposure == "fixed" or len(views) < 2:
         return scene
@@ -165,12 +165,14 @@ class _Pixels:
 
 
 def _pixels_of(scene: Scene) -> _Pixels:
-    """Collect the pixels of an aligned scene; those outside masks do not count."""
+    """Collect the pixels of a scene and the Gaussians in front; those outside masks do not count."""
+    assert scene.pixels is not None, "views have Gaussians of their own"
     shape = len(scene), scene.pixels_per_view
-    valid = scene.valid.reshape(shape)
+    fronts = scene.pixels.fronts.reshape(shape)
+    valid = fronts >= 0
     if scene.masks is not None:
         valid = valid & scene.masks.reshape(shape)
-    return _Pixels(scene.cameras, scene.gaussians.means.reshape(*shape, 3), valid)
+    return _Pixels(scene.cameras, scene.gaussians.means[fronts], valid)
 
 
 def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
@@ -254,7 +256,8 @@ def _divide(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
         images[view] = (scene.images[view] * factors[view]).clip(0, 1)
 
     parallel_map(divide, range(len(scene)))
-    g, each = scene.gaussians, factors.repeat(scene.pixels_per_view, 0)[:, None]
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    g, each = scene.gaussians, factors[scene.pixels.homes // scene.pixels_per_view][:, None]
     gaussians = replace(g, sh0=rgb_to_sh0(sh0_to_rgb(g.sh0) * each).astype(np.float32), shN=g.shN * each)
     large = scene.large_photos
     large = None if large is None else change_large(large, changes)

@@ -24,7 +24,7 @@ from gsmerge.raster.composite import blend_depths
 from gsmerge.raster.images import tile_views
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Gaussians, PicturedScene, grid_ids
+from gsmerge.types import Gaussians, PicturedScene
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
@@ -48,14 +48,15 @@ BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
 def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = False) -> PicturedScene:
     """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers, or leave large parts empty; add notes.
 
-    ``shown [v,h,w]``: pixels whose picture says what is there. Where rows belong to pixels, only pixels without a row
-    get a Gaussian, which takes their row. Elsewhere the new Gaussians follow the others, and none is added where most
-    pixels are empty: the scene may be a part of what the photos show. Large connected parts of a view without
-    Gaussians stay empty, unless ``everywhere``: the scene was cut out, or its model left out the sky.
+    ``shown [v,h,w]``: pixels whose picture says what is there. The new Gaussians follow the others. None is added where
+    views have no Gaussians of their own and most pixels are empty: the scene may be a part of what the photos show.
+    Large connected parts of a view without Gaussians stay empty, unless ``everywhere``: the scene was cut out, or its
+    model left out the sky.
     """
-    bare = scene.valid & (scene.gaussians.opacities.reshape(shown.shape) > BARE) if scene.aligned else ~shown
-    bare, free = ~bare, shown & ~scene.valid if scene.aligned else shown
-    cut: Iterable[np.ndarray] = [] if everywhere or not scene.aligned else bare
+    assert scene.pixels is not None, "prepared scenes have pixels"
+    fronts = scene.pixels.fronts
+    free, bare = shown & (fronts < 0), (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)
+    cut: Iterable[np.ndarray] = [] if everywhere else bare
     if not (free.any() or any(large_parts(view).any() for view in cut if view.any())):
         return scene
     holes, empty, edges = np.zeros_like(free), np.zeros_like(free), dict[int, _Edges]()
@@ -79,7 +80,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
 
     tile_views(scene, find)
     filled = scene
-    if edges and (scene.aligned or np.count_nonzero(holes) < MOST * np.count_nonzero(shown)):
+    if edges and (scene.pixels.own or np.count_nonzero(holes) < MOST * np.count_nonzero(shown)):
         filled = _add_holes(scene, holes, edges)
     return _leave_empty(filled, empty)
 
@@ -97,13 +98,15 @@ def _add_holes(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edg
     views = sorted(edges)
     added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), views))
     note(f"{len(added):,} pixels that Gaussians hardly cover, or not at all, get the colours of their pictures")
-    if not scene.aligned:
-        return replace(scene, gaussians=Gaussians.concat([scene.gaussians, added]))
+    assert scene.pixels is not None, "prepared scenes have pixels"
+    homes, fronts, first = scene.pixels.homes, scene.pixels.fronts.copy(), len(scene.gaussians)
     holes[[view for view in range(len(scene)) if view not in edges]] = False
-    columns = {name: values.copy() for name, values in vars(scene.gaussians).items()}
-    for name, values in vars(added).items():
-        columns[name][holes.reshape(-1)] = values
-    return replace(scene, gaussians=Gaussians(**columns), pixel_ids=grid_ids(scene.valid | holes))
+    places = np.flatnonzero(holes)
+    fronts.reshape(-1)[places] = np.arange(first, first + len(added), dtype=np.int32)
+    return replace(
+        scene, gaussians=Gaussians.concat([scene.gaussians, added]), filled=np.arange(first + len(added)) >= first,
+        pixels=replace(scene.pixels, homes=np.concatenate([homes, places.astype(homes.dtype)]), fronts=fronts),
+    )  # fmt: skip
 
 
 def large_parts(empty: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Aligned scene -> the same scene with cameras, and their pixels' Gaussians, moved to where the photos agree.
+"""Scene -> the same scene with cameras, and their pixels' Gaussians, moved to where the photos agree.
 
 Poses that a network predicts are wrong by some pixels, and its Gaussians follow them: every view
 fits itself and none of the others. The pixels of a view, at their depths, are looked up in the
@@ -99,11 +99,13 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
 
 def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
     """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours that see most of it."""
-    cameras, means = scene.cameras, scene.gaussians.means.reshape(len(scene), -1, 3)
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    cameras, fronts = scene.cameras, scene.pixels.fronts.reshape(len(scene), -1)
     step = max(1, scene.pixels_per_view // OVERLAP_PIXELS)
     pairs, chosen = set(), set(views)
     for view in views:
-        xyz = means[view, ::step][scene.valid[view].reshape(-1)[::step]]
+        rows = fronts[view, ::step]
+        xyz = scene.gaussians.means[rows[rows >= 0]]
         pixels, z = project(xyz, cameras)
         x, y = pixels[..., 0], pixels[..., 1]
         inside = (z > NEAR_PLANE) & (x > 0) & (y > 0) & (x < cameras.width) & (y < cameras.height)
@@ -122,15 +124,17 @@ def _level_of(scene: PicturedScene, pairs: np.ndarray, level: float, samples: in
     shape = photos.height, photos.width
     rows, columns = ((np.arange(n) + 0.5) / n for n in shape)
     near = np.ix_((rows * scene.cameras.height).astype(int), (columns * scene.cameras.width).astype(int))
-    means = scene.gaussians.means.reshape(*scene.valid.shape, 3)
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    means, fronts = scene.gaussians.means, scene.pixels.fronts
     spread = 0.5 + np.random.default_rng(0).random(shape)  # or all pixels would be those of one edge
     spread[:BORDER] = spread[-BORDER:] = spread[:, :BORDER] = spread[:, -BORDER:] = 0
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         grey = blur(photos.images[view].mean(-1, dtype=np.float32), BLUR)
         down, right = np.gradient(grey)
-        depth = camera_depths(means[view][near], scene.cameras.viewmats[view])
-        depth = np.where(scene.valid[view][near] & (depth > NEAR_PLANE), depth, np.nan)
+        rows = fronts[view][near]
+        depth = camera_depths(means[rows], scene.cameras.viewmats[view])
+        depth = np.where((rows >= 0) & (depth > NEAR_PLANE), depth, np.nan)
         score = np.where(np.isfinite(depth), np.sqrt(right * right + down * down) * spread, 0).ravel()
         chosen = np.argsort(-score, kind="stable")[:samples]
         chosen = chosen[score[chosen] > 0]

@@ -13,6 +13,7 @@ from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.exposure import equalise_exposure
 from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.move_poses import move_poses
+from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.place_cameras import (
     NO_VIEWS,
     add_judges,
@@ -25,7 +26,7 @@ from gsmerge.facts.place_cameras import (
 )
 from gsmerge.facts.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
 from gsmerge.facts.scene_size import SceneSize, measure_size, unlike_captures
-from gsmerge.facts.views import distinct_views, subset
+from gsmerge.facts.views import distinct_views, subset, take_rows
 from gsmerge.frame import Frame, canonicalise, sample_rows
 from gsmerge.raster.images import seen_weights
 from gsmerge.runtime.record import choose, note, record_part, stage
@@ -57,15 +58,15 @@ class Prepared:
     """A scene in its canonical frame, as the stages use it, with facts about it."""
 
     input_scene: Scene  # The scene as it was given, in its own world frame, with photos that look as its Gaussians
-    # The canonical scene: every view once, photos that do not show it replaced; one without pixels
-    # has cameras and only finite Gaussians that are seen, or all if none is set aside
+    # The canonical scene with pixels: every view once, photos that do not show it replaced, Gaussians that are seen,
+    # or all if none is set aside
     scene: PicturedScene
     frame: Frame  # The canonical frame
     reference: Reference  # What the pictures are for
     repeated: tuple[int, ...]  # Place in the scene of every given view
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
     unseen: Gaussians  # Canonical Gaussians that no view sees, if they are kept
-    agreement: Agreement | None = None  # How far views confirm each other's depth; None without pixels
+    agreement: Agreement | None = None  # How far views confirm each other's depth; None of one view
 
     @property
     def size(self) -> SceneSize:
@@ -132,8 +133,7 @@ def prepare(
         note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
         scene = subset(scene, views)
     scene, frame = canonicalise(add_views(scene), frame)
-    finish = _prepare_pixels if scene.aligned else _prepare_others
-    prepared = finish(given, scene, frame, tuple(repeated), options)
+    prepared = _with_references(given, with_pixels(scene), frame, tuple(repeated), options)
     files = _photos_before(given, prepared)
     prepared = replace(prepared, reference=replace(prepared.reference, photo_files=files))
     agreement = confirm_depths(prepared.scene)
@@ -173,40 +173,35 @@ def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
     return replace(prepared, scene=filled, reference=reference)
 
 
-def _prepare_pixels(
+def _with_references(
     given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
 ) -> Prepared:
-    """Prepare a scene whose rows belong to pixels: without photos the rows' own colours replace them."""
-    add_colors = partial(add_row_colors, given=canonical.images is not None)
-    scene, views = _with_pictures(canonical, add_colors, options.look)
-    every = tuple(range(len(scene)))
-    reference = Reference(PHOTOS, every, views) if views else Reference(ROW_COLORS, every, every)
-    given = _with_photos(given, scene, repeated)
-    scene = equalise_exposure(scene, reference.score_views, options.exposure)
-    fixed, always = options.poses == "fixed", options.poses == "free"
-    moved = None if fixed else move_poses(scene, reference.score_views, always=always)
-    return Prepared(given, moved or scene, frame, reference, repeated, moved is not None, scene.gaussians[:0])
+    """Prepare a scene with pixels: choose the pictures that results are fitted to.
 
-
-def _prepare_others(
-    given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
-) -> Prepared:
-    """Prepare a scene whose rows belong to no pixels: without photos that show it renders of it replace them."""
-    scene, views = _with_pictures(canonical, blank_pictures, options.look)
-    every = tuple(range(len(scene)))
-    reference = Reference(PHOTOS, views, views) if views else Reference(RENDERS, every, every)
-    unseen = scene.gaussians[:0]
-    if options.unseen == "keep":
+    Without photos that show it they are the colours of the views' own Gaussians, or renders where views have none.
+    """
+    own = canonical.has_own_pixels
+    stand_in = partial(add_row_colors, given=canonical.images is not None) if own else blank_pictures
+    scene, views = _with_pictures(canonical, stand_in, options.look)
+    every, unseen = tuple(range(len(scene))), scene.gaussians[:0]
+    if options.unseen == "keep" and not own:
         scene, unseen = _split_unseen(scene)
     if views:
-        given = _with_photos(given, scene, repeated)
+        reference = Reference(PHOTOS, every if own else views, views)
+    elif own:
+        reference = Reference(ROW_COLORS, every, every)
     else:
         none = "no photos" if given.images is None else "photos do not count"
         note(f"{none}: views rendered from the scene itself stand in for them")
         scene = draw_pictures(scene)
         shown = tuple(view for view in every if scene.images[view].any())  # any result looks like an empty view
-        reference = replace(reference, score_views=shown or every)
-    return Prepared(given, scene, frame, reference, repeated, moved=False, unseen=unseen)
+        return Prepared(given, scene, frame, Reference(RENDERS, every, shown or every), repeated, False, unseen)
+    given, moved = _with_photos(given, scene, repeated), None
+    if own:  # whose exposure and pose each view's Gaussians have
+        scene = equalise_exposure(scene, reference.score_views, options.exposure)
+        fixed, always = options.poses == "fixed", options.poses == "free"
+        moved = None if fixed else move_poses(scene, reference.score_views, always=always)
+    return Prepared(given, moved or scene, frame, reference, repeated, moved is not None, unseen)
 
 
 def _with_pictures(
@@ -238,7 +233,7 @@ def judged_pictures(scene: Scene) -> tuple[Scene, bool]:
     Pictures of a scene with pixels are its rows' own colours where photos are missing, have another look, or do not
     show it, as :func:`prepare` has it.
     """
-    has_colors = _lacks_photos(scene) or (scene.aligned and len(scene) > 0 and bool(scene.valid.any()))
+    has_colors = scene.has_own_pixels and len(scene) > 0
     if len(scene) == 0 or len(scene.gaussians) == 0 or not (has_colors or scene.images is not None):
         return scene, False
     with record_part(silent=True) as record:
@@ -246,7 +241,7 @@ def judged_pictures(scene: Scene) -> tuple[Scene, bool]:
         if scene.images is not None:
             compared, views = compare_photos(PicturedScene.of(canonical, scene.images, scene.masks))
             if views or not has_colors:
-                if canonical.aligned:
+                if canonical.has_own_pixels:
                     equalise_exposure(compared, views, "auto")
                 return scene, not views or bool(record.choices)
         colored = add_row_colors(replace(canonical, images=None, large_photos=None, masks=None))
@@ -282,4 +277,4 @@ def _split_unseen(scene: PicturedScene) -> tuple[PicturedScene, Gaussians]:
     note(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
     if num_unseen in (0, len(seen)):
         return scene, scene.gaussians[:0]
-    return replace(scene, gaussians=scene.gaussians[seen]), scene.gaussians[~seen]
+    return with_pixels(take_rows(scene, np.flatnonzero(seen))), scene.gaussians[~seen]

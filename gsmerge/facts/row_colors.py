@@ -1,4 +1,4 @@
-"""Scene without photos -> the same with its rows' own colours in their place, where each row has a pixel.
+"""Scene without photos -> the same with its own colours in their place, where each view has Gaussians of its own.
 
 Feed-forward models start the colour of a pixel's Gaussian from the photo. These colours are compared with a drawing of
 the view's own Gaussians from its own camera, both blurred. Where the two disagree, or the Gaussians of a pixel are so
@@ -42,7 +42,8 @@ def add_row_colors(scene: Scene, *, given: bool = False) -> PicturedScene:
 
     ``given``: whether there are photos, which do not count.
     """
-    images, masks = np.zeros((*scene.valid.shape, 3), np.float32), np.full(scene.valid.shape, False)
+    shape = len(scene), scene.cameras.height, scene.cameras.width
+    images, masks = np.zeros((*shape, 3), np.float32), np.full(shape, False)
 
     def keep(views: np.ndarray, rows: RowPicture) -> int:
         images[views], masks[views] = rows.picture, rows.known
@@ -95,13 +96,14 @@ def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
 
 def _front(part: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Blend the layers of one camera, the nearest first: colours ``[h,w,3]`` and opacities ``[h,w]``."""
-    shape = part.valid.shape
-    opacities = np.where(part.valid, part.gaussians.opacities.reshape(shape), 0).astype(np.float32)
-    layers = colors.reshape(*shape, 3).astype(np.float32)
+    assert part.pixels is not None, "views have Gaussians of their own"
+    rows = part.pixels.fronts
+    opacities = np.where(rows >= 0, part.gaussians.opacities[rows], 0).astype(np.float32)
+    layers = colors[rows].astype(np.float32)
     if len(part) == 1:
         return layers[0], opacities[0]
-    means = part.gaussians.means.astype(np.float64)
-    order = np.argsort(camera_depths(means, part.cameras.viewmats[0]).reshape(shape), axis=0, kind="stable")
+    means, shape = part.gaussians.means[rows].astype(np.float64), rows.shape
+    order = np.argsort(camera_depths(means, part.cameras.viewmats[0]), axis=0, kind="stable")
     left, total = np.ones(shape[1:], np.float32), np.zeros((*shape[1:], 3), np.float32)
     for layer in order:
         weight = left * np.take_along_axis(opacities, layer[None], 0)[0]

@@ -23,11 +23,11 @@ Pictures = Literal["photos", "renders"]  # photos or what stands in for them; dr
 class SceneSize:
     """Sizes of a scene that a plan depends on, known before the scene is read in full."""
 
-    num_gaussians: int  # without rows that stand in for missing ones
+    num_gaussians: int
     num_views: int
     height: int  # pixels
     width: int
-    aligned: bool  # whether each Gaussian belongs to a pixel
+    has_own_pixels: bool  # whether each view has Gaussians of its own
     pictures: Pictures  # what results are fitted to
     num_cameras: int = 2  # views at different places; 1: one camera took all
     sh_degree: int = 0
@@ -49,7 +49,7 @@ def measure_size(scene: Scene, pictures: Pictures | None = None) -> SceneSize:
         pictures = "photos" if scene.is_shown else "renders"
     cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
     return SceneSize(
-        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned, pictures,
+        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.has_own_pixels, pictures,
         num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
         sh_degree=scene.gaussians.sh_degree,
     )  # fmt: skip

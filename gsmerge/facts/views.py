@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.types import PER_PIXEL, Cameras, Scene, SceneT, grid_ids
+from gsmerge.types import PER_PIXEL, Cameras, PicturedScene, Pixels, Scene, SceneT
 
 MAX_SCORED_VIEWS = 24  # views by which whole scenes are judged where something depends on it
 REPORT_VIEWS = 4  # views that input and result are scored on for the report alone
@@ -75,23 +75,38 @@ def _equal_views(scene: Scene, first: int, second: int) -> bool:
     for pictures in (scene.images, scene.masks, scene.importance):
         if pictures is not None and not np.array_equal(pictures[first], pictures[second]):
             return False
-    if not scene.aligned:
+    if scene.pixels is None or not scene.pixels.own:
         return True
-    size = scene.pixels_per_view
-    a, b = (vars(scene.gaussians[view * size : (view + 1) * size]) for view in (first, second))
-    return all(np.array_equal(a[name], b[name]) for name in a)
+    a, b = (scene.pixels.rows_of_views[view] for view in (first, second))
+    return all(np.array_equal(values[a], values[b]) for values in vars(scene.gaussians).values())
 
 
 def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
-    """Return the scene with only the views ``view_ids`` and their Gaussians; unaligned Gaussians all stay."""
+    """Return the scene with only the views ``view_ids``, and their Gaussians where each has its own.
+
+    Elsewhere all Gaussians stay, and their pixels are to be found again.
+    """
     ids = list(view_ids)
     parts = {name: value[ids] for name, value in vars(scene).items() if name in BY_VIEW and value is not None}
     parts["names"] = tuple(scene.names[i] for i in ids)
-    if scene.aligned:
-        size = scene.pixels_per_view
-        rows = (np.asarray(ids, np.int64)[:, None] * size + np.arange(size)).reshape(-1)
-        parts |= {"gaussians": scene.gaussians[rows], "pixel_ids": grid_ids(scene.valid[ids])}
+    parts["pixels"] = None
+    if scene.pixels is not None and scene.pixels.own:
+        rows, parts["pixels"] = scene.pixels.select(ids)
+        parts["gaussians"] = scene.gaussians[rows]
+        if isinstance(scene, PicturedScene) and scene.filled is not None:
+            parts["filled"] = scene.filled[rows]
     return replace(scene, **parts)
+
+
+def take_rows(scene: SceneT, rows: np.ndarray) -> SceneT:
+    """Return the scene with only the Gaussians ``rows [m]``, ascending; pixels that showed others show none."""
+    part = replace(scene, gaussians=scene.gaussians[rows], pixels=None)
+    if scene.pixels is None or not scene.pixels.own:
+        return part
+    numbers = np.full(len(scene.gaussians), -1, np.int32)
+    numbers[rows] = np.arange(len(rows), dtype=np.int32)
+    fronts = np.where(scene.pixels.shown, numbers[scene.pixels.fronts], np.int32(-1))
+    return replace(part, pixels=Pixels(scene.pixels.homes[rows], fronts, own=True))
 
 
 def in_float64(cameras: Cameras) -> Cameras:

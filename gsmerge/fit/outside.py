@@ -109,7 +109,7 @@ def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOpt
 
 def _sample(scene: Scene, count: int) -> Gaussians:
     """Return about ``count`` of a scene's Gaussians, evenly among the rows, so large that they cover what all do."""
-    rows = np.flatnonzero(scene.valid) if scene.aligned else np.arange(len(scene.gaussians))
+    rows = np.arange(len(scene.gaussians))
     step = max(1, len(rows) // max(1, count))
     first = np.arange(0, len(rows) - step + 1, step)
     some = scene.gaussians[rows[first + (step * (EVEN[0] * np.arange(len(first)) % 1)).astype(np.int64)]]

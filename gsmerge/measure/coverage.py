@@ -41,15 +41,15 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
 def coverage(scene: Scene) -> list[dict[str, Any]]:
     """Measure, for each view, the share of its pixels with a visible Gaussian. Layers count as views.
 
-    For each view: its ``name``, ``share_of_pixels`` that have a visible Gaussian of their own (None without pixels),
+    For each view: its ``name``, ``share_of_pixels`` that have a visible one of their own (None where views have none),
     and ``share_of_gaussians`` whose centre is inside the picture.
     """
     if len(scene) == 0:
         return []
     shares = shares_inside(scene, MAX_SAMPLE_GAUSSIANS)
     pixels: list[float | None] = [None] * len(scene)
-    if scene.aligned:
-        visible = (scene.gaussians.opacities >= TRANSPARENT).reshape(scene.valid.shape) & scene.stored
+    if scene.pixels is not None and scene.pixels.own:
+        visible = (scene.gaussians.opacities >= TRANSPARENT)[scene.pixels.fronts] & scene.pixels.shown
         pixels = [float(view.mean()) for view in visible]
     keys = ("name", "share_of_pixels", "share_of_gaussians")
     return [dict(zip(keys, view, strict=True)) for view in zip(scene.names, pixels, shares, strict=True)]
@@ -58,5 +58,5 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
 def shares_inside(scene: Scene, most: int) -> list[float]:
     """Measure the share of the Gaussians, of at most so many, whose centres lie in each view."""
     rows = np.arange(0, len(scene.gaussians), max(1, -(-len(scene.gaussians) // most)))
-    points = scene.gaussians.means[rows[scene.stored_rows[rows]]].astype(np.float64)
+    points = scene.gaussians.means[rows].astype(np.float64)
     return [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]

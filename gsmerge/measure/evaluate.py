@@ -224,7 +224,7 @@ def evaluate(
         raise UsageError("expected a scene with views, got none")
     given = scene
     scene, mended = judged_pictures(given)
-    inputs, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
+    inputs, results = scene.gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
         targets = shrink_views(targets, options.photo_side)
@@ -301,7 +301,7 @@ def _splits(
     """
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
-    sources = scene.cameras if scene.aligned else cameras  # whose pixels the points come from
+    sources = scene.cameras if scene.has_own_pixels else cameras  # whose pixels the points come from
     points = context_points(scene, renderer.near, sources)
 
     def split(views: Views, reference: str, masks: np.ndarray | None = None) -> _Split:
@@ -320,9 +320,9 @@ def _splits(
     else:
         drawn = np.stack([renderer.image(inputs, cameras, i) for i in range(len(scene))])
         context = replace(split(Views(cameras, drawn, scene.names), RENDERS, scene.masks), drawn=inputs)
-    if scene.missing is not None:
-        stored = np.stack([resize_mask(mask, cameras.width, cameras.height) for mask in scene.stored])
-        context = replace(context, covered=stored)
+    if scene.covered is not None:
+        covered = np.stack([resize_mask(mask, cameras.width, cameras.height) for mask in scene.covered])
+        context = replace(context, covered=covered)
     return {"context": context, **target}
 
 

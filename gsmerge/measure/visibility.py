@@ -25,11 +25,11 @@ _DILATION = 3  # pixels of the input views per side of the square that every sam
 def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
     """Return the surface points ``[n,3]``, world, that the pixels of the input views show.
 
-    In a scene with pixels these are the Gaussians; otherwise depth beyond ``near``, world units, is rendered into the
-    ``cameras``; None: those of the scene.
+    Where views have Gaussians of their own these are they; otherwise depth beyond ``near``, world units, is rendered
+    into the ``cameras``; None: those of the scene.
     """
-    if scene.aligned:
-        return scene.gaussians.means[scene.valid.reshape(-1)].astype(np.float64)
+    if scene.has_own_pixels:
+        return scene.gaussians.means.astype(np.float64)
     cameras = scene.cameras if cameras is None else cameras
     return np.concatenate([_rendered_points(scene.gaussians, cameras[[i]], near) for i in range(len(cameras))])
 

@@ -35,7 +35,7 @@ def cross_view_stats(
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, 6] = math.log(len(cameras)) / 4
-    if (members.pixels is not None and members.fronts is None) or len(means) == 0:
+    if len(means) == 0:
         return stats
     points, colors = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(SH_C0 * sh0[:, 0])
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))

@@ -91,7 +91,7 @@ def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras)
         return views
     positions, owners = group_rows(features.starts[merged], np.diff(features.starts)[merged])
     ids = features.members[positions]
-    pixels = members.pixels_of(ids)
+    pixels = members.pixels[ids]
     seen = pixels // (cameras.width * cameras.height)
     sums = np.bincount(owners * len(cameras) + seen, members.opacities[ids], len(merged) * len(cameras))
     views[merged] = sums.reshape(len(merged), -1).argmax(1)

@@ -9,6 +9,7 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
+from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.views import even_views
 from gsmerge.frame import Frame, scene_frame
 from gsmerge.geometry import middle_depth
@@ -187,14 +188,14 @@ def page_data(
     splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
     splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
     frame = scene_frame(scene)
-    named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
+    named = {INPUT: scene.gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
     entered = {name: frame.enter(gaussians) for name, gaussians in named.items()}
-    whole = entered[INPUT] if scene.missing is None else frame.enter(scene.gaussians)
     placed = frame.enter_cameras(scene.cameras.numpy())
     looked_at = [name for name in named if name != INPUT or not results]
     photos = pictures if len(pictures) else None
     marks = {name: Marks() for name in named} | {
-        name: find_marks(entered[name], placed, photos, aligned=name == INPUT and scene.aligned) for name in looked_at
+        name: find_marks(entered[name], placed, photos, own=name == INPUT and scene.has_own_pixels)
+        for name in looked_at
     }
     split, near = "context" if held_out is None else "target", near_plane(scene) / frame.unit
     sides = [
@@ -223,7 +224,7 @@ def page_data(
     lacks_pixels = share is not None and share < WHOLE
     return ViewData(
         title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
-        lacks_pixels, confirm_depths(replace(scene, gaussians=whole, cameras=placed)),
+        lacks_pixels, confirm_depths(with_pixels(replace(scene, gaussians=entered[INPUT], cameras=placed))),
     )  # fmt: skip
 
 
@@ -268,7 +269,7 @@ def _page_views(
 
 def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
     """Draw Gaussians of a scene's world from outside of its capture."""
-    camera, distance = outside_camera(scene.cameras.numpy(), scene.file_gaussians.means)
+    camera, distance = outside_camera(scene.cameras.numpy(), scene.gaussians.means)
     renders = (render(gaussians, camera, near=near_plane(scene)) for gaussians in named.values())
     return PageView(
         name=OUTSIDE,
@@ -343,10 +344,8 @@ def _pack(
         return *pack_splats(gaussians), highest
     if light:
         return None, highest, highest
-    ids = None
-    if scene.aligned:
-        ids = np.arange(len(gaussians)) if scene.missing is None else np.flatnonzero(~scene.missing.reshape(-1))
-    return *pack_splats(gaussians, cameras, ids), highest
+    homes = scene.pixels.homes if scene.pixels is not None and scene.pixels.own else None
+    return *pack_splats(gaussians, cameras, homes), highest
 
 
 def _side(

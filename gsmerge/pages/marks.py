@@ -47,11 +47,11 @@ class Marks:
         return replace(gaussians, opacities=gaussians.opacities * factors)
 
 
-def find_marks(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None, *, aligned: bool) -> Marks:
+def find_marks(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None, *, own: bool) -> Marks:
     """Find what is marked of canonical ``gaussians``; nothing where there are more than ``MOST``.
 
-    ``photos [v,h,w,3]`` of the ``cameras`` say where the sky is; None: no sky is found. Of ``aligned`` ones each
-    has a view of its own, which is not worth a mark.
+    ``photos [v,h,w,3]`` of the ``cameras`` say where the sky is; None: no sky is found. Of those that are
+    each a view's ``own`` that is not worth a mark.
     """
     if len(gaussians) > MOST:
         return Marks()
@@ -59,7 +59,7 @@ def find_marks(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None
     isolated = np.zeros(len(gaussians), bool)
     isolated[~above] = floaters(gaussians[~above])
     drops = {word: mask for word, mask in (("floaters", isolated), ("sky", above)) if mask.any()}
-    return Marks(drops, None if aligned else np.minimum(count_views(gaussians, cameras), MORE).astype(np.uint8))
+    return Marks(drops, None if own else np.minimum(count_views(gaussians, cameras), MORE).astype(np.uint8))
 
 
 def draw_marks(splats: Splats, marks: Marks, camera: Cameras, near: float) -> tuple[bytes | None, bytes | None]:

@@ -26,13 +26,13 @@ PIXEL_PARTS, DEPTH_PARTS = 8, 1024  # of a pixel, and of a depth: steps of what 
 
 
 def pack_splats(
-    gaussians: Gaussians, cameras: Cameras | None = None, pixel_ids: np.ndarray | None = None
+    gaussians: Gaussians, cameras: Cameras | None = None, homes: np.ndarray | None = None
 ) -> tuple[bytes | None, int]:
     """Pack the visible Gaussians with as many harmonics as fit; return bytes (None if too many) and SH degree.
 
     A gzip stream of a line of JSON and columns: numbers of a ``.spz`` in steps, each less that of the row before, the
     sign as lowest bit, first the low bytes of a column and then the higher ones. Neighbouring rows are similar, so this
-    takes 40 to 70 % of the ``.spz``, which the page's script restores. Rows with ``pixel_ids [n]`` among all pixels of
+    takes 40 to 70 % of the ``.spz``, which the page's script restores. Rows with ``homes [n]`` among all pixels of
     ``cameras`` have depths and shifts within their pixel for positions. ``gaussians`` and ``cameras`` are in the page's
     frame, where the scene is about 1 large: browsers keep means in 16 bits.
     """
@@ -47,8 +47,8 @@ def pack_splats(
     fraction = spz.choose_fraction(drawn, FINE)
     head: dict[str, Any] = {"count": count, "degree": degree, "fraction": fraction}
     places = None
-    if cameras is not None and pixel_ids is not None:
-        places = _pixel_places(rows, means, cameras, pixel_ids)
+    if cameras is not None and homes is not None and (homes >= 0).all():
+        places = _pixel_places(rows, means, cameras, homes.astype(np.int64, copy=False))
     if places is None:
         moved = np.diff(spz.fix_means(drawn, fraction), axis=0, prepend=np.zeros((1, 3), np.int32)).T
         places = np.where(moved < 0, -2 * moved - 1, 2 * moved).astype("<u4")

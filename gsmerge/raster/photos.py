@@ -129,14 +129,15 @@ class Photos:
 
 
 def scene_pictures(scene: Scene) -> np.ndarray:
-    """Return the photos ``[v,h,w,3]``, or the base colours of an aligned scene without photos."""
+    """Return the photos ``[v,h,w,3]``, or, without photos, the base colours of the Gaussians in front."""
     return row_pictures(scene) if scene.images is None else scene.images
 
 
 def row_pictures(scene: Scene) -> np.ndarray:
-    """Return the base colours ``[v,h,w,3]`` of the Gaussians of an aligned scene's pixels."""
-    shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
-    return sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1).reshape(shape)
+    """Return the base colours ``[v,h,w,3]`` of the Gaussians in front of a scene's pixels, 0 where there is none."""
+    assert scene.pixels is not None, "pixels show Gaussians"
+    colors = sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1)
+    return np.where(scene.pixels.shown[..., None], colors[scene.pixels.fronts], np.float32(0))
 
 
 def scene_photos(scene: Scene, level: float = 1) -> Photos:

@@ -18,14 +18,14 @@ import numpy as np
 
 from gsmerge.compaction.compact import compact
 from gsmerge.errors import GsmergeError, UsageError
-from gsmerge.facts.views import even_views, subset
+from gsmerge.facts.views import even_views, subset, take_rows
 from gsmerge.frame import Frame, scene_frame
 from gsmerge.geometry import move_views
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.runtime.record import Progress
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.types import SH_C0, Gaussians, Scene, Views, grid_ids
+from gsmerge.types import SH_C0, Gaussians, Scene, Views
 
 Needs = Literal["anything", "pixels", "photos"]
 Check = Literal["better", "same", "near", "once", "bits", "again"]
@@ -108,11 +108,7 @@ def break_rows(setup: StressScene) -> StressScene:
     """Break some rows, as if the file had NaN there."""
     scene = setup.scene
     chosen = _choose(len(scene.gaussians), BROKEN_SHARE)
-    if not scene.aligned:
-        return replace(setup, scene=replace(scene, gaussians=scene.gaussians[~chosen]))
-    gaussians = replace(scene.gaussians, opacities=np.where(chosen, np.float32(0), scene.gaussians.opacities))
-    valid = scene.valid & ~chosen.reshape(scene.valid.shape)
-    return replace(setup, scene=replace(scene, gaussians=gaussians, pixel_ids=grid_ids(valid)))
+    return replace(setup, scene=take_rows(scene, np.flatnonzero(~chosen)))
 
 
 def multiply(setup: StressScene, column: Literal["means", "scales"], share: float, factor: float) -> StressScene:
@@ -236,7 +232,7 @@ def stress(
 
 def _check_case(case: Case, setup: StressScene, base: _Result, options: CompactOptions) -> tuple[bool | None, str]:
     """Check whether the property of a case holds; return the answer with the figures."""
-    if case.needs != "anything" and not setup.scene.aligned:
+    if case.needs != "anything" and not setup.scene.has_own_pixels:
         return None, "needs a Gaussian for each pixel"
     if case.needs == "photos" and setup.scene.images is None:
         return None, "needs photos"

@@ -444,6 +444,8 @@ def without_photo(scene: Scene, views: Sequence[int]) -> Scene:
     masks = np.ones(shape, bool) if scene.masks is None else scene.masks.copy()
     masks[ids] = False
     images[ids] = (
-        row_pictures(scene)[ids] if scene.aligned else show_views(replace(scene, masks=None), max(shape))[ids].pictures
+        row_pictures(scene)[ids]
+        if scene.has_own_pixels
+        else show_views(replace(scene, masks=None), max(shape))[ids].pictures
     )
     return replace(scene, images=images, masks=masks)

@@ -20,7 +20,7 @@ from gsmerge.alignment import (
     AlignmentResult,
     Recovery,
     align,
-    check_alignment,
+    check_pixels,
     read_rotations,
 )
 from gsmerge.errors import SceneError
@@ -63,7 +63,7 @@ from gsmerge.scene.photos import (
     stored_photos,
     without_photo,
 )
-from gsmerge.scene.rows import color_from_photos, set_rotations, sort_rows, use_depths
+from gsmerge.scene.rows import color_from_photos, set_rotations, take_rows, use_depths
 from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, Cameras, LargePhotos, Scene, StrPath
@@ -108,7 +108,7 @@ class Loaded:
 
     def pixel_scene(self) -> Scene:
         """Return the scene; SceneError with the reason if it has not one Gaussian per pixel."""
-        if self.scene.aligned:
+        if self.scene.has_own_pixels:
             return self.scene
         raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
 
@@ -172,7 +172,7 @@ def read_scene(
             :class:`gsmerge.settings.reading.ReadHints`.
 
     Returns:
-        The scene; its ``pixel_ids`` are None where the rows belong to no pixels.
+        The scene; its ``pixels`` are None where the rows belong to no pixels that are known.
 
     Raises:
         SceneError: If a file is missing or damaged, or the Gaussians are not those of named cameras' views.
@@ -247,7 +247,7 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
         views=SceneViews(scene.cameras, photo_array(scene.images), scene.names, tuple(range(len(scene)))),
         exporters=tuple(dict.fromkeys(exporter for load in used for exporter in load.exporters)),
         notes=(*notes, *joined.notes),
-        alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored),
+        alignment=check_pixels(scene),
         moves=[move for load in used for move in load.moves],
         joined=joined.facts,
         left_out="; ".join(load.left_out for load in loads if load.left_out is not None) or None,
@@ -278,7 +278,9 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO
         with suppress(SceneError):
             load = _align(ply, fewer, read_scene_cameras(ply, fewer), hints=hints, photos=photos)
             # without photos, cameras of another scene may see these Gaussians, too
-            is_sure = load.scene.aligned or of_photos or fewer.cameras != files.cameras or fewer.masks != files.masks
+            is_sure = (
+                load.scene.has_own_pixels or of_photos or fewer.cameras != files.cameras or fewer.masks != files.masks
+            )
             if is_sure and ("images" not in files.named or files.images is None or load.scene.images is not None):
                 return _leave_out(load, files, why)
     if "cameras" not in files.named:
@@ -445,17 +447,18 @@ def _make_load(
     """
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
     names = () if camera_file is None else camera_file.names
-    gaussians, pixel_ids, missing, more = sort_rows(ply, result)
+    gaussians, pixels = take_rows(ply, result)
+    more = list[str]()
     cameras, images = result.cameras, result.images
     if views != list(range(len(cameras))):
         cameras, images = cameras[views], images[views] if len(images) else images
-    gaussians = color_from_photos(gaussians, images, files)
+    gaussians = color_from_photos(gaussians, pixels, images, files)
     large = None if large is None else large[views]
     masks, described = check_masks(masks[views], files)
     more += described
     photos = images if len(images) else None
     names = tuple(names[view] for view in views)
-    scene = Scene(gaussians, cameras, photos, pixel_ids, names, missing, large, masks.counts, masks.importance)
+    scene = Scene(gaussians, cameras, photos, pixels, names, large, masks.counts, masks.importance)
     frame = None if result.recovery is None else result.recovery.best.frame
     source = "" if camera_file is None else camera_file.source
     exporters, alignment = choose_exporters(hints.exporter, ply.info, layout, frame, source), None
@@ -471,7 +474,7 @@ def _make_load(
         if result.given is not None:
             scene = move_views(scene, result.given[views])
             result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
-        alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
+        alignment = check_pixels(scene)
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)
     return Loaded(
@@ -521,5 +524,7 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
             note = "the cameras do not fit the Gaussians and stay as their file has them"
             as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
             load = replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)
-        return load if load.scene.aligned else replace(load, notes=load.notes[:-1])  # without that there are no pixels
+        return (
+            load if load.scene.has_own_pixels else replace(load, notes=load.notes[:-1])
+        )  # without that there are no pixels
     return align_scene(ply, files, hints=hints, photos=photos)  # without what cannot be read, if it was not named

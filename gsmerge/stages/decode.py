@@ -45,8 +45,8 @@ def decode(
 
 
 def keep_all(scene: Scene, count: int | None) -> Decoded | None:
-    """Return all Gaussians of an unaligned scene if at least as many are asked for; otherwise None."""
-    if count is None or scene.aligned or count < len(scene.gaussians):
+    """Return all Gaussians of a scene if at least as many are asked for; otherwise None."""
+    if count is None or count < len(scene.gaussians):
         return None
     return Decoded(scene.gaussians, len(scene.gaussians), exact=True, kept=True)
 
@@ -122,7 +122,7 @@ def mixed_counts(
 
 def group_saliency(features: FeatureGaussians, members: Members, saliency: np.ndarray) -> np.ndarray:
     """Average the saliency of all views' pixels over each group's members, ``[g]``; without a pixel it is 0."""
-    starts, pixels = features.starts, members.pixels_of(features.members)
+    starts, pixels = features.starts, members.pixels[features.members]
     values = np.where(pixels >= 0, saliency[pixels], 0.0)
     return np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
 
@@ -137,21 +137,16 @@ def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarr
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
     """Return the number of Gaussians to decode merged views into; None: K for each Feature Gaussian.
 
-    It is a number if an exact count is requested and no fit grows to it, and for unaligned scenes, unless heads make K
-    of every group. In unaligned scenes a surface in both a near and a far view belongs to the near view, so many
-    superpixels of the far view are empty, and their Gaussians go to other groups.
+    It is a number if an exact count is requested and no fit grows to it, and where superpixels are empty, unless heads
+    make K of every group: a Gaussian that a near and a far view show belongs to the near one, so superpixels of the far
+    view may have none, and their Gaussians go to other groups.
     """
-    segmentation, members = merged.segmentation, merged.members
+    segmentation, num_empty = merged.segmentation, len(merged.segmentation.groups) - merged.num_groups
     if segmentation.exact and not grows:
         return segmentation.count
-    if members.pixels is None or options.k == MIXED or merged.networks.makes_children:
+    if num_empty == 0 or options.k == MIXED or merged.networks.makes_children:
         return None
-    groups = segmentation.groups
-    sizes = np.array(groups.counts)
-    seen = members.pixels[members.pixels >= 0]
-    labels = groups.labels.reshape(-1)[seen] + (np.cumsum(sizes) - sizes)[seen // groups.labels[0].size]
-    num_filled = int((np.bincount(labels, minlength=len(groups)) > 0).sum())
-    return min(segmentation.count, options.max_k * (len(merged.features) + len(groups) - num_filled))
+    return min(segmentation.count, options.max_k * (len(merged.features) + num_empty))
 
 
 def repeat(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:

@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.networks.cross_view_stats import cross_view_stats
-from gsmerge.pooling import Members, Moments, Rule, pool_members
+from gsmerge.pooling import ROWS, Members, Moments, Rule, pool_members
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
@@ -64,29 +64,20 @@ def correct(
 
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """List members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``, without empty superpixels."""
-    if members.pixels is None:
-        sizes, ids = _rows_by_view(scene, groups)
-    else:
-        counts = np.asarray(groups.counts)
-        first = np.cumsum(counts) - counts
-        labels = groups.labels.reshape(-1)[members.pixels] + first[members.pixels // scene.pixels_per_view]
-        labels = np.where(members.pixels >= 0, labels, -1)
-        starts, ids = group_members(labels.astype(np.int32), int(counts.sum()))
-        sizes = np.diff(starts)
+    counts = np.asarray(groups.counts)
+    first, flat = np.cumsum(counts) - counts, groups.labels.reshape(-1)
+    labels = np.empty(len(members.pixels), np.int32)
+
+    def label(start: int) -> None:
+        rows = slice(start, start + ROWS)
+        pixels = members.pixels[rows]
+        labels[rows] = np.where(pixels >= 0, flat[pixels] + first[pixels // scene.pixels_per_view], -1)
+
+    parallel_map(label, range(0, len(labels), ROWS))
+    starts, ids = group_members(labels, int(counts.sum()))
+    sizes = np.diff(starts)
     filled, views = sizes > 0, np.repeat(np.arange(len(scene)), groups.counts)
-    return np.concatenate([[0], np.cumsum(sizes[filled])]), ids.astype(np.int32, copy=False), views[filled]
-
-
-def _rows_by_view(scene: Scene, groups: Groups) -> tuple[np.ndarray, np.ndarray]:
-    """Sort the pixels of each view by superpixel, one view at a time to save memory."""
-
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-        labels = np.where(scene.valid[view], groups.labels[view], -1).reshape(-1).astype(np.int32)
-        starts, ids = group_members(labels, groups.counts[view])
-        return np.diff(starts), (ids + view * scene.pixels_per_view).astype(np.int32)
-
-    sizes, ids = zip(*parallel_map(one_view, range(len(scene))), strict=True)
-    return np.concatenate(sizes), np.concatenate(ids)
+    return np.concatenate([[0], np.cumsum(sizes[filled])]), ids, views[filled]
 
 
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:

@@ -20,7 +20,6 @@ from gsmerge.kernels.elementary import log, log10
 from gsmerge.kernels.superpixels.merge_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
-from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.budget import BudgetOptions
@@ -89,8 +88,9 @@ def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimit
     leaves = max(limits.per_view, -(-count // len(scene)))
     stretched = pictures if important is None else pictures * np.sqrt(important)[..., None]
     leaves = leaves if important is None else int(leaves * important.max())
-    depths, valid = (pixel_depths(scene), scene.valid) if scene.aligned else seen_depths(scene)
-    return region_tree(stretched, depths, segment(pictures, options, min(leaves, scene.pixels_per_view)), valid)
+    assert scene.pixels is not None, "stages have pixels"
+    groups = segment(pictures, options, min(leaves, scene.pixels_per_view))
+    return region_tree(stretched, front_depths(scene), groups, scene.pixels.shown)
 
 
 def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
@@ -165,7 +165,7 @@ def count_limits(
 def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
     """Return the superpixels per view; a share is one of the Gaussians if they are fewer than pixels, but not few."""
     per_view = count_for(segment, scene.height, scene.width)
-    if scene.aligned or segment.per_view is not None:
+    if scene.has_own_pixels or segment.per_view is not None:
         return per_view
     count = segment.share * scene.num_gaussians
     if has_few_rows(scene):
@@ -175,7 +175,7 @@ def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
 
 def has_few_rows(scene: SceneSize) -> bool:
     """Return whether Gaussians without pixels, such as tokens, are too few for a share of them to show the photos."""
-    shown = scene.pictures == "photos" and not scene.aligned
+    shown = scene.pictures == "photos" and not scene.has_own_pixels
     return shown and scene.num_gaussians < FEW * _few_pixels(scene)
 
 
@@ -189,7 +189,7 @@ def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptio
     if views == 0:
         return round(max(1, int(segment.share * count)) * decode.mean_k)
     per_view = superpixels_per_view(scene, segment)
-    total = per_view * count // scene.pixels_per_view if scene.aligned else per_view * views
+    total = per_view * count // scene.pixels_per_view if scene.has_own_pixels else per_view * views
     return round(max(views, total) * decode.mean_k)
 
 
@@ -221,15 +221,14 @@ class RegionTree:
         return len(self) - np.arange(len(self.distortions))
 
 
-def pixel_depths(scene: Scene) -> np.ndarray:
-    """Return the depth of every pixel's Gaussian in its own view, ``[v,h,w]`` float32, world units."""
-    cameras, means = scene.cameras, scene.gaussians.means
-    height, width, pixels = cameras.height, cameras.width, scene.pixels_per_view
+def front_depths(scene: Scene) -> np.ndarray:
+    """Return the depth of the Gaussian in front of every pixel, ``[v,h,w]`` float32, world units."""
+    assert scene.pixels is not None, "stages have pixels"
+    cameras, means, fronts = scene.cameras, scene.gaussians.means, scene.pixels.fronts
 
     def one_view(view: int) -> np.ndarray:
-        view_means = means[view * pixels : (view + 1) * pixels]
-        depths = camera_depths(view_means, cameras.viewmats[view].astype(means.dtype))
-        return depths.astype(np.float32).reshape(height, width)
+        depths = camera_depths(means[fronts[view]], cameras.viewmats[view].astype(means.dtype))
+        return depths.astype(np.float32)
 
     return np.stack(parallel_map(one_view, range(len(scene))))
 

@@ -43,7 +43,7 @@ def extend_state(
         options, _ = batch_settings({"recipe": "paper", "effort": "default"} | dict(settings))
         made["features"], report = extend_features(features, scene, options, progress=progress)
     else:
-        usual = {"fit": "none"} if scene.aligned else {}  # the photos are fitted to in the end
+        usual = {"fit": "none"} if scene.has_own_pixels else {}  # the photos are fitted to in the end
         made["scene"], report = extend(scene_before, scene, *batch_settings(usual | dict(settings)), progress=progress)
     about |= {"batches": [*about.get("batches", []), report.numbers]}
     about |= {"pictures": sorted({*about.get("pictures", []), report.pictures})}

@@ -104,7 +104,9 @@ class _JoinContext(NetworkContext):
         shown = Members(
             means=self.samples.means.reshape(-1, 3), quats=nothing, scales=nothing,
             opacities=self.samples.opacities.reshape(-1), sh0=self.samples.sh0.reshape(-1, 1, 3), shN=nothing,
-            footprints=nothing,
+            footprints=nothing, pixels=nothing, fronts=np.arange(self.samples.opacities.size, dtype=np.int32).reshape(
+                self.samples.opacities.shape
+            ),
         )  # fmt: skip
         grid = resize_cameras(self.cameras, width, height)
         stats = cross_view_stats(features.means, features.sh0, views, shown, grid)
@@ -147,7 +149,7 @@ def extend_features(
             raise UsageError(f"recipe paper: expected an encoder and absolute outputs, {options.checkpoint} lacks them")
         pictured, cameras = prepared.scene, in_float64(prepared.scene.cameras)
         segmentation = segment_scene(pictured, plan.superpixels, None)
-        members = assign(pictured, segmentation.groups, draws=plan.draws)
+        members = assign(pictured, segmentation.groups, by_contribution=plan.by_contribution)
         context = NetworkContext(weights, members, cameras, plan.seed)
         pooled = encode(pictured, members, segmentation.groups)
         features = correct(pooled, members, cameras, context, weaken=False)
@@ -194,8 +196,7 @@ def sample_views(members: Members, cameras: Cameras, state: FeatureState | None)
     columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)
     pixels = (rows[:, None] * cameras.width + columns).reshape(-1)
     ids = (np.arange(len(cameras))[:, None] * (cameras.width * cameras.height) + pixels).reshape(-1)
-    if members.pixels is not None:
-        ids = np.full_like(ids, -1) if members.fronts is None else members.fronts.reshape(-1)[ids]
+    ids = members.fronts.reshape(-1)[ids]
     means, sh0 = members.means[ids], members.sh0[ids, 0]
     usable = (ids >= 0) & np.isfinite(means).all(1) & np.isfinite(sh0).all(1) & np.isfinite(members.opacities[ids])
     grid = len(cameras), height, width

@@ -14,7 +14,7 @@ from gsmerge.alignment.registration.register import register
 from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, rotmat_to_quat
 from gsmerge.kernels.elementary import arccos
-from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, grid_ids
+from gsmerge.types import Cameras, Gaussians, LargePhotos, Pixels, Scene
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class JoinedScene:
 
 
 def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
-    """Join aligned scenes of one place, each with its own frame and scale, into one scene.
+    """Join scenes of pixels of one place, each with its own frame and scale, into one scene.
 
     ``paths`` are their files, for messages. SceneError if a scene has no pixels, if views or harmonics differ in size,
     or if no two scenes show the same surfaces.
@@ -70,7 +70,7 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
     for scene, path in zip(scenes, paths, strict=True):
         other = scene.cameras.width, scene.cameras.height
         sh_degree = scene.gaussians.sh_degree
-        if not scene.aligned:
+        if not scene.has_own_pixels:
             problem = "expected one Gaussian per pixel and a camera, to be joined, found none"
             raise SceneError(path, problem, "compact it by itself; a result is named with -o")
         if other != size:
@@ -100,7 +100,7 @@ def move_scene(scene: Scene, place: Similarity) -> Scene:
 
 
 def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> Scene:
-    """Concatenate the views of scenes of one size and frame; either all are aligned, or none is.
+    """Concatenate the views of scenes of one size and frame; pixels are known if those of all are.
 
     ``photos``: the photos of all views, if they are in one array already.
     """
@@ -113,21 +113,31 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
     images = [scene.images for scene in scenes if scene.images is not None]
     if photos is None and len(images) == len(scenes):
         photos = np.concatenate(images)
-    aligned = all(scene.aligned for scene in scenes)
     return Scene(
         gaussians=Gaussians.concat([scene.gaussians for scene in scenes]),
         cameras=cameras,
         images=photos,
-        pixel_ids=grid_ids(np.concatenate([scene.valid for scene in scenes])) if aligned else None,
+        pixels=_concat_pixels(scenes),
         names=tuple(name for scene in scenes for name in scene.names),
-        missing=_concat_pixels(scenes, [scene.missing for scene in scenes], usual=False),
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
-        masks=None if photos is None else _concat_pixels(scenes, [scene.masks for scene in scenes], usual=True),
-        importance=_concat_pixels(scenes, [scene.importance for scene in scenes], usual=np.float32(1)),
+        masks=None if photos is None else _concat_values(scenes, [scene.masks for scene in scenes], usual=True),
+        importance=_concat_values(scenes, [scene.importance for scene in scenes], usual=np.float32(1)),
     )
 
 
-def _concat_pixels(
+def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
+    """Concatenate the pixels of scenes; None if views of some are not known to have Gaussians of their own."""
+    homes, fronts, rows, views = list[np.ndarray](), list[np.ndarray](), 0, 0
+    for scene in scenes:
+        if scene.pixels is None or not scene.pixels.own:
+            return None
+        homes.append(np.where(scene.pixels.homes >= 0, scene.pixels.homes + views * scene.pixels_per_view, -1))
+        fronts.append(np.where(scene.pixels.shown, scene.pixels.fronts + np.int32(rows), np.int32(-1)))
+        rows, views = rows + len(scene.gaussians), views + len(scene)
+    return Pixels(np.concatenate(homes), np.concatenate(fronts), own=True)
+
+
+def _concat_values(
     scenes: Sequence[Scene], values: Sequence[np.ndarray | None], *, usual: bool | np.float32
 ) -> np.ndarray | None:
     """Concatenate values ``[v,h,w]`` of pixels; a scene without any has the ``usual``. None if all are."""

@@ -9,8 +9,9 @@ from dataclasses import dataclass, fields, replace
 import cv2
 import numpy as np
 
-from gsmerge.geometry import camera_depths, lower_median, sh0_to_rgb
+from gsmerge.geometry import camera_depths, lower_median
 from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.raster.photos import row_pictures
 from gsmerge.types import Scene
 
 SIDE = 1600  # longest side of a photo that keypoints are looked for in, pixels
@@ -67,7 +68,7 @@ class KeypointMatches:
 
 
 def find_keypoints(scene: Scene) -> list[Photo]:
-    """Find the keypoints of every camera of an aligned scene that lie on a single surface.
+    """Find the keypoints of every camera of a scene of pixels that lie on a single surface.
 
     Views from the same camera are layers of one photo.
     """
@@ -104,11 +105,7 @@ def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.nda
         scale = np.array([[size[0] / large.width], [size[1] / large.height], [1.0]])
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if share < 1 else photo
         return small, large.Ks[view].astype(np.float64) * scale
-    if scene.images is None:
-        grid = len(scene), scene.cameras.height, scene.cameras.width, 3
-        colors = sh0_to_rgb(scene.gaussians.sh0.reshape(grid)[view])
-    else:
-        colors = scene.images[view]
+    colors = row_pictures(scene)[view] if scene.images is None else scene.images[view]
     return (colors.clip(0, 1) * 255).round().astype(np.uint8), K
 
 
@@ -145,9 +142,10 @@ def _any_processor() -> Iterator[None]:
 def _surface(scene: Scene, layers: Sequence[int], viewmat: np.ndarray) -> np.ndarray:
     """Return depths ``[h,w]`` of the nearest opaque one of the views ``layers`` of a camera; infinite without any."""
     views = list(layers)
-    shape = len(scene), scene.cameras.height, scene.cameras.width
-    means = scene.gaussians.means.reshape(*shape, 3)[views].astype(np.float64)
-    opacities = scene.gaussians.opacities.reshape(shape)[views] * scene.stored[views]
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    rows = scene.pixels.fronts[views]
+    means = scene.gaussians.means[rows].astype(np.float64)
+    opacities = scene.gaussians.opacities[rows] * (rows >= 0)
     depths = camera_depths(means, viewmat)
     seen = (depths > 0) & (opacities > 0) & (opacities >= OPAQUE * opacities.max(0))
     return np.asarray(np.where(seen, depths, np.inf).min(0))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import rgb_to_sh0
+from gsmerge.geometry import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.table import DEPTHS, META, PLY, SCENE_SUFFIXES, find_format
@@ -22,6 +22,7 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Gaussians, StrPath
 
 _READ_FRAMES = LazyFunction("gsmerge.io.formats.depth_maps", "read_frames")
+MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
 MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
 MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
 FREED_ROWS = 1 << 17  # after which the pages of large columns leave memory
@@ -57,6 +58,7 @@ class FileInfo:
     opacity_encoding: str  # "logit", or "raw" where the file holds opacities in [0, 1]
     opacity_guessed: bool  # whether the encoding was guessed from the values, not given by the caller or the file
     num_nonfinite: int  # rows with NaN or inf, set aside
+    num_empty: int  # rows that hold the place of a Gaussian and are none, set aside
     num_clipped_scales: int  # Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped
     num_zero_quats: int  # Gaussians without a rotation, read as the identity
     # why the scales are likely wrong, one sentence without a full stop; empty where they are not
@@ -68,8 +70,8 @@ class FileInfo:
 class GaussianFile:
     """The n Gaussians of a file, row by row; float32, means float64 where the file stores them so.
 
-    A row that was not finite is False in ``valid [n]``, fully transparent and grey, and has the position and scales of
-    the finite row before it.
+    A row that is no Gaussian is False in ``valid [n]``: not finite, or empty. It is fully transparent and grey, and has
+    the position and scales of the Gaussian before it.
     """
 
     gaussians: Gaussians
@@ -89,6 +91,7 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
     """Describe adapted or unusual content of a file: one sentence each, without a full stop."""
     counted = {
         "row(s) with NaN or inf, set aside": info.num_nonfinite,
+        "empty row(s) at the origin, set aside": info.num_empty,
         "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
         "Gaussian(s) with a zero quaternion, taken as the identity": info.num_zero_quats,
     }
@@ -191,6 +194,7 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
     encoding = _activate(out["opacities"], out["valid"], declared_encoding)
     notes = _apply_filter(out) if arrays.FILTER in out else ()
     num_bad = clear_invalid(path, out)
+    num_empty = clear_empty(out)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
     if byte_columns == arrays.NORMALS:
         _spread_low_degree(out["shN"])
@@ -212,10 +216,11 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         opacity_encoding=encoding,
         opacity_guessed=declared_encoding is None,
         num_nonfinite=num_bad,
+        num_empty=num_empty,
         num_clipped_scales=num_clipped,
         num_zero_quats=num_zero_quats,
         odd_scales=_describe_odd_scales(out["means"], out["scales"], out["valid"]),
-        adapted=(*notes, *stored.notes),
+        adapted=(*notes, *stored.notes, *_describe_end(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
@@ -456,16 +461,55 @@ def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
     """Make rows with NaN or infinities transparent, in place; return their number."""
     valid = out["valid"]
     bad = np.flatnonzero(~valid)
-    if len(bad) == 0:
-        return 0
-    good = np.flatnonzero(valid)
-    if len(good) < MIN_FINITE * len(valid):
-        number = f"{len(bad):,} of" if len(good) else "all"
+    num_good = len(valid) - len(bad)
+    if len(bad) and num_good < MIN_FINITE * len(valid):
+        number = f"{len(bad):,} of" if num_good else "all"
         problem = f"expected finite Gaussians, found NaN or inf in {number} {len(valid):,} rows"
-        raise SceneError(path, problem, "export it again" if len(good) else "")
-    before = good[np.maximum(np.searchsorted(good, bad) - 1, 0)]
-    for name in ("means", "scales"):
-        out[name][bad] = out[name][before]
-    for name, value in {"quats": (1, 0, 0, 0), "opacities": 0, "sh0": 0, "shN": 0}.items():
-        out[name][bad] = value
+        raise SceneError(path, problem, "export it again" if num_good else "")
+    _clear(out, bad)
     return len(bad)
+
+
+def clear_empty(out: dict[str, np.ndarray]) -> int:
+    """Make rows that hold the place of a Gaussian transparent, in place; return their number.
+
+    Those are rows at the origin, not turned, round and grey, as a table of zeros is; and rows at the origin that are
+    all equal, as VolSplat fills its files up. They stay where a file has no others.
+    """
+    rows = np.flatnonzero((out["means"] == 0).all(1) & out["valid"])
+    if len(rows) == 0:
+        return 0
+    scales, sh0 = out["scales"][rows], out["sh0"][rows, 0]
+    empty = (out["quats"][rows] == (1, 0, 0, 0)).all(1) & (scales == scales[:, :1]).all(1) & (sh0 == 0).all(1)
+    if len(rows) >= MIN_PADDING:
+        shape = np.concatenate([scales, out["opacities"][rows, None], sh0], 1)
+        empty |= (shape == lower_median(shape)).all(1)
+    rows = rows[empty]
+    if len(rows) == np.count_nonzero(out["valid"]):
+        return 0
+    out["valid"][rows] = False
+    _clear(out, rows)
+    return len(rows)
+
+
+def _clear(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
+    """Give rows that are no Gaussians the position and scales of the Gaussian before, and make them transparent."""
+    if len(rows) == 0:
+        return
+    good = np.flatnonzero(out["valid"])
+    before = good[np.maximum(np.searchsorted(good, rows) - 1, 0)]
+    for name in ("means", "scales"):
+        out[name][rows] = out[name][before]
+    for name, value in {"quats": (1, 0, 0, 0), "opacities": 0, "sh0": 0, "shN": 0}.items():
+        out[name][rows] = value
+
+
+def _describe_end(valid: np.ndarray) -> tuple[str, ...]:
+    """Say where a file seems to have broken off: most rows, or its last ones alone, are no Gaussians."""
+    good = np.flatnonzero(valid)
+    last = len(valid) - 1 - int(good[-1])  # rows after the last Gaussian
+    gaps = len(valid) - len(good) - last
+    if len(good) > len(valid) / 2 and not (last > 1 and last > gaps):
+        return ()
+    where = f"the last {last:,} of" if last > gaps else f"{len(valid) - len(good):,} of"
+    return (f"{where} {len(valid):,} rows are no Gaussians: the export may have broken off; export it again",)

@@ -5,7 +5,7 @@ enum { COLUMNS = 6 };
 
 // What a point is compared with: Gaussians, which of them each pixel shows, and the limits of agreement.
 typedef struct {
-  const int32_t *fronts;  // null: a pixel shows the Gaussian of its own number
+  const int32_t *fronts;  // the Gaussian of each pixel, below 0: none
   const float *means, *opacities, *sh0;
   double color_scale, near, far, min_opacity;
   int64_t width, height, count;
@@ -25,12 +25,9 @@ static inline bool add_view(const surface *s, const double *m, const double *K, 
   double row = (K[4] * down + K[5] * depth) / depth;
   if (!(column >= 0.0 && column < (double)s->width && row >= 0.0 && row < (double)s->height))
     return true;
-  int64_t j = first + (int64_t)row * s->width + (int64_t)column;
-  if (s->fronts) {
-    j = s->fronts[j];
-    if (j < 0) return true;
-    if (j >= s->count) return false;
-  }
+  int64_t j = s->fronts[first + (int64_t)row * s->width + (int64_t)column];
+  if (j < 0) return true;
+  if (j >= s->count) return false;
   double there = along(m + 8, s->means[3 * j], s->means[3 * j + 1], s->means[3 * j + 2]);
   if (!(there > 0.0 && s->opacities[j] > s->min_opacity)) return true;
   double ratio = log8(depth / there);
@@ -54,7 +51,7 @@ API int32_t sum_cross_view(const double *restrict points, const float *restrict 
                            const float *restrict sh0, double color_scale, double near, double far,
                            double min_opacity, int64_t first, int64_t last, double *restrict out,
                            int64_t g, int64_t views, int64_t most, int64_t n) {
-  if (last > g || (!fronts && views > 0 && width * height > n / views)) return OUTSIDE;
+  if (last > g) return OUTSIDE;
   surface s = {fronts, means, opacities, sh0, color_scale, near,
                far, min_opacity, width, height, n};
   for (int64_t start = first, stop; start < last; start = stop) {

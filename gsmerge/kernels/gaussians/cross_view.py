@@ -75,7 +75,7 @@ def partition(values, order, low, high, place):
     STATUS, points=f8("g", 3), colors=f4("g", 3), own=i8("g"), asked=i4("views", "most", least=0, below="views"),
     viewmats=f8("views", 4, 4), Ks=f8("views", 3, 3),
     width=i8(least=0, below=1 << 31), height=i8(least=0, below=1 << 31),
-    fronts=i4("views", "height", "width", optional=True), means=f4("n", 3), opacities=f4("n"), sh0=f4("n", 1, 3),
+    fronts=i4("views", "height", "width"), means=f4("n", 3), opacities=f4("n"), sh0=f4("n", 1, 3),
     color_scale=f8(), near=f8(), far=f8(), min_opacity=f8(), first=i8(least=0), last=i8(),
     out=f8("g", COLUMNS, out=True),
 )  # fmt: skip
@@ -91,7 +91,7 @@ def sum_cross_view(
         asked: ``[v,most]`` int32 views that are asked about the points of each.
         width: Of the views, pixels.
         height: Of the views, pixels.
-        fronts: ``[v,h,w]`` int32 Gaussian of each pixel, -1 for none; None: the pixel's own number.
+        fronts: ``[v,h,w]`` int32 Gaussian of each pixel, -1 for none.
         color_scale: From ``sh0`` to colours.
         near: Largest difference of the logarithms of two depths of one surface.
         far: Larger differences are clipped to this.

@@ -23,26 +23,42 @@ _weigh_centres = declare(
 )  # fmt: skip
 
 
-def weigh_centres(means, scales, opacities, viewmat, K, near, fronts):
-    """Weigh Gaussians at the pixels of their centres, nearest first; of equal depths the first row comes first.
+def project_centres(means, scales, viewmat, K, width, height, near):
+    """Project the centres of Gaussians into a picture, and find those that reach into it.
 
     Args:
         viewmat: ``[4,4]`` float64, world to camera.
+        width: Of the picture, pixels.
+        height: Of the picture, pixels.
         near: Depth beyond which Gaussians count, world units.
-        fronts: ``[h,w]`` int32, written: the Gaussian with the largest opacity times transmittance at each pixel, -1
+
+    Returns:
+        Of m Gaussians: their rows ``[m]`` int32, ascending; their pixels ``[m]`` int32; their depths ``[m]`` float32;
+        and their areas ``[m]`` float32: the product of the two longest axes in pixels, negative and times the falloff
+        up to the picture where the centre is outside.
+    """
+    n = len(means)
+    ids, pixels, depths, areas = (np.empty(n, kind) for kind in (np.int32, np.int32, np.float32, np.float32))
+    m = _project_centres(means, scales, viewmat, K, width, height, near, ids, pixels, depths, areas)
+    return tuple(array[:m].copy() for array in (ids, pixels, depths, areas))
+
+
+def weigh_centres(ids, places, depths, areas, opacities, fronts):
+    """Weigh Gaussians at the places of their centres, nearest first; of equal depths the first row comes first.
+
+    Args:
+        ids: ``[m]`` int32 rows.
+        places: ``[m]`` int32, the pixel or cell ``row * w + column`` of each.
+        areas: ``[m]`` float32, see :func:`project_centres`.
+        opacities: ``[n]`` float32 of all Gaussians.
+        fronts: ``[h,w]`` int32, written: the Gaussian with the largest opacity times transmittance at each place, -1
             without any.
 
     Returns:
-        Of the m Gaussians that reach into the picture: their rows ``[m]`` int32, ascending; their pixels ``[m]`` int32;
-        and ``[m]`` float32 opacity times transmittance times area: the product of the two longest axes in pixels, times
-        the falloff up to the picture where the centre is outside.
+        Opacity times transmittance times area ``[m]`` float32.
     """
-    (height, width), n = fronts.shape, len(means)
-    ids, pixels, depths, areas = (np.empty(n, kind) for kind in (np.int32, np.int32, np.float32, np.float32))
-    m = _project_centres(means, scales, viewmat, K, width, height, near, ids, pixels, depths, areas)
-    ids, pixels, depths, areas = (array[:m].copy() for array in (ids, pixels, depths, areas))
-    weights, passing = np.empty(m, np.float32), np.ones((height, width), np.float32)
+    weights, passing = np.empty(len(ids), np.float32), np.ones(fronts.shape, np.float32)
     fronts[:] = -1
     order = depth_order(depths.view(np.uint32))
-    _weigh_centres(order, ids, pixels, areas, opacities, passing, np.zeros_like(passing), fronts, weights)
-    return ids, pixels, weights
+    _weigh_centres(order, ids, places, areas, opacities, passing, np.zeros_like(passing), fronts, weights)
+    return weights

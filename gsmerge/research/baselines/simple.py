@@ -23,16 +23,14 @@ from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode
 from gsmerge.stages.encode import encode
 from gsmerge.stages.superpixels import superpixels
-from gsmerge.types import Cameras, Decoded, Gaussians, Groups, Scene
+from gsmerge.types import Cameras, Decoded, Gaussians, Groups, PicturedScene
 
 MAX_TILED = 2_000_000  # Gaussians in the tiled views under way: each is as large as they are
 
 
-def own_gaussians(scene: Scene) -> Gaussians:
-    """Return the Gaussians of the file, without rows that were added for missing or invalid ones."""
-    if scene.aligned and not bool(scene.stored.all()):
-        return scene.gaussians[scene.stored.reshape(-1)]
-    return scene.gaussians
+def own_gaussians(scene: PicturedScene) -> Gaussians:
+    """Return the Gaussians of the file, without those that fill holes."""
+    return scene.gaussians if scene.filled is None else scene.gaussians[~scene.filled]
 
 
 def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:

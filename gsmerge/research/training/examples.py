@@ -27,9 +27,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import encode
 from gsmerge.stages.merge import take
 from gsmerge.stages.superpixels import segment
-from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians
-
-NOT_STORED = ("pixels", "fronts")  # of Members: a pixel has one member, in order
+from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Pixels
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, Call
     """
     load = load_scene(path)
     scene, ply = load.scene, load.files.ply
-    if not scene.aligned:
+    if not scene.has_own_pixels:
         raise SceneError(ply, "expected one Gaussian per pixel to learn from, found an unaligned scene")
     if scene.images is None:
         raise SceneError(ply, "expected photos to learn from, found none", "put them next to it in images/")
@@ -123,23 +121,24 @@ def make_example(training: TrainingScene, options: TrainOptions, density: float,
 
 def select_views(example: Example, ids: Sequence[int]) -> Example:
     """Keep the views ``ids`` (ascending) of an example; photos of other views become novel ones."""
-    views, pixels = len(example.cameras), example.cameras.width * example.cameras.height
+    views, own = len(example.cameras), example.members
     if len(ids) == views:
         return example
     place = np.full(views, -1)
     place[list(ids)] = np.arange(len(ids))
     rows = np.flatnonzero(place[example.features.views] >= 0)
     part = take(example.features, rows)
-    members = place[part.members // pixels] * pixels + part.members % pixels
-    columns = {f.name: getattr(example.members, f.name) for f in fields(Members) if f.name not in NOT_STORED}
-    chosen = (np.array(ids)[:, None] * pixels + np.arange(pixels)).reshape(-1)
+    chosen, pixels = Pixels(own.pixels, own.fronts, own=True).select(ids)
+    numbers = np.full(len(own.pixels), -1, np.int32)
+    numbers[chosen] = np.arange(len(chosen), dtype=np.int32)
+    columns = {f.name: getattr(own, f.name)[chosen] for f in fields(Members) if f.name != "fronts"}
     order = [*ids, *(photo for photo in range(len(example.photos)) if photo not in set(ids))]
     photos = example.photos
     return replace(
         example,
-        members=Members(**{name: column[chosen] for name, column in columns.items()}),
+        members=Members(**columns | {"pixels": pixels.homes, "fronts": pixels.fronts}),
         cameras=example.cameras[list(ids)],
-        features=replace(part, views=place[part.views], members=members),
+        features=replace(part, views=place[part.views], members=numbers[part.members]),
         base=example.base[rows],
         photos=replace(photos, viewmats=photos.viewmats[order], Ks=photos.Ks[order]),
         images=example.images[order],

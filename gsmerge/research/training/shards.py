@@ -33,7 +33,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.pooling import Members
 from gsmerge.raster.photos import Photos
 from gsmerge.research.training.backbones import PredictedCapture
-from gsmerge.research.training.examples import NOT_STORED, Example, make_examples, scene_name
+from gsmerge.research.training.examples import Example, make_examples, scene_name
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.runtime.threads import work_alone
 from gsmerge.scene.content_hash import content_hash, digest, read_files
@@ -141,8 +141,7 @@ def write_shard(path: Path, example: Example) -> str:
 def _arrays(example: Example) -> Iterator[tuple[str, np.ndarray]]:
     for part, kind in PARTS.items():
         for f in fields(kind):
-            if f.name not in NOT_STORED:
-                yield f"{part}.{f.name}", np.ascontiguousarray(getattr(getattr(example, part), f.name))
+            yield f"{part}.{f.name}", np.ascontiguousarray(getattr(getattr(example, part), f.name))
     for part, cameras in (("cameras", example.cameras), ("photos", example.photos)):
         yield f"{part}.viewmats", np.ascontiguousarray(cameras.viewmats)
         yield f"{part}.Ks", np.ascontiguousarray(cameras.Ks)

@@ -1,0 +1,117 @@
+"""Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel, by projection of centres.
+
+Each view is looked at in cells so wide that nearly every one has a centre in it where any is near: a pixel, or several
+where Gaussians are wider apart. What is behind the front of a cell is hidden, and a pixel without a centre of its own
+shows the front of its cell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from gsmerge.kernels.gaussians.fronts import project_centres, weigh_centres
+from gsmerge.raster.images import ONE_AT_A_TIME
+from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.runtime.threads import in_turn
+from gsmerge.types import Pixels, Scene, SceneT
+
+# Share of the cells with a centre, of those beside others with one, from which on cells are wide enough. Of captures in
+# voxels six with .97 and more of their pixels show as much as by drawing, two with .93 and .95 lose 1.5 and 5 dB
+COVERED = 0.96
+MOST_LEVELS = 5  # cells are at most 32 pixels wide
+SAME_DEPTH = 1.05  # times the depth of a cell's front up to which a centre in the cell is on the same surface
+
+
+def with_pixels(scene: SceneT) -> SceneT:
+    """Return a canonical scene with its pixels, found by projection where they are not known."""
+    return scene if scene.pixels is not None else replace(scene, pixels=find_pixels(scene))
+
+
+def find_pixels(scene: Scene) -> Pixels:
+    """Find the pixel of each Gaussian of a canonical scene, and the front of each pixel.
+
+    A Gaussian's pixel is the one with the largest opacity x transmittance x area, pixels, or -1 if no view sees it; in
+    ties the first view counts. The front of a pixel is the Gaussian with the largest opacity x transmittance among
+    those with their centre in it, or in its cell, or -1 without any.
+    """
+    g, cameras, count = scene.gaussians, scene.cameras, len(scene)
+    means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
+    viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
+    fronts = np.empty((count, cameras.height, cameras.width), np.int32)
+    most, homes = np.zeros(len(g), np.float32), np.full(len(g), -1, np.int64)
+
+    def weigh(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return _weigh_view(means, scales, opacities, viewmats[view], Ks[view], fronts[view])
+
+    of_views = in_turn(weigh, range(count)) if len(g) <= ONE_AT_A_TIME else map(weigh, range(count))
+    for view, (ids, places, weights) in enumerate(of_views):
+        better = weights > most[ids]
+        ids = ids[better]
+        most[ids], homes[ids] = weights[better], view * scene.pixels_per_view + places[better]
+    return Pixels(homes, fronts, own=False)
+
+
+def _weigh_view(
+    means: np.ndarray, scales: np.ndarray, opacities: np.ndarray, viewmat: np.ndarray, K: np.ndarray, fronts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weigh the Gaussians of one view in its cells, and write the fronts of its pixels ``[h,w]``.
+
+    Returns rows ``[m]``, their pixels ``[m]``, and their weights ``[m]``, pixels.
+    """
+    height, width = fronts.shape
+    ids, pixels, depths, areas = project_centres(means, scales, viewmat, K, width, height, NEAR_PLANE)
+    inside = areas > 0
+    shown = np.zeros((height, width), bool)
+    shown.reshape(-1)[pixels[inside]] = True
+    level = choose_level(shown)
+    weights = weigh_centres(ids, pixels, depths, areas, opacities, fronts) if level == 0 else None
+    if weights is not None and (shown.all() or not shown.any()):
+        return ids, pixels, weights
+    cells, shape = _cells_of(pixels, fronts.shape, max(level, 1))
+    front_of = np.empty(shape, np.int32)
+    of_cells = weigh_centres(ids, cells, depths, areas, opacities, front_of)
+    if weights is None:
+        weights, nearest = of_cells, np.full(front_of.size, np.inf, np.float32)
+        np.minimum.at(nearest, cells[inside], np.where(front_of.reshape(-1)[cells] == ids, depths, np.inf)[inside])
+        surface = np.flatnonzero(inside & (depths <= SAME_DEPTH * nearest[cells]))
+        weigh_centres(ids[surface], pixels[surface], depths[surface], areas[surface], opacities, fronts)
+    beside = front_of.reshape(-1)[_cells_of(np.arange(fronts.size, dtype=np.int32), fronts.shape, max(level, 1))[0]]
+    np.copyto(fronts, beside.reshape(fronts.shape), where=fronts < 0)
+    return ids, pixels, weights
+
+
+def choose_level(shown: np.ndarray) -> int:
+    """Choose how wide cells are, as a power of 2, from the mask ``shown [h,w]`` of pixels with a centre.
+
+    Nearly all cells that lie between others with a centre have one, too; 0 where no width has that.
+    """
+    fine = shown
+    for level in range(MOST_LEVELS + 1):
+        around = cv2.erode(_coarser(fine).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
+        height, width = fine.shape
+        between = around.repeat(2, 0)[:height].repeat(2, 1)[:, :width]
+        if not between.any():
+            return 0
+        if np.count_nonzero(fine & between) >= COVERED * np.count_nonzero(between):
+            return level
+        fine = _coarser(fine)
+    return 0
+
+
+def _coarser(mask: np.ndarray) -> np.ndarray:
+    """Return which squares of 2 x 2 of a mask ``[h,w]`` hold something."""
+    height, width = mask.shape
+    even = np.pad(mask, ((0, height % 2), (0, width % 2)))
+    lines = even[::2] | even[1::2]
+    return np.asarray(lines[:, ::2] | lines[:, 1::2])
+
+
+def _cells_of(pixels: np.ndarray, shape: tuple[int, ...], level: int) -> tuple[np.ndarray, tuple[int, int]]:
+    """Return the cell of each pixel ``[m]`` int32 of a picture ``[h,w]``, and how many lines and columns there are."""
+    height, width = shape
+    rows, columns = np.divmod(pixels, np.int32(width))
+    wide = -(-width // (1 << level))
+    return (rows >> level) * np.int32(wide) + (columns >> level), (-(-height // (1 << level)), wide)
