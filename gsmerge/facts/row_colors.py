@@ -78,6 +78,9 @@ def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T], wante
 def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
     """Draw the Gaussians of all ``views`` of one camera, and choose between the drawing and their colours."""
     part = subset(scene, views.tolist())
+    if len(part.gaussians) == 0:
+        black, nowhere = np.zeros((*scene.pixels.fronts.shape[1:], 3), np.float32), np.zeros(scene.pixels.fronts.shape[1:], bool)
+        return RowPicture(black, nowhere, nowhere, black)
     tiled = tile_view(make_splats(part.gaussians), **blank_photos(part.cameras).camera(0))
     seen = view_colors(tiled)
     drawing, transmittance = blend(tiled, seen, np.zeros(3, np.float32))
