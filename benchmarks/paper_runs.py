@@ -136,7 +136,7 @@ class Bench:
         ply = export(folder, self.cache, case.style)
         scene, targets = read_case(folder, ply, case.views)
         images = dict[int, np.ndarray]()
-        gaussians, facts = scene.file_gaussians, dict[str, Any]()
+        gaussians, facts = scene.gaussians, dict[str, Any]()
         if settings is not None:
             gaussians, facts = self.compact(scene, way, settings)
         options = EvaluateOptions((), context=False, own=False, photo_side=PHOTO_SIDE, fog=False)
@@ -198,7 +198,7 @@ def distance(scene: gsmerge.Scene, targets: Views, images: Mapping[int, np.ndarr
     """LPIPS of the visible pixels of two views; ``evaluate`` takes twice as long, as it has more of them."""
     near = near_plane(scene)
     chosen = pick_views(len(targets.names), LPIPS_VIEWS)
-    sources = scene.cameras if scene.aligned else shrink_cameras(scene.cameras, PHOTO_SIDE)
+    sources = scene.cameras if scene.has_own_pixels else shrink_cameras(scene.cameras, PHOTO_SIDE)
     masks = visible_pixels(context_points(scene, near, sources), targets.cameras[chosen], near, sources)
     pairs = zip(chosen, targets.images[chosen], masks, strict=True)
     return float(np.mean([lpips(images[i], photo, "vgg", mask) for i, photo, mask in pairs]))

@@ -47,7 +47,7 @@ def score(gaussians: Gaussians, targets: Targets, perceptual: bool = False) -> t
 
 def score_outside(scene: Scene, results: Mapping[str, Gaussians]) -> dict[str, tuple[float, ...]]:
     """Fog, holes and veils of results by name; NaN where there is nothing to measure on."""
-    fog = measure_fog(scene.file_gaussians, results, scene.cameras, near_plane(scene))
+    fog = measure_fog(scene.gaussians, results, scene.cameras, near_plane(scene))
     return {name: tuple(math.nan if v is None else v for v in vars(one[ALL]).values()) for name, one in fog.items()}
 
 

@@ -250,7 +250,7 @@ def align_section(run: Run) -> str:
             ),
             say(
                 "every pixel is stored and valid, none is missing.",
-                bool(run.prepared.input_scene.stored.all()) and run.prepared.input_scene.num_missing == 0,
+                bool(run.prepared.input_scene.pixels.shown.all()) and run.prepared.input_scene.num_missing == 0,
             ),
         ),
     ])  # fmt: skip

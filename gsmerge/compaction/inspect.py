@@ -15,7 +15,6 @@ from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.prepare import missing_notes
 from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.facts.support import count_views_in_world
@@ -131,7 +130,7 @@ def _photo_notes(scene: Scene) -> list[str]:
 
 
 def _measure_agreement(scene: Scene) -> Agreement | None:
-    return confirm_depths(with_pixels(canonicalise(scene)[0])) if len(scene) > 1 and len(scene.gaussians) else None
+    return confirm_depths(canonicalise(scene)[0]) if scene.has_own_pixels and len(scene.gaussians) else None
 
 
 def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] | None:

@@ -81,9 +81,12 @@ class Agreement:
 
 
 def confirm_depths(scene: Scene) -> Agreement | None:
-    """Measure how far the views of a scene with pixels confirm each other's depth; None with fewer than two."""
+    """Measure how far the views of a scene confirm each other's depth.
+
+    None with fewer than two, or where they have no Gaussians of their own: what several share confirms itself.
+    """
     views, pixels_of = len(scene), scene.pixels
-    if views < 2 or pixels_of is None or not pixels_of.shown.any():
+    if views < 2 or pixels_of is None or not pixels_of.own or not pixels_of.shown.any():
         return None
     means, centres = scene.gaussians.means, scene.cameras.centres
     cameras, fronts = scene.cameras, pixels_of.fronts.reshape(views, -1)

@@ -21,7 +21,7 @@ from gsmerge.types import Pixels, Scene, SceneT
 # Share of the cells with a centre, of those beside others with one, from which on cells are wide enough. Of captures in
 # voxels six with .97 and more of their pixels show as much as by drawing, two with .93 and .95 lose 1.5 and 5 dB
 COVERED = 0.96
-MOST_LEVELS = 5  # cells are at most 32 pixels wide
+REACH = 4.0  # standard deviations of a Gaussian, from end to end, in which it shows nearly all that it shows
 SAME_DEPTH = 1.05  # times the depth of a cell's front up to which a centre in the cell is on the same surface
 
 
@@ -66,7 +66,7 @@ def _weigh_view(
     inside = areas > 0
     shown = np.zeros((height, width), bool)
     shown.reshape(-1)[pixels[inside]] = True
-    level = choose_level(shown)
+    level = choose_level(shown, REACH * float(np.sqrt(np.median(areas[inside]))) if inside.any() else 1.0)
     weights = weigh_centres(ids, pixels, depths, areas, opacities, fronts) if level == 0 else None
     if weights is not None and (shown.all() or not shown.any()):
         return ids, pixels, weights
@@ -83,21 +83,20 @@ def _weigh_view(
     return ids, pixels, weights
 
 
-def choose_level(shown: np.ndarray) -> int:
+def choose_level(shown: np.ndarray, widest: float) -> int:
     """Choose how wide cells are, as a power of 2, from the mask ``shown [h,w]`` of pixels with a centre.
 
-    Nearly all cells that lie between others with a centre have one, too; 0 where no width has that.
+    Nearly all cells that lie between others with a centre have one, too, and none is wider than ``widest``, pixels; 0
+    where no width has that.
     """
-    fine = shown
-    for level in range(MOST_LEVELS + 1):
+    fine, level = shown, 0
+    while 2**level <= max(widest, 1.0):
         around = cv2.erode(_coarser(fine).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
         height, width = fine.shape
         between = around.repeat(2, 0)[:height].repeat(2, 1)[:, :width]
-        if not between.any():
-            return 0
-        if np.count_nonzero(fine & between) >= COVERED * np.count_nonzero(between):
+        if between.any() and np.count_nonzero(fine & between) >= COVERED * np.count_nonzero(between):
             return level
-        fine = _coarser(fine)
+        fine, level = _coarser(fine), level + 1
     return 0
 
 

@@ -9,7 +9,6 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.views import even_views
 from gsmerge.frame import Frame, scene_frame
 from gsmerge.geometry import middle_depth
@@ -224,7 +223,7 @@ def page_data(
     lacks_pixels = share is not None and share < WHOLE
     return ViewData(
         title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
-        lacks_pixels, confirm_depths(with_pixels(replace(scene, gaussians=entered[INPUT], cameras=placed))),
+        lacks_pixels, confirm_depths(replace(scene, gaussians=entered[INPUT], cameras=placed)),
     )  # fmt: skip
 
 

@@ -105,4 +105,4 @@ def test_a_frame_without_its_photo_is_left_out(script: Callable[[str], ModuleTyp
 def test_every_style_is_read(style: str, script: Callable[[str], ModuleType], capture: Path, tmp_path: Path) -> None:
     loaded = load_scene(script("capture_exports").export(capture, tmp_path / style, style))
     assert len(loaded.scene.cameras) == 3
-    assert loaded.scene.aligned == (style != "anysplat")
+    assert loaded.scene.has_own_pixels == (style != "anysplat")

@@ -182,7 +182,7 @@ def test_a_small_world_is_drawn_as_a_large_one(kind: str, small_copy: Path, tmp_
 def test_an_overlay_colours_what_few_views_show(small_copy: Path, tmp_path: Path, run: Run) -> None:
     """Red where the scene's Gaussians stand again, behind all cameras, and nothing where many views show them."""
     scene = gsmerge.read_scene(small_copy)
-    some, forward = scene.finite_gaussians[::7], scene.cameras.viewmats[:, 2, :3].mean(0)
+    some, forward = scene.gaussians[::7], scene.cameras.viewmats[:, 2, :3].mean(0)
     behind = replace(some, means=some.means - 30 * forward.astype(np.float32))
     gsmerge.write_ply(tmp_path / "both.ply", gsmerge.Gaussians.concat([some, behind]))
     cameras = small_copy / "transforms.json"

@@ -138,7 +138,7 @@ def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
 def test_what_no_view_shows_can_be_made_faint(tab: Browser, small_scene: Path, tmp_path: Path) -> None:
     """Every tenth Gaussian again, far behind all cameras: these alone become faint, and come back."""
     scene = gsmerge.read_scene(small_scene)
-    some, forward = scene.finite_gaussians[::10], scene.cameras.viewmats[:, 2, :3].mean(0)
+    some, forward = scene.gaussians[::10], scene.cameras.viewmats[:, 2, :3].mean(0)
     behind = replace(some, means=some.means - 30 * forward.astype(np.float32))
     both = gsmerge.Gaussians.concat([some, behind])
     (tmp_path / "page.html").write_text(site_contents(both, scene.cameras, "both", (), apart=False)[0])

@@ -141,7 +141,7 @@ def test_a_device_is_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_quality_without_photos_and_pixels_is_that_from_the_input(scene: Scene) -> None:
-    rows = replace(scene, images=None, pixel_ids=None)
+    rows = replace(scene, images=None, pixels=None)
     low, high = (compact(rows, quality=quality, fit_steps=20).report for quality in ("20dB", "28dB"))
     for report, asked in ((low, 20), (high, 28)):
         assert report.unmet is None

@@ -135,7 +135,7 @@ def save_export(folder: Path, tiny: Tiny, rows: np.ndarray, *, cameras: bool = T
 def home(scene: Scene, tiny: Tiny, kept: np.ndarray | None = None) -> float:
     """Share of the stored (or of the kept) pixels whose Gaussian is the one made for them, known by its opacity."""
     same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
-    return float(same[scene.stored.reshape(-1) if kept is None else kept].mean())
+    return float(same[scene.pixels.shown.reshape(-1) if kept is None else kept].mean())
 
 
 def da3_rows(tiny: Smooth, depths: np.ndarray | None = None) -> np.ndarray:

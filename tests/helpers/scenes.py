@@ -18,7 +18,7 @@ from floors import nudged
 from gsmerge import Cameras, Gaussians, Scene, compact, render
 from gsmerge.compaction.report import CompactReport
 from gsmerge.compaction.result import CompactResult
-from gsmerge.facts.views import subset
+from gsmerge.facts.views import subset, take_rows
 from gsmerge.fit import FitJob, FitOptions
 from gsmerge.fit.schedule import FitRun, prepare_fit
 from gsmerge.geometry import covariances, normalize, quat_to_rotmat, rotmat_to_quat
@@ -28,7 +28,7 @@ from gsmerge.raster.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
 from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians
 from gsmerge.research.generate.synthetic_scene import look_at as camera_to_world
-from gsmerge.types import SH_C0, FeatureGaussians, grid_ids
+from gsmerge.types import SH_C0, FeatureGaussians, Pixels
 
 Texture = Callable[[np.ndarray], np.ndarray]
 FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -185,8 +185,14 @@ def make_scene(
     if not noise:  # exactly on the surfaces, so that what is equal is so in float64
         means = np.concatenate([world_points(h.depth, c2w, lens).reshape(-1, 3) for c2w, h, _ in actual])
     gaussians = nudged(replace(gaussians, means=means))
-    valid = np.ones((len(cameras), cameras.height, cameras.width), bool)
-    return Scene(gaussians, cameras, np.stack(images) if photos else None, grid_ids(valid), names(len(cameras)))
+    pixels = Pixels.of_grid(np.ones((len(cameras), cameras.height, cameras.width), bool))
+    return Scene(gaussians, cameras, np.stack(images) if photos else None, pixels, names(len(cameras)))
+
+
+def shown_in(scene: Scene, mask: np.ndarray) -> Scene:
+    """The scene with only the Gaussians of the pixels ``mask [v,h,w]``."""
+    assert scene.pixels is not None
+    return take_rows(scene, np.flatnonzero(mask.reshape(-1)[scene.pixels.homes]))
 
 
 def names(count: int) -> tuple[str, ...]:
@@ -324,8 +330,8 @@ def assert_invariants(gaussians: Gaussians, scene: Scene) -> None:
     np.testing.assert_allclose(np.linalg.norm(gaussians.quats, axis=1), 1, atol=1e-5)
     covars = covariances(gaussians.quats.astype(np.float64), gaussians.scales.astype(np.float64))
     assert (np.linalg.eigvalsh(covars)[:, 0] >= -1e-9 * np.trace(covars, axis1=1, axis2=2)).all()
-    assert len(gaussians) <= int(scene.valid.sum())
-    if (scene.gaussians.opacities[scene.valid.reshape(-1)] > 1 / 255).all():
+    assert len(gaussians) <= len(scene.gaussians)
+    if (scene.gaussians.opacities > 1 / 255).all():
         assert len(gaussians) >= 1
     assert gaussians.sh_degree <= scene.gaussians.sh_degree
     drawn = render(gaussians, scene.cameras)
@@ -336,7 +342,7 @@ def assert_invariants(gaussians: Gaussians, scene: Scene) -> None:
 def assert_consistent(report: CompactReport, scene: Scene, gaussians: Gaussians) -> None:
     """The report tells what the run did."""
     assert (report.num_input, report.num_output) == (scene.num_gaussians, len(gaussians))
-    unmeasured = (scene.images is None and not scene.aligned) or "nothing is scored" in (report.worse or "")
+    unmeasured = (scene.images is None and not scene.has_own_pixels) or "nothing is scored" in (report.worse or "")
     assert (report.psnr_before is None) == (report.psnr_after is None) == unmeasured
     assert all(seconds >= 0 for seconds in report.seconds.values())
     assert report.peak_memory_bytes > 0

@@ -14,7 +14,7 @@ from gsmerge import Scene
 from gsmerge.geometry import multiply_quats, rotmat_to_quat
 from gsmerge.kernels import elementary
 from gsmerge.kernels.matrices import matmul
-from gsmerge.types import Cameras, Gaussians, grid_ids
+from gsmerge.types import Cameras, Gaussians
 
 COLUMNS = ["x", "y", "z", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3)),
            *(f"rot_{i}" for i in range(4))]  # fmt: skip
@@ -33,7 +33,8 @@ def split_views(scene: Scene, scales: Sequence[float]) -> list[Scene]:
             scales=(scale * g.scales).astype(np.float32),
         )
         cameras = Cameras(np.eye(4)[None], scene.cameras.Ks[[view]], scene.cameras.width, scene.cameras.height)
-        parts.append(Scene(own, cameras, scene.images[[view]], grid_ids(scene.valid[[view]]), (scene.names[view],)))
+        pixels = scene.pixels.select([view])[1]
+        parts.append(Scene(own, cameras, scene.images[[view]], pixels, (scene.names[view],)))
     return parts
 
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from scenes import make_features
 from skimage.measure import label as connected_parts
 
-from gsmerge.pooling import Members
+from gsmerge.pooling import Members, gaussian_members
 from gsmerge.stages.decode import split_counts
 from gsmerge.stages.segment import RegionTree, SegmentOptions, cut_tree, region_tree, segment
-from gsmerge.types import FeatureGaussians, Groups
+from gsmerge.types import FeatureGaussians, Gaussians, Groups
 
 FEW = settings(max_examples=25, deadline=None, derandomize=True)
 seeds = st.integers(0, 2**32 - 1)
@@ -65,7 +65,8 @@ def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:
     colours = rng.integers(0, 3, (n, 1, 3)) if seed % 2 else rng.normal(size=(n, 1, 3))
     columns = (rng.normal(size=(n, 3)) * 0.01, np.eye(4)[np.zeros(n, int)], np.full((n, 3), 0.01), rng.random(n))
     harmonics = colours, np.zeros((n, 0, 3))
-    members = Members(*(np.ascontiguousarray(c, np.float32) for c in (*columns, *harmonics, np.full(n, 0.01))))
+    gaussians = Gaussians(*(np.ascontiguousarray(c, np.float32) for c in (*columns, *harmonics)))
+    members = gaussian_members(gaussians, np.full(n, 0.01, np.float32))
     features = make_features(rng.normal(size=(g, 3)) * 0.01)
     starts = np.concatenate([[0], np.cumsum(sizes)])
     return replace(features, starts=starts, members=np.arange(n)), members

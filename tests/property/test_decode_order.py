@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from scenes import assert_same_set, make_features
 
 from gsmerge.kernels.elementary import exp
-from gsmerge.pooling import Members
+from gsmerge.pooling import Members, gaussian_members
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import decode
-from gsmerge.types import FeatureGaussians
+from gsmerge.types import FeatureGaussians, Gaussians
 
 FEW = settings(max_examples=15, deadline=None, derandomize=True)
 seeds = st.integers(0, 2**32 - 1)
@@ -26,7 +26,8 @@ def random_group(rng: np.random.Generator, count: int) -> tuple[FeatureGaussians
         rng.uniform(0.2, 0.9, count), rng.normal(size=(count, 1, 3)) * 0.3, np.zeros((count, 0, 3)),
         np.full(count, 0.02),
     )  # fmt: skip
-    members = Members(*(np.ascontiguousarray(c, np.float32) for c in columns))
+    *values, footprints = (np.ascontiguousarray(c, np.float32) for c in columns)
+    members = gaussian_members(Gaussians(*values), footprints)
     feature = make_features(members.means.mean(0, keepdims=True), sizes=0.02)
     return replace(feature, starts=np.array([0, count]), members=np.arange(count)), members
 

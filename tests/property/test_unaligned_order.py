@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 from sweeps import sweep
 
 from gsmerge import Scene, compact
-from gsmerge.pooling import unaligned_members
+from gsmerge.facts.pixels import with_pixels
+from gsmerge.pooling import scene_members
 from gsmerge.stages.assign import Owners, find_owners, owner_pixels
 from gsmerge.stages.encode import member_rows
 from gsmerge.stages.segment import SegmentOptions, segment
@@ -50,7 +51,7 @@ def test_permuted_gaussians_have_permuted_owners(seed: int, count: int, scene: S
 def test_each_gaussian_is_in_at_most_one_superpixel(count: int) -> None:
     scene = unaligned_scenes.without_order(TURNED)
     owners = find_owners(scene, groups(count))
-    members = unaligned_members(scene, owner_pixels(owners, groups(count)))
+    members = replace(scene_members(with_pixels(scene)), pixels=owner_pixels(owners, groups(count)))
     starts, ids, views = member_rows(scene, members, groups(count))
     assert len(np.unique(ids)) == len(ids)
     assert set(ids) == set(np.flatnonzero(owners.labels >= 0))

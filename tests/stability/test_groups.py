@@ -15,7 +15,7 @@ from gsmerge.geometry import covariances, project, quat_to_rotmat
 from gsmerge.kernels import elementary
 from gsmerge.pooling import feature_to_gaussians, scene_members
 from gsmerge.stages.encode import encode
-from gsmerge.types import FeatureGaussians, Groups, grid_ids
+from gsmerge.types import FeatureGaussians, Groups
 
 compacted = partial(scenes.compacted, poses="fixed")
 
@@ -35,7 +35,7 @@ def changed(scene: Scene, **columns: np.ndarray) -> Scene:
 
 
 def one_group_per_view(scene: Scene) -> FeatureGaussians:
-    labels = np.zeros(scene.valid.shape, np.int32)
+    labels = np.zeros(scene.pixels.shown.shape, np.int32)
     return encode(scene, scene_members(scene), Groups(labels, (1,) * len(scene)))
 
 
@@ -89,8 +89,8 @@ def test_flat_groups_have_a_smallest_scale(small: Scene, axes: list[int]) -> Non
 @pytest.mark.parametrize("size", [2, 3, 4, 16])
 def test_needle_in_a_group(small: Scene, size: int) -> None:
     """Aspect 1e4: the merged Gaussian keeps within three times the group's extent."""
-    pixels = np.arange(small.valid.size).reshape(small.valid.shape)
-    scene = replace(small, pixel_ids=grid_ids(pixels < size))
+    pixels = np.arange(small.pixels.shown.size).reshape(small.pixels.shown.shape)
+    scene = scenes.shown_in(small, pixels < size)
     scales = scene.gaussians.scales.copy()
     scales[0, 0] *= 1e4
     clean, actual = (feature_to_gaussians(one_group_per_view(s)) for s in (scene, changed(scene, scales=scales)))
@@ -122,7 +122,7 @@ def test_oversized_members_cost_less_than_a_decibel(room: Scene) -> None:
 
 @sweep("k", [1, 4])
 def test_transparent_pixels_leave_nothing(room: Scene, k: int) -> None:
-    opacities = room.gaussians.opacities.copy().reshape(room.valid.shape)
+    opacities = room.gaussians.opacities.copy().reshape(room.pixels.shown.shape)
     opacities[0] = 0
     half = replace(changed(room, opacities=opacities.reshape(-1)), images=None)
     whole = {"k": k, "match": "none", "min_contribution": 0}  # nothing is pruned that view 0 hides
@@ -207,7 +207,7 @@ def test_sky_and_foreground_stay_apart(settings: dict) -> None:
     depths = project(actual.means, scene.cameras)[1][0]
     sky_from = 7e5 if settings.get("fit") == "none" else 1e5  # a fit moves what is so far away and so large
     assert ((depths < 3) | (depths > sky_from)).all()
-    far = scenes.trace(sky, scene.cameras)[1].reshape(scene.valid.shape) > 1e5
+    far = scenes.trace(sky, scene.cameras)[1].reshape(scene.pixels.shown.shape) > 1e5
 
     def sky_psnr(gaussians: Gaussians) -> float:
         image = np.clip(scenes.images_of(gaussians, scene.cameras)[0], 0, 1)
@@ -255,7 +255,7 @@ def test_near_and_far_details_are_both_kept() -> None:
     cameras = scenes.arc(3, span=0.004)
     scene = scenes.make_scene(surfaces, cameras)
     actual = compacted(scene, fit_steps=60).gaussians
-    is_near = (scenes.trace(surfaces, cameras)[1] < 1).reshape(scene.valid.shape)
+    is_near = (scenes.trace(surfaces, cameras)[1] < 1).reshape(scene.pixels.shown.shape)
     drawn = [scenes.images_of(gaussians, cameras)[0].clip(0, 1) for gaussians in (actual, scene.gaussians)]
     for part in (is_near, ~is_near):
         inner = part[:, 1:, 1:] & part[:, :-1, :-1] & part[:, 1:, :-1] & part[:, :-1, 1:]

@@ -127,7 +127,7 @@ def test_some_photos_in_another_order_of_channels(room: Scene, odd: list[int], a
     three = subset(room, range(3))
     images = three.images.copy()
     images[odd] = images[odd, ..., ::-1]
-    scene = replace(three, images=images, pixel_ids=three.pixel_ids if aligned else None)
+    scene = replace(three, images=images, pixels=three.pixels if aligned else None)
     with record_run() as record:
         mended = prepare(scene).scene.images
     np.testing.assert_array_equal(mended, three.images)
@@ -140,7 +140,7 @@ def test_a_photo_of_another_white_balance_keeps_its_channels(room: Scene, aligne
     images = room.images.copy()
     images[1] = (images[1] * np.float32([0.5, 1, 1.6])).clip(0, 1)
     with record_run() as record:
-        prepare(replace(room, images=images, pixel_ids=room.pixel_ids if aligned else None))
+        prepare(replace(room, images=images, pixels=room.pixels if aligned else None))
     assert not noted(record.notes, "red", "blue")
 
 
@@ -252,12 +252,7 @@ def test_a_black_photo_under_masks_is_left_out(room: Scene) -> None:
 def test_covered_pixels_without_a_gaussian_get_the_nearest_colour(room: Scene) -> None:
     missing = np.zeros((VIEWS, HEIGHT, WIDTH), bool)
     missing[:, 33:] = True
-    ids = np.where(missing.reshape(-1), -1, room.pixel_ids).astype(np.int32)
-    shown = ~missing.reshape(-1)
-    rows = replace(
-        room.gaussians, sh0=room.gaussians.sh0 * shown[:, None, None], opacities=room.gaussians.opacities * shown
-    )
-    scene = replace(room, gaussians=rows, pixel_ids=ids, missing=missing)
+    scene = scenes.shown_in(room, ~missing)
     mended = prepare(replace(scene, images=band(room.images))).scene.images
     assert mended is not None
     assert np.abs(mended[::2, 33:] - room.images[::2, 33:]).mean() < 0.1

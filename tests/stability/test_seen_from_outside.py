@@ -13,7 +13,7 @@ from sweeps import sweep
 from gsmerge import Gaussians, Scene
 from gsmerge.facts.views import concat_cameras
 from gsmerge.measure.fog import HAZE, measure_fog
-from gsmerge.types import grid_ids
+from gsmerge.types import Pixels
 
 SIZE = (112, 84)
 
@@ -30,7 +30,7 @@ def two_layers() -> Scene:
     behind = replace(g, means=eyes + 1.3 * (g.means - eyes), scales=1.3 * g.scales, opacities=0.5 * g.opacities)
     return Scene(
         Gaussians.concat([g, behind]), concat_cameras(front.cameras, front.cameras), np.concatenate([front.images] * 2),
-        grid_ids(np.ones((4, SIZE[1], SIZE[0]), bool)), scenes.names(4),
+        Pixels.of_grid(np.ones((4, SIZE[1], SIZE[0]), bool)), scenes.names(4),
     )  # fmt: skip
 
 

@@ -153,7 +153,7 @@ def test_empty_sky() -> None:
     """Superpixels without a Gaussian are left out, and their share is spent on the ball."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36))
     near = scene.gaussians.means[:, 2] < 3.3
-    masks = near.reshape(scene.valid.shape)  # or the sky would be filled
+    masks = near.reshape(scene.pixels.shown.shape)  # or the sky would be filled
     ball = replace(unaligned_scenes.without_order(scene), gaussians=scene.gaussians[near], masks=masks)
     result = compacted(ball, fit="none")
     assert (result.gaussians.means[:, 2] < 3.3).all()

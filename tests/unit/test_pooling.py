@@ -6,7 +6,7 @@ import scenes
 
 from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import exp, log, log1p
-from gsmerge.pooling import Members, pool_members, principal_axes, scene_members, to_gaussians
+from gsmerge.pooling import Members, gaussian_members, pool_members, principal_axes, scene_members, to_gaussians
 from gsmerge.types import Gaussians
 
 
@@ -17,7 +17,8 @@ def members(count: int, seed: int = 0, coefficients: int = 1, opacity: float | N
         np.full(count, opacity) if opacity else rng.uniform(0.2, 0.9, count), rng.normal(size=(count, 1, 3)),
         rng.normal(size=(count, coefficients - 1, 3)), np.full(count, 0.05),
     )  # fmt: skip
-    return Members(*(np.ascontiguousarray(c, np.float32) for c in columns))
+    *values, footprints = (np.ascontiguousarray(c, np.float32) for c in columns)
+    return gaussian_members(Gaussians(*values), footprints)
 
 
 def merged(of: Members) -> Gaussians:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, Scene, as_array, as_tensor, grid_ids, like
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, Pixels, Scene, as_array, as_tensor, like
 
 
 def gaussians(n: int, coefficients: int = 0, start: int = 0) -> Gaussians:
@@ -149,28 +149,38 @@ def test_wrong_cameras_are_refused(change: dict, named: tuple[object, ...]) -> N
 
 def scene() -> Scene:
     images, valid = np.zeros((2, 3, 4, 3), np.float32), np.ones((2, 3, 4), bool)
-    return Scene(gaussians(24), cameras(), images, grid_ids(valid), ("a", "b"))
+    return Scene(gaussians(24), cameras(), images, Pixels.of_grid(valid), ("a", "b"))
 
 
-def test_what_the_file_has() -> None:
-    assert scene().num_missing == 0
-    assert len(scene().file_gaussians) == scene().num_gaussians == 24
-    missing = np.zeros((2, 3, 4), bool)
-    missing[1, 2, 3] = missing[0, 0, 1] = True
-    some = replace(scene(), missing=missing)
-    assert (some.num_missing, some.num_gaussians, int(some.stored.sum())) == (2, 22, 22)
-    kept = np.r_[0, 2:23]
-    assert np.array_equal(some.file_gaussians.means, gaussians(24).means[kept])
+def test_pixels_of_a_grid_with_gaps() -> None:
+    shown = np.ones((2, 3, 4), bool)
+    shown[1, 2, 3] = shown[0, 0, 1] = False
+    pixels = Pixels.of_grid(shown)
+    assert pixels.homes.tolist() == np.flatnonzero(shown).tolist()
+    assert np.array_equal(pixels.shown, shown)
+    assert np.array_equal(pixels.homes[pixels.fronts[shown]], np.flatnonzero(shown))
+    assert scene().covered is None
+    assert np.array_equal(replace(scene(), gaussians=gaussians(22), pixels=pixels).covered, shown)
 
 
-@pytest.mark.parametrize("missing", [None, np.zeros((2, 3, 4), bool)])
-def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None, torch: Any) -> None:
-    given = replace(scene(), missing=missing)
+@pytest.mark.parametrize("views", [[0], [1], [1, 0], [0, 0, 1]], ids=str)
+def test_pixels_of_some_views(views: list[int]) -> None:
+    shown = np.random.default_rng(0).random((2, 3, 4)) < 0.7
+    pixels = Pixels.of_grid(shown)
+    order = np.random.default_rng(1).permutation(len(pixels.homes))
+    for whole in (pixels, Pixels(pixels.homes[order], np.where(shown, np.argsort(order)[pixels.fronts], -1), own=True)):
+        rows, part = whole.select(views)
+        assert np.array_equal(part.shown, shown[views])
+        assert np.array_equal(rows[part.fronts[part.shown]], whole.fronts[views][part.shown])
+        assert np.array_equal(part.homes % 12, whole.homes[rows] % 12)
+        assert np.array_equal(np.asarray(views)[part.homes // 12], whole.homes[rows] // 12)
+
+
+def test_scenes_of_tensors_become_such_of_arrays(torch: Any) -> None:
+    given = scene()
     assert isinstance(given.numpy().gaussians.means, np.ndarray)
     changed = {"gaussians": given.gaussians.to("cpu"), "cameras": given.cameras.to("cpu")}
-    changed |= {name: as_tensor(getattr(given, name)) for name in ("images", "pixel_ids")}
-    if missing is not None:
-        changed["missing"] = as_tensor(missing)
+    changed |= {name: as_tensor(getattr(given, name)) for name in ("images",)}
     unaligned = Scene(changed["gaussians"], changed["cameras"], changed["images"], None, given.names)
     for tensors in (
         replace(given, **changed),
@@ -183,7 +193,7 @@ def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None, tor
         assert arrays.names == given.names
         for one in (*vars(arrays.gaussians).values(), arrays.cameras.viewmats, arrays.cameras.Ks):
             assert isinstance(one, np.ndarray)
-        for name in ("images", "pixel_ids", "missing"):
+        for name in ("images",):
             one, other = getattr(arrays, name, None), getattr(tensors, name, None)
             assert (one is None) == (other is None)
             assert one is None or (isinstance(one, np.ndarray) and np.array_equal(one, getattr(given, name)))
@@ -192,11 +202,11 @@ def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None, tor
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"gaussians": gaussians(23)}, ("", "2 x 3 x 4", 23)),
-        ({"pixel_ids": np.ones((2, 4), int)}, ("pixel_ids", [24], [2, 4])),
+        ({"gaussians": gaussians(23)}, ("homes", [23], [24])),
+        ({"pixels": Pixels.of_grid(np.ones((1, 6, 4)))}, ("fronts", [2, 3, 4], [1, 6, 4])),
         ({"images": np.zeros((2, 3, 4, 4))}, ("images", [2, 3, 4, 3], [2, 3, 4, 4])),
         ({"names": ("a",)}, ("", 2, "names", 1)),
-        ({"missing": np.ones((2, 4, 3), bool)}, ("missing", [2, 3, 4], [2, 4, 3])),
+        ({"masks": np.ones((2, 4, 3), bool)}, ("masks", [2, 3, 4], [2, 4, 3])),
     ],
 )
 def test_wrong_scenes_are_refused(change: dict, named: tuple[object, ...]) -> None:

@@ -102,7 +102,7 @@ def test_transparent_pixels_and_single_views_say_nothing() -> None:
     assert cross_view_stats(g.means[:0], g.sh0[:0], views[:0], members, scene.cameras).shape == (0, 7)
 
 
-def random_sums(num: int, pixels: int, first: int = 0, last: int | None = None) -> np.ndarray:
+def random_sums(num: int, pixels: int, first: int = 0, last: int | None = None, more: int = 0) -> np.ndarray:
     """What three views of 6 x 4 pixels say of random points, some of them no numbers."""
     rng = np.random.default_rng(0)
     points, means = rng.normal(size=(num, 3)), rng.normal(size=(pixels, 3)).astype(np.float32)
@@ -113,10 +113,10 @@ def random_sums(num: int, pixels: int, first: int = 0, last: int | None = None) 
     colors, sh0 = (rng.normal(size=shape).astype(np.float32) for shape in ((num, 3), (pixels, 1, 3)))
     opacities, own = rng.uniform(0, 1, pixels).astype(np.float32), rng.integers(-1, 3, num)
     asked = np.array([[1, 2], [0, 2], [0, 1]], np.int32)
-    out = np.zeros((num, 6))
+    out, fronts = np.zeros((num, 6)), more + np.arange(72, dtype=np.int32).reshape(3, 4, 6)
     last = num if last is None else last
     sum_cross_view(
-        points, colors, own, asked, viewmats, Ks, 6, 4, None, means, opacities, sh0, 0.3, 0.5, 2.0, 0.1, first, last,
+        points, colors, own, asked, viewmats, Ks, 6, 4, fronts, means, opacities, sh0, 0.3, 0.5, 2.0, 0.1, first, last,
         out,
     )  # fmt: skip
     return out
@@ -130,6 +130,6 @@ def test_the_bits_are_the_same_on_every_processor(each_target) -> None:  # type:
 
 def test_pixels_and_points_outside_are_refused() -> None:
     assert random_sums(0, 72).shape == (0, 6)
-    for arguments in ((5, 71), (5, 72, 0, 6), (5, 72, -1, 5)):
+    for arguments in ((500, 72, 0, 500, 1), (5, 72, 0, 6), (5, 72, -1, 5)):
         with pytest.raises(ValueError, match="sum_cross_view: "):
             random_sums(*arguments)

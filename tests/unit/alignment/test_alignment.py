@@ -53,7 +53,7 @@ def test_without_pixels_the_photos_tell(tmp_path: Path, true: tuple[str, str]) -
     folder = some_rows(SMOOTH).save(tmp_path / "scene")
     rewrite_poses(folder, SMOOTH, true)
     loaded = load_scene(folder)
-    assert not loaded.scene.aligned
+    assert not loaded.scene.has_own_pixels
     assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
     assert noted(loaded.notes, *true)
 
@@ -107,7 +107,7 @@ def test_rows_without_finite_positions_are_not_looked_at(tmp_path: Path, tiny: T
     start = data.index(b"end_header\n") + 11
     data[start + 5 * 68 : start + 5 * 68 + 4] = np.float32(np.nan).tobytes()
     (folder / "scene.ply").write_bytes(data)
-    assert load_scene(folder, order="view-major").pixel_scene().valid.sum() == 839
+    assert load_scene(folder, order="view-major").pixel_scene().pixels.shown.sum() == 839
 
 
 def test_poses_that_fit_in_no_reading(tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ def save_with(tiny: Tiny, folder: Path, viewmats: np.ndarray) -> Path:
 @pytest.mark.slow
 def test_a_file_whose_cameras_are_off_is_read_with_a_note(large: Tiny, tmp_path: Path) -> None:
     load = load_scene(save_with(large, tmp_path / "scene", off(large, 0.7, 0.02)))
-    assert load.scene.aligned
+    assert load.scene.has_own_pixels
     assert pose_changes(large.w2c, load.scene.cameras.viewmats)[0].max() < 0.05
     assert sum(names(note, "cameras", "median") for note in load.notes) == 1
     assert len(load.moves) == 3

@@ -34,7 +34,7 @@ def test_dropped_pixels(tmp_path: Path, nested: float, dropped: float | str, siz
     assert loaded.recovery.best.layout.kind == "pruned"
     assert loaded.recovery.best.frame.scale == pytest.approx(1 / nested, rel=2e-3)
     scene = loaded.pixel_scene()
-    actual = np.flatnonzero(scene.stored.reshape(-1))
+    actual = np.flatnonzero(scene.pixels.shown.reshape(-1))
     assert len(np.setxor1d(actual, kept)) < 0.01 * len(kept)
     same = np.intersect1d(actual, kept)
     right = np.abs((scene.gaussians.opacities - tiny.gaussians.opacities)[same]) < 1e-5
@@ -101,6 +101,6 @@ def test_a_scale_that_cannot_be_measured_is_not_guessed(tmp_path: Path) -> None:
     c2w[:, :3, 3] *= 1.5
     kept = np.flatnonzero(rng.random(len(means)) > 0.4)
     folder = save_export(tmp_path, replace(tiny, c2w=c2w), export_rows(tiny, kept))
-    assert not load_scene(folder).scene.aligned
+    assert not load_scene(folder).scene.has_own_pixels
     with refuses(SceneError, "scene.ply", "--hint order=view-major"):
         load_scene(folder, order="view-major")

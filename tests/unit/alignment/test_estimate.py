@@ -60,7 +60,7 @@ def test_cameras_and_pixels_from_photos(tmp_path: Path, fy: float) -> None:
     assert any("from the Gaussians' own order" in note for note in loaded.notes)
     assert not any("resized" in note for note in loaded.notes)  # photos have the grid's size
     assert [exporter.name for exporter in loaded.exporters] == ["da3"]
-    assert loaded.scene.num_missing == tiny.depths.size - len(kept)
+    assert int((~loaded.scene.pixels.shown).sum()) == tiny.depths.size - len(kept)
 
 
 @pytest.mark.slow

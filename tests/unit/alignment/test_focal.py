@@ -100,7 +100,7 @@ def test_photos_show_it_where_rows_are_no_pixels(tmp_path: Path, views: int, K: 
     rows = export_rows(tiny, order[: int(0.7 * len(order))], rest=72)
     one = replace(tiny, names=tiny.names[:views], c2w=tiny.c2w[:views], images=images[:views])
     loaded = load_scene(write(tmp_path, one, rows, frame_list))
-    assert not loaded.scene.aligned
+    assert not loaded.scene.has_own_pixels
     np.testing.assert_allclose(loaded.scene.cameras.Ks[0], K, rtol=0.02, atol=0.1)
     assert noted(loaded.notes, "intrinsics", "colours")
 

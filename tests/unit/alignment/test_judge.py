@@ -127,5 +127,5 @@ def test_a_plain_file_is_not_searched(tmp_path: Path, monkeypatch: pytest.Monkey
     )
     for number, (scene, rows, hints) in enumerate(doubtful, 1):
         loaded = load_scene(save(tmp_path / str(number), scene, rows, tiny.images), **hints)
-        assert loaded.scene.aligned
+        assert loaded.scene.has_own_pixels
         assert len(searched) == number

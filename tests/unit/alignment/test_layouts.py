@@ -149,7 +149,7 @@ def test_borders_of_any_width(tmp_path: Path, trim: int) -> None:
     loaded = load_scene(save_export(tmp_path, tiny, rows))
     assert loaded.recovery.best.layout.description.startswith(f"{trim} pixels trimmed")
     assert loaded.recovery.best.frame.kind == "first"
-    assert np.array_equal(np.flatnonzero(loaded.pixel_scene().stored.reshape(-1)), trimmed(tiny, trim))
+    assert np.array_equal(np.flatnonzero(loaded.pixel_scene().pixels.shown.reshape(-1)), trimmed(tiny, trim))
 
 
 def test_a_resize_that_looks_like_a_trim(tmp_path: Path) -> None:
@@ -170,8 +170,8 @@ def test_a_trimmed_grid_of_another_size(tmp_path: Path) -> None:
     write_photos(tmp_path, SMOOTH, photos)
     write_cameras(tmp_path, SMOOTH, K, (96, 72))
     scene = load_scene(tmp_path).pixel_scene()
-    assert scene.valid.shape == (3, 36, 48)
-    assert int(scene.valid.sum()) == grid.size
+    assert scene.pixels.shown.shape == (3, 36, 48)
+    assert int(scene.pixels.shown.sum()) == grid.size
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_dropped_pixels_of_a_patched_grid(tmp_path: Path) -> None:
     write_photos(tmp_path, tiny, photos)
     write_cameras(tmp_path, tiny, K, (1008, 56))
     loaded = load_scene(tmp_path)
-    assert loaded.scene.aligned
+    assert loaded.scene.has_own_pixels
     assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == (504, 28)
     assert noted(loaded.notes, "resized", "504 x 28")
 

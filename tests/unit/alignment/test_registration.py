@@ -21,7 +21,7 @@ from gsmerge.errors import SceneError
 from gsmerge.facts.views import subset
 from gsmerge.geometry import Similarity, camera_centres
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, make_scene
-from gsmerge.types import grid_ids
+from gsmerge.types import Pixels
 
 VIEWS, WIDTH, HEIGHT = 6, 144, 96
 SCALES = (1.1, 0.8, 1.25, 0.93, 1.0, 0.87)
@@ -33,7 +33,7 @@ def made_scene(seed: int, views: int = VIEWS) -> Scene:
     ranges = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))
     options = GenerateOptions(views=views, width=WIDTH, height=HEIGHT, ranges=ranges)
     made = make_scene(seed, 0, options)
-    ids = grid_ids(np.ones((views, HEIGHT, WIDTH), bool))
+    ids = Pixels.of_grid(np.ones((views, HEIGHT, WIDTH), bool))
     return Scene(made.gaussians, made.cameras, np.stack(made.images), ids, tuple("abcdef"[:views]))
 
 
@@ -127,7 +127,7 @@ def test_opencv_is_left_as_it_was(parts: list[Scene]) -> None:
 
 
 def test_files_that_cannot_be_joined(parts: list[Scene]) -> None:
-    unaligned = replace(parts[1], pixel_ids=None)
+    unaligned = replace(parts[1], pixels=None)
     with refuses(SceneError, "b.ply", "-o"):
         join_scenes([parts[0], unaligned], PATHS[:2])
     small = replace(parts[1].cameras, width=HEIGHT, height=WIDTH)

@@ -51,7 +51,7 @@ def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(match, "read_views", lambda *args: tried.append(args))
     rows = turned(padded(voxels()), SMOOTH.w2c[0, :3, :3])
     loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
-    assert not loaded.scene.aligned
+    assert not loaded.scene.has_own_pixels
     assert not tried
     assert "the cameras are rotated into the first camera, as the photos' colours show" in loaded.notes
     assert any("Gaussians that only fill the file up are left out" in note for note in loaded.notes)
@@ -66,7 +66,7 @@ def test_voxels_in_the_first_camera_at_any_scale(tmp_path: Path, scale: float) -
     rows = turned(voxels(), first[:3, :3], scale=scale, shift=scale * first[:3, 3])
     rows["opacity"] = 1 / (1 + elementary.exp(-rows["opacity"]))
     loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
-    assert not loaded.scene.aligned
+    assert not loaded.scene.has_own_pixels
     assert any("moved into the first camera" in note for note in loaded.notes)
     assert np.allclose(loaded.scene.cameras.viewmats[0], np.eye(4), atol=1e-6)
     centres = (SMOOTH.c2w[:, :3, 3] - SMOOTH.c2w[0, :3, 3]) @ SMOOTH.c2w[0, :3, :3]

@@ -69,7 +69,7 @@ def test_far_pixels_dropped_before_the_world_was_turned(tmp_path: Path, textured
     loaded = load_scene(save_export(tmp_path, textured, rows))
     scene = loaded.pixel_scene()
     check_centres(loaded, centres, scale)
-    wrong = np.setxor1d(np.flatnonzero(scene.stored.reshape(-1)), kept)
+    wrong = np.setxor1d(np.flatnonzero(scene.pixels.shown.reshape(-1)), kept)
     assert len(wrong) <= 0.02 * len(kept)
     assert loaded.recovery.best.frame.kind == "upright"
     assert "mvsplat" in [exporter.name for exporter in loaded.exporters]

@@ -163,7 +163,7 @@ def test_more_blocks_than_views(scene: Scene) -> None:
 
 
 def test_unaligned_scenes_have_no_blocks(scene: Scene) -> None:
-    unaligned = replace(scene, pixel_ids=None)
+    unaligned = replace(scene, pixels=None)
     assert count_blocks(unaligned) == 1
     with refuses(UsageError, "blocks 2", "Gaussian"):
         compact(unaligned, blocks=2)
@@ -191,7 +191,7 @@ def test_views_of_blocks_are_joined(scene: Scene, monkeypatch: pytest.MonkeyPatc
     masks = np.random.default_rng(0).random((len(scene), 18, 24)) < 0.9
     chosen = [([6, 1], None), ([3], masks)]
     bare = [
-        PicturedScene.of(replace(scene, gaussians=scene.gaussians[:0], pixel_ids=None), scene.images, mask)
+        PicturedScene.of(replace(scene, gaussians=scene.gaussians[:0], pixels=None), scene.images, mask)
         for _, mask in chosen
     ]
     for size in (1, 1 << 40):

@@ -112,7 +112,7 @@ def test_left_out_views_leave_neither_photos_nor_rows(room: Scene) -> None:
 
 
 def test_nothing_is_said_of_rows_without_pixels_nor_of_many(room: Scene) -> None:
-    rows = replace(room, pixel_ids=None)
+    rows = replace(room, pixels=None)
     assert compact(rows, **QUICK, budget="2%").report.new_views is None
     settings = QUICK | {"budget": int((MOST_SHARE + 0.01) * room.num_gaussians)}
     assert compact(room, **settings).report.new_views is None
@@ -130,7 +130,7 @@ def test_what_only_left_out_views_show_does_not_count() -> None:
         scene,
         gaussians=Gaussians.concat([wall, behind]),
         cameras=replace(scene.cameras, viewmats=viewmats),
-        pixel_ids=None,
+        pixels=None,
     )
     rest = subset(pictured(both), [0, 1])
     assert cover(rest, subset(pictured(both), [2])).mean() > 0.9
@@ -148,7 +148,6 @@ def test_small_scenes_keep_places_and_what_they_show(room: Scene) -> None:
     assert small.images.mean() == pytest.approx(scene.images.mean(), abs=0.01)
     places, large = (each.gaussians.means.reshape(5, *size, 3) for each, size in ((small, (9, 12)), (scene, (36, 48))))
     assert (places == large[:, 2::4, 2::4]).all()
-    assert shrink_scene(replace(scene, pixel_ids=None), 4).gaussians is scene.gaussians
 
 
 @pytest.mark.parametrize("scores", [(17.25, 21.5, 3.0, 5.5), (-1.5, 0.0, 0.2, 2.75), (30.12, 29.99, -1.4, 1.1)])

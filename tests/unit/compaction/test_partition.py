@@ -121,7 +121,7 @@ def test_hidden_points_are_not_seen() -> None:
 
 def test_points_belong_to_the_nearest_view_that_sees_them(two_sides: Scene) -> None:
     covisibility = measure_covisibility(two_sides)
-    centre = two_sides.valid.reshape(6, 36, 48)[0, 12:24, 16:32]
+    centre = two_sides.pixels.shown.reshape(6, 36, 48)[0, 12:24, 16:32]
     assert centre.all()
     means = two_sides.gaussians.means.reshape(6, 36, 48, 3)
     views = list(range(6))

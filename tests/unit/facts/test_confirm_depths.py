@@ -14,7 +14,6 @@ from gsmerge import Cameras, Scene
 from gsmerge.facts.confirm_depths import FEWEST, MOST, PIXELS, REACH, SAME, Agreement, confirm_depths
 from gsmerge.kernels.elementary import log
 from gsmerge.runtime.threads import use_threads
-from gsmerge.types import grid_ids
 
 VIEWS, WIDTH, HEIGHT = 4, 48, 36
 
@@ -112,18 +111,18 @@ def test_shares_are_those_of_a_plain_loop(spoilt: list[int], wall: Scene) -> Non
 
 
 def test_pixels_without_a_gaussian_do_not_count(wall: Scene) -> None:
-    valid = wall.valid.copy()
+    valid = wall.pixels.shown.copy()
     valid[:, :, WIDTH // 2 :] = False
-    half = replace(with_nearer_half(wall, [0, 1, 2, 3]), pixel_ids=grid_ids(valid))
+    half = scenes.shown_in(with_nearer_half(wall, [0, 1, 2, 3]), valid)
     assert confirm_depths(half).contradicted < 0.02
-    assert confirm_depths(replace(wall, pixel_ids=grid_ids(np.zeros_like(wall.valid)))) is None
+    assert confirm_depths(scenes.shown_in(wall, np.zeros_like(wall.pixels.shown))) is None
 
 
 def test_scenes_in_which_nothing_can_be_compared_have_none(wall: Scene) -> None:
     assert confirm_depths(scenes.take_views(wall, [0])) is None
     assert confirm_depths(unaligned_scenes.without_order(wall)) is None
     none = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
-    assert confirm_depths(Scene(wall.gaussians[:0], none, None, grid_ids(np.empty((0, 1, 1), bool)), ())) is None
+    assert confirm_depths(Scene(wall.gaussians[:0], none, None, None, ())) is None
 
 
 def test_threads_change_nothing(wall: Scene) -> None:

@@ -13,7 +13,6 @@ import scenes
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.facts.holes import LARGE, RIM, large_parts
 from gsmerge.facts.prepare import prepare
-from gsmerge.types import grid_ids
 
 WIDTH, HEIGHT, THIRD = 96, 72, 24
 AROUND = 6  # pixels beside an object into which few Gaussians reach
@@ -27,13 +26,11 @@ def room() -> Scene:
 
 def keep(scene: Scene, valid: np.ndarray) -> Scene:
     """The scene without the rows of some pixels."""
-    opacities = np.where(valid.reshape(-1), scene.gaussians.opacities, np.float32(0))
-    gaussians = replace(scene.gaussians, opacities=opacities)
-    return replace(scene, gaussians=gaussians, pixel_ids=grid_ids(valid), missing=~valid)
+    return scenes.shown_in(scene, valid)
 
 
 def without_top(scene: Scene) -> Scene:
-    valid = scene.valid.copy()
+    valid = scene.pixels.shown.copy()
     valid[:, :THIRD] = False
     return keep(scene, valid)
 
@@ -41,7 +38,7 @@ def without_top(scene: Scene) -> Scene:
 def ball_alone(scene: Scene) -> Scene:
     """The Gaussians of the ball without pixels, beside photos of the whole room."""
     near = np.linalg.norm(scene.gaussians.means - np.array([0.2, 0.1, 2.6]), axis=1) < 0.55
-    return replace(scene, gaussians=scene.gaussians[np.flatnonzero(near)], pixel_ids=None)
+    return replace(scene, gaussians=scene.gaussians[np.flatnonzero(near)], pixels=None)
 
 
 def alphas(gaussians: Gaussians, scene: Scene) -> np.ndarray:
@@ -52,7 +49,7 @@ def compared(scene: Scene, **settings: Any) -> tuple[np.ndarray, np.ndarray, lis
     """What the input and its result cover, and the notes that name the setting."""
     result = compact(scene, **FIT, **settings)
     notes = [note for note in result.report.notes if "--set extent=photos" in note]
-    return alphas(scene.finite_gaussians, scene), alphas(result.gaussians, scene), notes
+    return alphas(scene.gaussians, scene), alphas(result.gaussians, scene), notes
 
 
 def test_a_part_without_rows_stays_empty(room: Scene) -> None:
@@ -67,8 +64,8 @@ def test_a_part_without_rows_stays_empty(room: Scene) -> None:
 def test_thin_rows_are_not_taken_for_empty_parts(room: Scene) -> None:
     """Rows of which a ray meets a sixth show the whole room; without those of the top they show all but the top."""
     for scene, count in ((room, 0), (without_top(room), 1)):
-        faint = replace(scene.gaussians, opacities=0.02 * scene.gaussians.opacities)[np.flatnonzero(scene.valid)]
-        _, _, notes = compared(replace(scene, gaussians=faint, pixel_ids=None, missing=None))
+        faint = replace(scene.gaussians, opacities=0.02 * scene.gaussians.opacities)
+        _, _, notes = compared(replace(scene, gaussians=faint, pixels=None))
         assert len(notes) == count
 
 
@@ -79,7 +76,7 @@ def test_photos_fill_it_where_it_is_asked_for(room: Scene) -> None:
 
 
 def test_borders_and_small_holes_are_filled(room: Scene) -> None:
-    valid = np.zeros_like(room.valid)
+    valid = np.zeros_like(room.pixels.shown)
     valid[:, 3:-3, 3:-3] = True
     valid[:, 30:35, 40:45] = False
     _, after, notes = compared(keep(room, valid))

@@ -7,18 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
 from exports import da3_rows, export_rows, save_export, smooth_scene
 from messages import noted
 
 from gsmerge import compact
 from gsmerge.facts.holes import fill_holes
+from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.prepare import prepare
 from gsmerge.geometry import camera_depths, rgb_to_sh0
 from gsmerge.kernels import elementary
 from gsmerge.raster import render
 from gsmerge.runtime.record import record_run
 from gsmerge.scene.read import load_scene
-from gsmerge.types import Cameras, Gaussians, PicturedScene, grid_ids
+from gsmerge.types import Cameras, Gaussians, PicturedScene, Pixels
 
 WIDTH, HEIGHT, NEAR, FAR, FLOOR = 96, 64, 3.0, 6.0, 24
 K = np.array([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]])
@@ -45,18 +47,23 @@ def scene_of(*, moved: float = 0.5, floor: int = FLOOR) -> PicturedScene:
         means=np.concatenate(means).astype(np.float32),
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
         scales=np.full((count, 3), 0.03, np.float32),
-        opacities=np.where(kept.reshape(-1), np.float32(0.9), np.float32(0)),
+        opacities=np.full(count, 0.9, np.float32),
         sh0=rgb_to_sh0(photos.reshape(-1, 1, 3)),
         shN=np.zeros((count, 0, 3), np.float32),
     )
     cameras = Cameras(viewmats, np.tile(K, (3, 1, 1)), WIDTH, HEIGHT)
-    return PicturedScene(gaussians, cameras, photos, grid_ids(kept), ("a", "b", "c"), ~kept)
+    return PicturedScene(gaussians[kept.reshape(-1)], cameras, photos, Pixels.of_grid(kept), ("a", "b", "c"))
 
 
 def without_pixels(scene: PicturedScene) -> PicturedScene:
     """The same rows, those that are there, in no order."""
-    rows = np.random.default_rng(0).permutation(np.flatnonzero(scene.valid))
-    return replace(scene, gaussians=scene.gaussians[rows], pixel_ids=None, missing=None)
+    rows = np.random.default_rng(0).permutation(len(scene.gaussians))
+    return with_pixels(replace(scene, gaussians=scene.gaussians[rows], pixels=None))
+
+
+def new_in(filled: PicturedScene, scene: PicturedScene) -> np.ndarray:
+    """Mask ``[v,h,w]`` of the pixels that showed nothing before."""
+    return filled.pixels.shown & ~scene.pixels.shown
 
 
 def filled_everywhere(scene: PicturedScene) -> PicturedScene:
@@ -66,30 +73,31 @@ def filled_everywhere(scene: PicturedScene) -> PicturedScene:
 
 def depths_of(scene: PicturedScene) -> np.ndarray:
     """Depth of each pixel's Gaussian ``[v,h,w]``."""
-    means = scene.gaussians.means.reshape(*scene.valid.shape, 3)
+    means = scene.gaussians.means[scene.pixels.fronts]
     return np.stack([camera_depths(*pair) for pair in zip(means, scene.cameras.viewmats[:, None, None], strict=True)])
 
 
 def test_far_pixels_lie_where_the_photos_agree() -> None:
     filled = filled_everywhere(scene_of())
     far = (slice(None), slice(6, FLOOR - 6), slice(10, -10))
-    assert filled.valid[far].all()
+    assert filled.pixels.shown[far].all()
     assert (np.abs(np.log(depths_of(filled)[far] / FAR)) < 0.1).mean() > 0.9
 
 
-def test_rows_stay_and_missing_stays() -> None:
+def test_rows_stay_and_what_fills_is_known() -> None:
     scene = scene_of()
-    filled = filled_everywhere(scene)
-    assert np.array_equal(filled.missing, scene.missing)
-    assert np.array_equal(filled.stored, scene.valid)
-    kept = scene.valid.reshape(-1)
-    assert all(np.array_equal(values[kept], getattr(scene.gaussians, name)[kept])
+    filled, count = filled_everywhere(scene), len(scene.gaussians)
+    assert all(np.array_equal(values[:count], getattr(scene.gaussians, name))
                for name, values in vars(filled.gaussians).items())  # fmt: skip
+    assert np.array_equal(filled.filled, np.arange(len(filled.gaussians)) >= count)
+    new = new_in(filled, scene)
+    assert np.array_equal(np.sort(filled.pixels.homes[count:]), np.flatnonzero(new))
+    assert np.array_equal(filled.pixels.fronts[~new], scene.pixels.fronts[~new])
 
 
 def test_without_parallax_far_pixels_are_beside_the_others() -> None:
     filled = filled_everywhere(scene_of(moved=0.0))
-    new = filled.valid & filled.missing
+    new = new_in(filled, scene_of())
     assert new[:, :FLOOR].any()
     assert np.allclose(depths_of(filled)[new], NEAR, rtol=1e-3)
 
@@ -97,12 +105,13 @@ def test_without_parallax_far_pixels_are_beside_the_others() -> None:
 def test_holes_between_rows_have_the_depth_beside_them() -> None:
     """Squares missing from the near wall: the photos do not speak for another depth."""
     scene = scene_of()
-    kept = scene.valid.copy()
+    kept = scene.pixels.shown.copy()
     kept[:, 40:48, 12:-12] = False
-    opacities = np.where(kept.reshape(-1), scene.gaussians.opacities, 0)
-    holed = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities), pixel_ids=grid_ids(kept))
-    filled = filled_everywhere(holed)
-    inner = (slice(None), slice(42, 46), slice(20, -20))
+    filled = filled_everywhere(scenes.shown_in(scene, kept))
+    inner = np.zeros_like(kept)
+    inner[:, 42:46, 20:-20] = True
+    inner &= filled.pixels.shown
+    assert inner.sum() > 100
     assert (np.abs(np.log(depths_of(filled)[inner] / NEAR)) < 0.02).mean() > 0.95
 
 
@@ -128,19 +137,18 @@ def test_a_part_of_what_the_photos_show_stays_one() -> None:
 
 def test_only_pixels_that_are_shown_are_filled() -> None:
     scene = scene_of()
-    shown = np.zeros_like(scene.valid)
+    shown = np.zeros_like(scene.pixels.shown)
     shown[1, 4:12] = True
-    new = fill_holes(scene, shown, everywhere=True).valid & scene.missing
+    new = new_in(fill_holes(scene, shown, everywhere=True), scene)
     assert new.any()
     assert not (new & ~shown).any()
 
 
 def test_nothing_is_added_where_everything_is_covered() -> None:
     scene = scene_of()
-    rows = replace(scene.gaussians, opacities=np.full_like(scene.gaussians.opacities, 0.9))
-    full = replace(scene, gaussians=rows, pixel_ids=grid_ids(np.ones_like(scene.valid)), missing=None)
+    full = replace(filled_everywhere(scene), filled=None)
     assert filled_everywhere(full) is full
-    unordered = replace(full, pixel_ids=None)
+    unordered = without_pixels(full)
     assert filled_everywhere(unordered) is unordered
 
 
@@ -149,7 +157,7 @@ def test_views_that_show_no_gaussian_stay_empty() -> None:
     viewmats = scene.cameras.viewmats.copy()
     viewmats[2, :3, :3] = np.diag([-1, 1, -1])  # looks away
     turned = replace(scene, cameras=replace(scene.cameras, viewmats=viewmats))
-    assert not (filled_everywhere(turned).valid & scene.missing)[2].any()
+    assert not new_in(filled_everywhere(turned), scene)[2].any()
 
 
 @pytest.mark.parametrize("photos", [True, False])
@@ -159,13 +167,13 @@ def test_dropped_pixels_are_filled_with_cameras(tmp_path: Path, photos: bool) ->
     folder = save_export(tmp_path, tiny, export_rows(tiny, da3_rows(tiny)))
     loaded = load_scene(folder).pixel_scene()
     scene = loaded if photos else replace(loaded, images=None)
-    assert np.array_equal(np.flatnonzero(scene.valid.reshape(-1)), da3_rows(tiny))
+    assert np.array_equal(np.flatnonzero(scene.pixels.shown.reshape(-1)), da3_rows(tiny))
     with record_run() as record:
         prepared = prepare(scene)
     assert noted(record.notes, "pixels that Gaussians hardly cover")
     alphas = render(prepared.scene.gaussians, prepared.scene.cameras).alphas
     assert (alphas > 0.5).mean() > 0.99
-    assert np.array_equal(prepared.input_scene.valid, scene.valid)
+    assert np.array_equal(prepared.input_scene.pixels.shown, scene.pixels.shown)
 
 
 def test_views_whose_photos_do_not_show_the_scene_stay_empty() -> None:
@@ -174,7 +182,7 @@ def test_views_whose_photos_do_not_show_the_scene_stay_empty() -> None:
     images[1] = np.random.default_rng(0).random(images[1].shape)
     prepared = prepare(replace(scene, images=images))
     assert prepared.reference.score_views == (0, 2)
-    assert (prepared.scene.valid & scene.missing).any((1, 2)).tolist() == [True, False, True]
+    assert new_in(prepared.scene, scene).any((1, 2)).tolist() == [True, False, True]
 
 
 def test_shares_of_a_budget_are_of_the_file() -> None:

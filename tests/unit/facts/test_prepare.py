@@ -13,7 +13,6 @@ from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.frame import canonicalise, scene_frame
 from gsmerge.geometry import project
 from gsmerge.raster.photos import scene_pictures
-from gsmerge.types import grid_ids
 
 
 @pytest.fixture(scope="module")
@@ -57,19 +56,18 @@ def test_projections_do_not_change(scene: Scene) -> None:
 
 
 def test_flyaways_and_invalid_rows_do_not_move_the_frame(scene: Scene) -> None:
-    means, valid = scene.gaussians.means.copy(), scene.valid.copy()
+    means, valid = scene.gaussians.means.copy(), scene.pixels.shown.copy()
     means[::100] = 1e8
-    means[50::100] = 0
     valid.reshape(-1)[50::100] = False
-    frame = scene_frame(replace(scene, gaussians=replace(scene.gaussians, means=means), pixel_ids=grid_ids(valid)))
+    frame = scene_frame(scenes.shown_in(replace(scene, gaussians=replace(scene.gaussians, means=means)), valid))
     assert frame.unit == scene_frame(scene).unit
     assert np.abs(frame.origin - scene_frame(scene).origin).max() < 0.3
 
 
 def test_one_valid_row(scene: Scene) -> None:
-    mask = np.zeros_like(scene.valid)
+    mask = np.zeros_like(scene.pixels.shown)
     mask.reshape(-1)[7] = True
-    frame = scene_frame(replace(scene, pixel_ids=grid_ids(mask)))
+    frame = scene_frame(scenes.shown_in(scene, mask))
     assert np.allclose(frame.origin, scene.gaussians.means[7])
     assert frame.unit > 0
 
@@ -77,15 +75,15 @@ def test_one_valid_row(scene: Scene) -> None:
 def test_few_valid_rows_of_many() -> None:
     """Only some rows are looked at; they must be valid ones."""
     large = scenes.make_scene(scenes.wall(), scenes.arc(1, 512, 256))
-    mask = np.zeros_like(large.valid)
+    mask = np.zeros_like(large.pixels.shown)
     mask.reshape(-1)[1::2] = True
-    frame = scene_frame(replace(large, pixel_ids=grid_ids(mask)))
+    frame = scene_frame(scenes.shown_in(large, mask))
     assert np.abs(frame.origin - scene_frame(large).origin).max() < 0.1
 
 
 def test_no_valid_row_is_refused(scene: Scene) -> None:
-    with refuses(ValueError, "", "valid", "none"):
-        scene_frame(replace(scene, pixel_ids=grid_ids(np.zeros_like(scene.valid))))
+    with refuses(ValueError, "", "Gaussians", 0):
+        scene_frame(scenes.shown_in(scene, np.zeros_like(scene.pixels.shown)))
 
 
 def test_gaussians_in_the_cameras_plane_have_a_unit() -> None:
@@ -97,7 +95,7 @@ def test_gaussians_in_the_cameras_plane_have_a_unit() -> None:
 def test_renders_stand_in_for_photos_where_no_pixels_are_known_alone(scene: Scene) -> None:
     """A fit to renders of one Gaussian per pixel would keep its errors: its pixels' own colours are taken."""
     bare = replace(scene, images=None)
-    aligned, unaligned = prepare(bare), prepare(replace(bare, pixel_ids=None))
+    aligned, unaligned = prepare(bare), prepare(replace(bare, pixels=None))
     np.testing.assert_allclose(aligned.scene.images, scene_pictures(bare), atol=1e-6)
     assert aligned.input_scene.images is not None
     assert aligned.reference.name == ROW_COLORS

@@ -15,7 +15,7 @@ from gsmerge.facts.row_colors import FAINT, add_row_colors
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import record_run
-from gsmerge.types import Gaussians, grid_ids
+from gsmerge.types import Gaussians, Pixels
 
 WIDTH, HEIGHT = 64, 48
 SIDE = 20  # pixels of a square that is changed, in the middle of each view
@@ -30,7 +30,7 @@ def scene() -> Scene:
 
 def square(scene: Scene) -> np.ndarray:
     """Mask ``[v,h,w]`` of a square in the middle of each view."""
-    mask = np.zeros_like(scene.valid)
+    mask = np.zeros_like(scene.pixels.shown)
     mask[:, (HEIGHT - SIDE) // 2 : (HEIGHT + SIDE) // 2, (WIDTH - SIDE) // 2 : (WIDTH + SIDE) // 2] = True
     return mask
 
@@ -48,7 +48,7 @@ def pictures_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, list[str]]:
     with record_run() as record:
         colored = add_row_colors(scene)
     assert colored.gaussians is scene.gaussians
-    masks = np.ones_like(scene.valid) if colored.masks is None else colored.masks
+    masks = np.ones_like(scene.pixels.shown) if colored.masks is None else colored.masks
     return colored.images, masks, record.notes
 
 
@@ -58,7 +58,7 @@ def two_layers(front: Scene, back: Scene) -> Scene:
     cameras = replace(
         front.cameras, viewmats=np.concatenate([front.cameras.viewmats] * 2), Ks=np.concatenate([front.cameras.Ks] * 2)
     )
-    ids = grid_ids(np.concatenate([front.valid, back.valid]))
+    ids = Pixels.of_grid(np.concatenate([front.pixels.shown, back.pixels.shown]))
     return Scene(gaussians, cameras, None, ids, (*front.names, *front.names))
 
 
@@ -110,7 +110,7 @@ def test_faint_rows_with_nothing_behind_them_keep_their_colours(scene: Scene) ->
 
 def test_colours_of_rows_that_others_hide_are_drawn(scene: Scene) -> None:
     """What the file says of their pixels is not what the view shows."""
-    astray = np.zeros_like(scene.valid)
+    astray = np.zeros_like(scene.pixels.shown)
     astray[:, :4, :4] = True  # of each view, brought before the square
     size, rows = scene.pixels_per_view, astray.reshape(-1)
     own = np.arange(len(scene.gaussians)) // size * size + size // 2 + WIDTH // 2  # the middle pixel of its view
@@ -129,7 +129,7 @@ def test_colours_of_rows_that_others_hide_are_drawn(scene: Scene) -> None:
 def test_small_differences_of_the_drawing_are_those_of_its_errors(scene: Scene) -> None:
     """Rows of wrong depth cover a few others; after the blur that is little."""
     rng = np.random.default_rng(0)
-    astray = rng.random(scene.valid.shape) < 0.01
+    astray = rng.random(scene.pixels.shown.shape) < 0.01
     camera = np.repeat(scene.cameras.centres, scene.pixels_per_view, 0)[astray.reshape(-1)]
     means = camera + 0.7 * (scene.gaussians.means[astray.reshape(-1)] - camera)
     pictures, _, _ = pictures_of(changed(scene, astray, means=means))
@@ -138,7 +138,7 @@ def test_small_differences_of_the_drawing_are_those_of_its_errors(scene: Scene) 
 
 def test_layers_of_one_camera_make_one_picture(scene: Scene) -> None:
     """The nearest first, each with what those before it let through, whichever comes first in the file."""
-    every = np.ones_like(scene.valid)
+    every = np.ones_like(scene.pixels.shown)
     red, blue = (
         changed(scene, every, sh0=rgb_to_sh0(np.array(rgb)).astype(np.float32), opacities=0.6)
         for rgb in ([1.0, 0, 0], [0, 0, 1.0])
@@ -153,12 +153,11 @@ def test_layers_of_one_camera_make_one_picture(scene: Scene) -> None:
 
 def test_pixels_without_a_row_count_where_something_is_drawn_there(scene: Scene) -> None:
     inside = square(scene)
-    holes = replace(scene, pixel_ids=grid_ids(~inside), missing=inside)
-    holes = changed(holes, inside, opacities=0.0)
+    holes = scenes.shown_in(scene, ~inside)
     _, masks, _ = pictures_of(holes)
     np.testing.assert_array_equal(masks[INNER], False)
     assert masks[:, :4].all()
-    covered = changed(holes, ~inside, scales=scene.gaussians.scales.max() * 8)
+    covered = changed(holes, np.ones(len(holes.gaussians), bool), scales=scene.gaussians.scales.max() * 8)
     pictures, masks, _ = pictures_of(covered)
     assert masks[INNER].all()
     assert pictures[INNER].min() > 0

@@ -23,7 +23,7 @@ def cameras() -> Cameras:
 
 @pytest.fixture(scope="module")
 def room(cameras: Cameras) -> Gaussians:
-    made = scenes.make_scene(scenes.room(), cameras, noise=0.01).finite_gaussians
+    made = scenes.make_scene(scenes.room(), cameras, noise=0.01).gaussians
     return made[:: max(1, len(made) // 150)]
 
 

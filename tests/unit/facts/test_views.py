@@ -70,7 +70,7 @@ def test_subset_is_the_scene_of_those_views() -> None:
     assert np.array_equal(small.cameras.viewmats, expected.cameras.viewmats)
     assert np.array_equal(small.images, expected.images)
     assert small.names == ("003.png", "001.png")
-    unaligned = subset(replace(scene, pixel_ids=None), [2])
+    unaligned = subset(replace(scene, pixels=None), [2])
     assert len(unaligned.gaussians) == len(scene.gaussians)  # in no order, all stay
     assert np.array_equal(unaligned.cameras.viewmats, scene.cameras.viewmats[2:3])
 

@@ -121,7 +121,7 @@ def test_photos_are_read_once_at_their_scale(scene: Scene) -> None:
 
 
 def test_masks_weigh_larger_photos(scene: Scene) -> None:
-    masks = np.ones(scene.valid.shape, bool)
+    masks = np.ones(scene.pixels.shown.shape, bool)
     half = masks.shape[2] // 2
     masks[:, :, half:] = False
     weights = large_photos(replace(with_large(scene, 2), masks=masks), 2).weights

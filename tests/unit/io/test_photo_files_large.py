@@ -71,7 +71,7 @@ def shift_between(scene: Scene, scale: float) -> tuple[float, float]:
 @pytest.mark.parametrize("scale", [1.5, 3])
 def test_larger_photos_show_what_the_grid_shows(made: Path, scale: float) -> None:
     scene = gsmerge.read_scene(made)
-    assert scene.aligned
+    assert scene.has_own_pixels
     assert largest_scale(scene) == pytest.approx(SCALE)
     assert shift_between(scene, scale) == (0, 0)
 
@@ -100,7 +100,7 @@ def test_cropped_and_distorted_photos(folder: Path, k1: float) -> None:
 
     change_cameras(folder, widen)
     scene = gsmerge.read_scene(folder)
-    assert scene.aligned
+    assert scene.has_own_pixels
     assert (scene.cameras.width, scene.cameras.height) == (WIDTH, HEIGHT)
     assert WIDTH * SCALE <= scene.large_photos.width <= WIDTH * SCALE + 2
     assert scene.large_photos.read(0).shape == (scene.large_photos.height, scene.large_photos.width, 3)
@@ -117,7 +117,7 @@ def test_photos_of_the_grids_size_are_not_large(folder: Path) -> None:
 def test_views_of_an_unaligned_scene_are_reduced_but_not_their_photos(folder: Path) -> None:
     change_cameras(folder, enlarge)
     scene = gsmerge.read_scene(folder, order="none", max_side=WIDTH)
-    assert not scene.aligned
+    assert not scene.has_own_pixels
     assert (scene.cameras.width, largest_scale(scene)) == (WIDTH, pytest.approx(SCALE))
     np.testing.assert_allclose(scene.large_photos.Ks, scene.cameras.Ks * [[SCALE], [SCALE], [1]])
 
@@ -164,7 +164,7 @@ def save(folder: Path, *, shuffled: bool = True, tiny: Tiny = LARGE) -> Path:
 def test_views_of_unaligned_scenes_are_resized(tmp_path: Path, order: str) -> None:
     loaded = load_scene(save(tmp_path), order=order, max_side=48)
     scene = loaded.scene
-    assert not scene.aligned
+    assert not scene.has_own_pixels
     assert NOTE in loaded.notes
     assert scene.images.shape == (3, 36, 48, 3)
     assert (scene.cameras.width, scene.cameras.height) == (48, 36)
@@ -193,7 +193,7 @@ def test_cameras_without_photos_are_resized_too(tmp_path: Path) -> None:
 
 def test_scenes_with_pixels_keep_their_grid(tmp_path: Path) -> None:
     loaded = load_scene(save(tmp_path, shuffled=False), max_side=16)
-    assert loaded.scene.aligned
+    assert loaded.scene.has_own_pixels
     assert loaded.scene.cameras.width == 24
 
 
@@ -205,7 +205,7 @@ def test_memory_is_bounded_before_pixels_are_known(
     monkeypatch.setattr("gsmerge.scene.views._MAX_BYTES", 3 * 52 * 39 * 12)
     loaded = load_scene(save(tmp_path, shuffled=shuffled), max_side=48)
     assert NOTE in loaded.notes
-    assert loaded.scene.aligned != shuffled
+    assert loaded.scene.has_own_pixels != shuffled
     size = (48, 36) if shuffled else (24, 18)
     assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == size
 
@@ -213,7 +213,7 @@ def test_memory_is_bounded_before_pixels_are_known(
 def test_photos_that_may_be_the_grid_are_never_resized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.scene.views._MAX_BYTES", 0)
     loaded = load_scene(save(tmp_path, shuffled=False, tiny=SMOOTH), max_side=16)
-    assert loaded.pixel_scene().valid.all()
+    assert loaded.pixel_scene().pixels.shown.all()
     assert loaded.notes == ()
 
 

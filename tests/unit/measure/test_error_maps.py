@@ -37,7 +37,7 @@ def wall() -> Scene:
 def errors_of(scene: Scene, view: int) -> np.ndarray:
     assert scene.images is not None
     views = Views(scene.cameras, scene.images, scene.names)
-    return expected_errors(call_witnesses(scene.finite_gaussians, views), scene.cameras[[view]], view)
+    return expected_errors(call_witnesses(scene.gaussians, views), scene.cameras[[view]], view)
 
 
 def test_what_other_photos_confirm_is_likely_right(wall: Scene) -> None:
@@ -75,7 +75,7 @@ def test_where_no_other_photo_looks_nothing_is_known(wall: Scene) -> None:
     turned = wall.cameras.viewmats.copy()
     turned[1:] = np.diag([-1.0, 1, -1, 1]) @ turned[1:]
     away = Views(replace(wall.cameras, viewmats=turned), wall.images, wall.names)
-    errors = expected_errors(call_witnesses(wall.finite_gaussians, away), wall.cameras[[0]], 0)
+    errors = expected_errors(call_witnesses(wall.gaussians, away), wall.cameras[[0]], 0)
     assert np.isnan(errors).all()
     assert (draw_errors(errors) == UNKNOWN).all()
 
@@ -90,10 +90,10 @@ def test_views_without_a_photo_say_nothing(wall: Scene) -> None:
     with refuses(SceneError, "a.ply", "2 views", "0", "--images"):
         require_photos(replace(wall, images=None), Path("a.ply"))
     require_photos(wall, Path("a.ply"))
-    assert [view for _, view, _ in draw_sheets(alone, {"small": wall.finite_gaussians}, None, {})] == [0]
+    assert [view for _, view, _ in draw_sheets(alone, {"small": wall.gaussians}, None, {})] == [0]
     assert wall.images is not None
     views = Views(wall.cameras, wall.images, wall.names)
-    assert np.isnan(expected_errors(call_witnesses(wall.finite_gaussians, views, masks), wall.cameras[[0]], 0)).all()
+    assert np.isnan(expected_errors(call_witnesses(wall.gaussians, views, masks), wall.cameras[[0]], 0)).all()
 
 
 def test_colours_go_from_none_to_much() -> None:
@@ -104,9 +104,9 @@ def test_colours_go_from_none_to_much() -> None:
 def test_a_sheet_has_photo_result_and_map(wall: Scene) -> None:
     assert wall.images is not None
     held_out = Views(scenes.arc(2, WIDTH, HEIGHT, span=3.0), wall.images[:2], ("a", "b"))
-    sheets = list(draw_sheets(wall, {"small": wall.finite_gaussians[::2]}, held_out, {}))
+    sheets = list(draw_sheets(wall, {"small": wall.gaussians[::2]}, held_out, {}))
     assert [(name, view) for name, view, _ in sheets] == [("small", view) for view in range(5)]
     assert all(sheet.shape[1] > 3 * WIDTH for *_, sheet in sheets)
-    only = list(draw_sheets(wall, {"small": wall.finite_gaussians}, held_out, {}, context=False))
+    only = list(draw_sheets(wall, {"small": wall.gaussians}, held_out, {}, context=False))
     assert [view for _, view, _ in only] == [3, 4]
     assert sh0_to_rgb(wall.gaussians.sh0).std() > 0.05  # it has a pattern

@@ -76,9 +76,9 @@ def test_masked_figures_count_visible_pixels_alone(actual: Evaluation) -> None:
 
 def test_what_the_input_covers_is_measured_apart(scene: Scene, half: Gaussians) -> None:
     """Of the input's own views by the rows of the file, of the others by its renders."""
-    missing = np.zeros_like(scene.valid)
+    missing = np.zeros_like(scene.pixels.shown)
     missing[:, :12] = True
-    lacking = evaluate(replace(scene, missing=missing), {"half": half}, held_out(), PLAIN)
+    lacking = evaluate(scenes.shown_in(scene, ~missing), {"half": half}, held_out(), PLAIN)
     for result in lacking.results:
         share, covered = result.mean_covered("context")
         assert share == pytest.approx(1 - missing.mean())
@@ -107,7 +107,7 @@ def test_what_is_counted(actual: Evaluation, scene: Scene, half: Gaussians) -> N
 
 def no_pixels(scene: Scene) -> Scene:
     """The same Gaussians without photos, and without the pixels that they belong to."""
-    return replace(scene, images=None, pixel_ids=None)
+    return replace(scene, images=None, pixels=None)
 
 
 def test_without_photos_the_colours_of_pixels_are_the_reference(scene: Scene, half: Gaussians) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scenes
@@ -12,7 +10,7 @@ from gsmerge.facts.views import subset
 from gsmerge.measure import visibility
 from gsmerge.measure.sizes import zoom_cameras
 from gsmerge.measure.visibility import context_points, front_rows, visible_pixels
-from gsmerge.types import Cameras, Gaussians, Scene, grid_ids
+from gsmerge.types import Cameras, Gaussians, Scene
 
 
 def slow_mask(points: np.ndarray, cameras: Cameras, view: int) -> np.ndarray:
@@ -53,9 +51,9 @@ def test_larger_pictures_have_no_gaps_between_samples(factor: int) -> None:
 
 def test_pixels_without_a_gaussian_give_no_sample() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(1, 24, 18))
-    valid = scene.valid.copy()
+    valid = scene.pixels.shown.copy()
     valid[0, :, 12:] = False
-    masks = visible_pixels(context_points(replace(scene, pixel_ids=grid_ids(valid)), 0.01), scene.cameras, 0.01)
+    masks = visible_pixels(context_points(scenes.shown_in(scene, valid), 0.01), scene.cameras, 0.01)
     assert masks[0, :, :13].all()  # a column more than there are samples: every sample marks its neighbours
     assert not masks[0, :, 13:].any()
 

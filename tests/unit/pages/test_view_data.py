@@ -128,7 +128,7 @@ def test_one_scene_alone(small: Scene) -> None:
     values = [view.scores[0].psnr or 0 for view in alone.views]
     assert values == sorted(values)
     assert alone.scored
-    assert not collect("room", replace(small, images=None, pixel_ids=None), {}, (300,)).scored
+    assert not collect("room", replace(small, images=None, pixels=None), {}, (300,)).scored
 
 
 def test_the_worst_view_comes_first(actual: ViewData) -> None:
@@ -317,7 +317,7 @@ def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene)
 
 
 def test_without_photos_there_are_no_superpixels(small: Scene) -> None:
-    none = collect("room", replace(small, images=None, pixel_ids=None), {"half": small.gaussians[::2]}, (2, 1))
+    none = collect("room", replace(small, images=None, pixels=None), {"half": small.gaussians[::2]}, (2, 1))
     assert none.num_superpixels is None
     assert {view.outlines for view in none.views} == {None}
 
@@ -333,7 +333,7 @@ def test_many_views_are_thinned(small: Scene, monkeypatch: pytest.MonkeyPatch) -
 
 def test_without_photos_results_are_compared_with_the_input(small: Scene) -> None:
     bare = replace(small, images=None)
-    actual = collect("room", replace(bare, pixel_ids=None), {"half": small.gaussians[::2]}, (2, 1))
+    actual = collect("room", replace(bare, pixels=None), {"half": small.gaussians[::2]}, (2, 1))
     assert [view.photo for view in actual.views] == [None] * 3
     assert actual.reference == "renders of the input"
     colored = collect("room", bare, {"half": small.gaussians[::2]}, (2, 1))

@@ -120,7 +120,7 @@ def test_rows_that_are_no_grid(tmp_path: Path) -> None:
     for name, index in others.items():
         loaded = read_bare(tmp_path / name, tiny, index)
         assert len(loaded.scene) == 0
-        assert not loaded.scene.aligned
+        assert not loaded.scene.has_own_pixels
 
 
 def test_a_wall_in_front_of_the_camera_has_no_focal_length(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_photos_of_any_size(tmp_path: Path, larger: int, margin: int, trim: int)
     assert scene.images is not None
     assert scene.images.shape == tiny.images.shape
     assert np.abs(scene.images * 255.0 - tiny.images).mean() < 2
-    assert int(scene.valid.sum()) == ids.size
+    assert int(scene.pixels.shown.sum()) == ids.size
     assert scene.names == ("0.png", "1.png", "2.png")
     assert (scene.large_photos is not None) == (larger > 1)
 
@@ -170,7 +170,7 @@ def test_photos_of_another_scene_are_not_used(tmp_path: Path) -> None:
     for i, image in enumerate(np.random.default_rng(0).integers(0, 256, (3, 90, 120, 3), np.uint8)):
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), image)
     loaded = read_bare(tmp_path, tiny, np.arange(len(tiny.gaussians)))
-    assert loaded.scene.aligned
+    assert loaded.scene.has_own_pixels
     assert loaded.scene.images is None
     assert noted(loaded.notes, "images", "not used", f"3 views of {WIDTH} x {HEIGHT}")
 
@@ -181,7 +181,7 @@ def test_other_pictures_beside_the_file_are_no_photos(tmp_path: Path) -> None:
     for i in range(2):
         cv2.imwrite(str(tmp_path / f"chart{i}.png"), np.random.default_rng(i).integers(0, 256, (90, 120, 3), np.uint8))
     scene = read_bare(tmp_path, tiny, np.arange(len(tiny.gaussians))).scene
-    assert scene.aligned
+    assert scene.has_own_pixels
     assert scene.images is None
     write_photos(tmp_path / "photos", tiny, 2, 0, "view{}.png")
     for path in (tmp_path / "photos").iterdir():

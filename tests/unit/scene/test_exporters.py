@@ -45,15 +45,11 @@ def test_depthsplat(tmp_path: Path) -> None:
     assert home(scene, smooth) == 1
     assert [d.name for d in loaded.exporters] == ["depthsplat"]
     assert loaded.recovery.best.frame.kind == "first"
-    assert scene.num_gaussians == int(scene.valid.sum()) == inner.size
-    assert scene.num_missing == 3 * h * w - inner.size
+    assert scene.num_gaussians == int(scene.pixels.shown.sum()) == inner.size
+    assert int((~scene.pixels.shown).sum()) == 3 * h * w - inner.size
     # the Gaussians stay where the file has them, and the cameras are moved
-    assert np.array_equal(
-        scene.gaussians.means[scene.valid.reshape(-1)][0], read_ply(tmp_path / "scene.ply").gaussians.means[0]
-    )
+    assert np.array_equal(scene.gaussians.means[0], read_ply(tmp_path / "scene.ply").gaussians.means[0])
     assert np.allclose(scene.cameras.viewmats[0, :3, :3], np.eye(3), atol=1e-6)
-    transparent = ~scene.valid.reshape(-1)
-    assert (scene.gaussians.opacities[transparent] == 0).all()
     assert np.isfinite(scene.gaussians.means).all()
 
 
@@ -80,7 +76,7 @@ def test_depth_anything(tmp_path: Path, nested: float, ties: bool) -> None:
     sky = np.isin(np.arange(2 * 48 + 1, 3 * 48 - 1), kept)
     assert ties == bool(sky.all())
     if not ties:  # what was dropped is put back where the depth maps have it
-        assert scene.valid.all()
+        assert scene.pixels.shown.all()
         error = np.linalg.norm(scene.gaussians.means - tiny.gaussians.means, axis=1)
         assert error.max() < 0.1
         assert np.abs(scene.gaussians.sh0 - tiny.gaussians.sh0).max() < 1e-4
@@ -178,9 +174,9 @@ def test_infinite_opacities_and_nan_scales(tmp_path: Path) -> None:
     scene = load_scene(save_export(tmp_path, smooth, rows)).pixel_scene()
     assert scene.gaussians.opacities.reshape(3, h, w)[0, 8, 8] == 1
     assert scene.gaussians.opacities.reshape(3, h, w)[1, 8, 8] == 0
-    assert scene.valid[1, 8, 8]
-    assert not scene.valid[:, 8, 9].any()
-    assert int(scene.valid.sum()) == len(rows) - 3
+    assert scene.pixels.shown[1, 8, 8]
+    assert not scene.pixels.shown[:, 8, 9].any()
+    assert int(scene.pixels.shown.sum()) == len(rows) - 3
     assert scene.num_gaussians == len(rows)  # rows of the file, the set-aside ones included
 
 
@@ -193,8 +189,8 @@ def test_byte_normals_are_long_lrm(tmp_path: Path, smooth: Tiny) -> None:
 
 def test_a_scene_can_be_given_as_unaligned(tmp_path: Path, smooth: Tiny) -> None:
     path = save_export(tmp_path, smooth, export_rows(smooth))
-    assert not read_scene(path, order="none").aligned
-    assert not read_scene(path, exporter="volsplat").aligned
+    assert not read_scene(path, order="none").has_own_pixels
+    assert not read_scene(path, exporter="volsplat").has_own_pixels
 
 
 def test_a_given_scale(tmp_path: Path, smooth: Tiny) -> None:
@@ -203,7 +199,7 @@ def test_a_given_scale(tmp_path: Path, smooth: Tiny) -> None:
     path = save_export(tmp_path, replace(smooth, c2w=c2w), export_rows(smooth))
     scene = read_scene(path, scene_scale=0.5)
     assert np.allclose(scene.cameras.viewmats, smooth.w2c)
-    assert read_scene(path).aligned
+    assert read_scene(path).has_own_pixels
 
 
 @pytest.mark.parametrize(

@@ -96,11 +96,11 @@ def test_depth_is_the_distance_along_the_ray(tmp_path: Path) -> None:
     save_export(tmp_path / "gs_ply", tiny, export_rows(tiny, da3_rows(tiny)), cameras=False, name="0000.ply")
     write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths.astype(np.float32))
     scene = load_scene(tmp_path / "gs_ply/0000.ply").pixel_scene()
-    assert scene.valid.all()
+    assert scene.pixels.shown.all()
     assert np.linalg.norm(scene.gaussians.means - tiny.gaussians.means, axis=1).max() < 0.05
     rows = da3_rows(tiny)  # and is never taken for the file's own
-    assert np.array_equal(np.flatnonzero(scene.stored.reshape(-1)), rows)
-    assert np.array_equal(scene.file_gaussians.means, tiny.gaussians.means[rows])
+    assert np.array_equal(np.flatnonzero(scene.pixels.shown.reshape(-1)), rows)
+    assert np.array_equal(scene.gaussians.means, tiny.gaussians.means[rows])
 
 
 @pytest.mark.parametrize("images", [True, False])
@@ -127,7 +127,7 @@ def test_depth_maps_of_fewer_views_are_left_alone(tmp_path: Path) -> None:
     save_export(tmp_path / "gs_ply", tiny, export_rows(tiny, da3_rows(tiny)), cameras=False, name="0000.ply")
     write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths[:1].astype(np.float32))
     scene = load_scene(tmp_path / "gs_ply/0000.ply").pixel_scene()
-    assert int(scene.valid.sum()) == len(da3_rows(tiny))
+    assert int(scene.pixels.shown.sum()) == len(da3_rows(tiny))
 
 
 def test_rotations_are_never_changed(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_several_gaussians_per_pixel(tmp_path: Path, axes: tuple[int, ...], trim
     rows["opacity"] = np.broadcast_to(np.arange(3) - 1.0, (*inner.shape, 3)).transpose(axes).reshape(-1)
     scene = load_scene(save_export(tmp_path, SMOOTH, rows)).pixel_scene()
     assert scene.names == tuple(f"images/{name}" for name in SMOOTH.names for _ in range(3))
-    opacities = scene.gaussians.opacities.reshape(9, -1)[scene.valid.reshape(9, -1)].reshape(9, -1)
+    opacities = scene.gaussians.opacities.reshape(9, -1)[scene.pixels.shown.reshape(9, -1)].reshape(9, -1)
     assert (opacities == opacities[:, :1]).all()
     assert np.allclose(opacities[3:6, 0], 1 / (1 + np.exp([1, 0, -1])))
 
@@ -252,7 +252,7 @@ def test_all_elements_of_sharp(tmp_path: Path, legacy: bool) -> None:
         write_elements(tmp_path / "photo.ply", rows, pose.reshape(-1), K.reshape(-1), size)
     loaded = load_scene(tmp_path / "photo.ply")
     scene = loaded.pixel_scene()
-    assert scene.valid.shape == (2, 36, 36)
+    assert scene.pixels.shown.shape == (2, 36, 36)
     assert np.allclose(scene.cameras.Ks[0], square.K, atol=1e-4)
     assert np.allclose(scene.cameras.viewmats, pose, atol=1e-6)
     assert set(loaded.info.extra_elements) >= {"frame", "disparity", "color_space", "version"}

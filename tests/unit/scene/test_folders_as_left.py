@@ -45,7 +45,7 @@ def test_depthsplat_s_folders(tmp_path: Path) -> None:
         assert files.cameras == tmp_path / "poses_of_room.json"
         assert files.images == tmp_path / "images/room"
     loaded = load_scene(tmp_path)
-    assert loaded.scene.aligned
+    assert loaded.scene.has_own_pixels
     assert home(loaded.scene, smooth, kept) == 1
     assert np.array_equal((loaded.scene.images * 255).round(), smooth.images)
     assert "depthsplat" in [exporter.name for exporter in loaded.exporters]
@@ -163,7 +163,7 @@ def test_gaussians_among_the_photos_and_poses_as_a_model_returns_them(tmp_path: 
     nothing = dict.fromkeys(("extrinsics", "intrinsics", "depth", "image"))
     write_npz(tmp_path / "predicted.npz", tiny, **(nothing | arrays))
     loaded = load_scene(tmp_path)
-    assert not loaded.scene.aligned
+    assert not loaded.scene.has_own_pixels
     np.testing.assert_allclose(loaded.scene.cameras.viewmats, tiny.w2c, atol=1e-6)
     np.testing.assert_allclose(loaded.scene.cameras.Ks, np.tile(tiny.K, (3, 1, 1)), atol=1e-4)
     assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)

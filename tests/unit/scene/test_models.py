@@ -77,7 +77,7 @@ def test_rows_of_no_pixels_have_the_cameras_and_photos_of_their_views(tmp_path: 
     """Takes over a second where many grids have as many pixels, as each is tried."""
     export = MODELS[name](tmp_path / "out")
     loaded = load_scene(export.path, **export.options)
-    assert not loaded.scene.aligned
+    assert not loaded.scene.has_own_pixels
     check_cameras(loaded.scene, export)
     assert set(UNALIGNED[name]) <= {exporter.name for exporter in loaded.exporters}
     means = np.stack([export.rows[axis] for axis in "xyz"], 1)

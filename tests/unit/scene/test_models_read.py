@@ -50,7 +50,7 @@ def test_every_row_is_at_its_pixel(tmp_path: Path, name: str) -> None:
 )
 def test_cameras_and_photos_of_rows_of_no_pixels(tmp_path: Path, name: str) -> None:
     loaded, export = load(name, tmp_path)
-    assert not loaded.scene.aligned
+    assert not loaded.scene.has_own_pixels
     check_cameras(loaded.scene, export)
     assert ("gsplat" in name) == ("gsplat" in {exporter.name for exporter in loaded.exporters})
 
@@ -95,7 +95,7 @@ def test_folders_without_gaussians(tmp_path: Path, name: str, place: str, said: 
 @pytest.mark.parametrize("name", [f"{DA3}, npz", f"{DA3}, results.npz"])
 def test_depth_maps_without_gaussians(tmp_path: Path, name: str) -> None:
     loaded = load_scene(MODELS[name](tmp_path / "out").path)
-    assert loaded.scene.aligned
+    assert loaded.scene.has_own_pixels
     assert loaded.scene.images is not None
     assert loaded.info.layout.startswith("depth maps")
 
@@ -108,8 +108,12 @@ def test_scenes_without_cameras_are_read_without_a_hint(tmp_path: Path, name: st
     """Every row is there; of those that show their cameras nearly every one."""
     export = MODELS[name](tmp_path / "out")
     loaded = load_scene(export.path)
-    g = loaded.scene.gaussians[loaded.scene.stored.reshape(-1)] if loaded.scene.aligned else loaded.scene.gaussians
+    g = (
+        loaded.scene.gaussians[loaded.scene.pixels.shown.reshape(-1)]
+        if loaded.scene.has_own_pixels
+        else loaded.scene.gaussians
+    )
     means = np.stack([export.rows[axis] for axis in "xyz"], 1)
     assert len(g) >= 0.999 * len(means)
     assert np.isin(g.means[:, 0], means[:, 0]).all()
-    assert loaded.scene.aligned or np.array_equal(g.means, means)
+    assert loaded.scene.has_own_pixels or np.array_equal(g.means, means)

@@ -37,7 +37,7 @@ def test_a_plain_scene(tiny_folder: Path, tiny: Tiny) -> None:
     assert (scene.cameras.width, scene.cameras.height) == (20, 14)
     assert np.allclose(scene.cameras.viewmats, tiny.w2c)
     assert np.array_equal((scene.images * 255).round(), tiny.images)
-    assert scene.valid.all()
+    assert scene.pixels.shown.all()
     assert scene.names == tuple(f"images/{n}" for n in tiny.names)
     assert np.allclose(scene.gaussians.means, tiny.gaussians.means)
     loaded = load_scene(tiny_folder / "scene.ply")
@@ -118,13 +118,12 @@ def test_rows_with_nan_keep_the_order(tmp_path: Path, tiny: Tiny) -> None:
     (folder / "scene.ply").write_bytes(data)
     before = read_scene(tiny.save(tmp_path / "whole")).gaussians
     scene = read_scene(folder)
-    good = scene.valid.reshape(-1)
+    good = scene.pixels.shown.reshape(-1)
     for name, column in vars(before).items():
-        assert np.array_equal(getattr(scene.gaussians, name)[good], column[good]), name
-    assert scene.valid.sum() == 3 * 14 * 20 - 2
-    assert not scene.valid[0, 0, 0]
-    assert not scene.valid[1, 1, 1]  # 301 = 280 + 20 + 1
-    assert scene.gaussians.opacities[301] == 0
+        assert np.array_equal(getattr(scene.gaussians, name), column[good]), name
+    assert scene.pixels.shown.sum() == 3 * 14 * 20 - 2
+    assert not scene.pixels.shown[0, 0, 0]
+    assert not scene.pixels.shown[1, 1, 1]  # 301 = 280 + 20 + 1
 
 
 def test_views_in_the_order_of_their_names(tiny_folder: Path, tiny: Tiny) -> None:

@@ -78,7 +78,10 @@ def read_once(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Loaded:
 def same(actual: Loaded, alone: Loaded) -> bool:
     scenes = actual.scene, alone.scene
     means = [scene.gaussians.means for scene in scenes]
-    return np.array_equal(*means) and len({(len(scene), scene.aligned, scene.images is None) for scene in scenes}) == 1
+    return (
+        np.array_equal(*means)
+        and len({(len(scene), scene.has_own_pixels, scene.images is None) for scene in scenes}) == 1
+    )
 
 
 @sweep("stray", STRAY, often=3)

@@ -10,15 +10,16 @@ from messages import noted, refuses
 
 from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
+from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.frame import canonicalise, scene_frame
-from gsmerge.pooling import scene_members, unaligned_members
+from gsmerge.pooling import scene_members
 from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions
-from gsmerge.stages.assign import assign, find_owners, find_pixels, merge_unseen, middle_pixels, owner_pixels
+from gsmerge.stages.assign import assign, find_owners, merge_unseen, middle_pixels, owner_pixels
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.stages.segment import FEW_PIXELS, superpixels_per_view
 from gsmerge.stages.superpixels import segment
@@ -50,49 +51,39 @@ def test_owner_pixels_lie_in_their_superpixel(room: Scene, groups: Groups) -> No
     assert (pixels[seen] // (32 * 24) == owners.views[seen]).all()
 
 
-def test_centres_are_projected_where_they_cover_the_views(room: Scene, groups: Groups) -> None:
-    """Two of three Gaussians leave gaps, through which centres seem to be seen that are hidden."""
-    scene = unaligned_scenes.without_order(room)
-    pixels, fronts = find_pixels(scene)
-    covering = assign(scene, groups, draws=False)
-    np.testing.assert_array_equal(covering.pixels, pixels)
-    np.testing.assert_array_equal(covering.fronts, fronts)
-    sparse = replace(scene, gaussians=scene.gaussians[::3])
-    assert assign(sparse, groups, draws=False).fronts is None
-    np.testing.assert_array_equal(assign(sparse, groups, draws=False).pixels, assign(sparse, groups).pixels)
-
-
-def test_rows_do_not_depend_on_their_order(room: Scene) -> None:
-    """Where no two are equally deep."""
-    rng, g = np.random.default_rng(4), room.gaussians
-    uneven = replace(g, means=g.means + rng.normal(0, 1e-3, g.means.shape).astype(np.float32))
-    scene, order = unaligned_scenes.without_order(replace(room, gaussians=uneven)), rng.permutation(len(g))
-    pixels, fronts = find_pixels(scene)
-    moved, moved_fronts = find_pixels(replace(scene, gaussians=scene.gaussians[order]))
-    np.testing.assert_array_equal(moved, pixels[order])
-    np.testing.assert_array_equal(np.where(moved_fronts >= 0, order[moved_fronts], -1), fronts)
+def test_gaussians_belong_to_the_superpixel_of_their_pixel(room: Scene, groups: Groups) -> None:
+    """Or, as in the paper, to the one that they show most in."""
+    scene = with_pixels(canonicalise(unaligned_scenes.without_order(room))[0])
+    np.testing.assert_array_equal(assign(scene, groups).pixels, scene.pixels.homes)
+    shown = assign(scene, groups, by_contribution=True)
+    np.testing.assert_array_equal(shown.pixels, owner_pixels(find_owners(scene, groups), groups))
+    np.testing.assert_array_equal(assign(room, groups, by_contribution=True).pixels, room.pixels.homes)
 
 
 def test_rows_by_pixel_are_those_of_the_grid(room: Scene, groups: Groups) -> None:
     """Members that know their pixels are grouped as those of a scene in order."""
-    scene, pixels = unaligned_scenes.without_order(room), np.arange(len(room.gaussians))
-    members = unaligned_members(scene, pixels)
-    in_order = member_rows(room, scene_members(room), groups)
-    for actual, expected in zip(member_rows(scene, members, groups), in_order, strict=True):
-        assert (actual == expected).all()
-    np.testing.assert_allclose(members.footprints, scene_members(room).footprints, rtol=1e-5)
+    order = np.random.default_rng(0).permutation(len(room.gaussians))
+    pixels = replace(room.pixels, homes=order, fronts=np.argsort(order)[room.pixels.fronts].astype(np.int32))
+    scene = replace(room, gaussians=room.gaussians[order], pixels=pixels)
+    members, in_order = scene_members(scene), scene_members(room)
+    (starts, ids, views), expected = (member_rows(room, each, groups) for each in (members, in_order))
+    assert np.array_equal(starts, expected[0])
+    assert np.array_equal(views, expected[2])
+    labels = groups.labels.reshape(-1)
+    assert np.array_equal(labels[order[ids]], labels[expected[1]])
+    np.testing.assert_allclose(members.footprints, in_order.footprints[order], rtol=1e-5)
     one, other = (encode(scene, members, groups), encode(room, scene_members(room), groups))
     assert np.allclose(one.means, other.means, atol=1e-6)
     assert np.array_equal(one.views, other.views)
 
 
 def test_members_without_a_pixel_are_in_no_group(room: Scene, groups: Groups) -> None:
-    pixels = np.arange(len(room.gaussians))
-    pixels[::3] = -1
-    members = unaligned_members(unaligned_scenes.without_order(room), pixels)
-    _, ids, _ = member_rows(unaligned_scenes.without_order(room), members, groups)
-    assert sorted(ids) == np.flatnonzero(pixels >= 0).tolist()
-    scene = unaligned_scenes.without_order(room)
+    homes = room.pixels.homes.copy()
+    homes[::3] = -1
+    scene = replace(room, pixels=replace(room.pixels, homes=homes))
+    members = scene_members(scene)
+    _, ids, _ = member_rows(scene, members, groups)
+    assert sorted(ids) == np.flatnonzero(homes >= 0).tolist()
     focals, centres = scene.cameras.Ks[:, 0, 0], scene.cameras.centres
     away = np.stack([np.linalg.norm(scene.gaussians.means - c, axis=1) for c in centres], 1)
     np.testing.assert_allclose(members.footprints[::3], (away / focals).min(1)[::3], rtol=1e-5)

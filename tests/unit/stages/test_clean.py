@@ -149,11 +149,11 @@ def test_a_crop_leaves_what_shows_it(scene: Scene) -> None:
     """Pixels count whose own Gaussian is inside, but for borders; without pixels the same photos count."""
     crop = sphere_in(scene, 0.5)
     inside = crop_scene(scene, crop)
-    own = inside_crop(scene.gaussians.means, crop).reshape(scene.valid.shape)
+    own = inside_crop(scene.gaussians.means, crop).reshape(scene.pixels.shown.shape)
     assert inside.masks is not None
     assert (inside.masks == own).mean() > 0.9
-    assert (inside.valid == own).all()
-    free = crop_scene(replace(scene, pixel_ids=None), crop)
+    assert (inside.pixels.shown == own).all()
+    free = crop_scene(replace(scene, pixels=None), crop)
     assert len(free.gaussians) == own.sum()
     np.testing.assert_array_equal(free.masks, inside.masks)
     assert crop_scene(replace(scene, images=None, masks=None), crop).masks is None
@@ -187,7 +187,7 @@ def test_what_cannot_be(scene: Scene) -> None:
 
 def test_what_no_view_shows_is_left_out(scene: Scene) -> None:
     """What stands behind the cameras, and nothing that takes part in a picture."""
-    given = scene.finite_gaussians
+    given = scene.gaussians
     behind = given.means - 1000 * scene.cameras.viewmats[0, 2, :3].astype(np.float32)
     both = Gaussians.concat([given, replace(given, means=behind)])
     options = CleanOptions(drop="unseen")

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scenes
@@ -10,7 +8,7 @@ from gsmerge import Scene
 from gsmerge.kernels import elementary
 from gsmerge.pooling import scene_members
 from gsmerge.stages.encode import encode, member_rows
-from gsmerge.types import FeatureGaussians, Groups, grid_ids
+from gsmerge.types import FeatureGaussians, Groups
 
 WIDTH, HEIGHT = 12, 8
 
@@ -44,22 +42,21 @@ def test_rows_of_the_groups(scene: Scene, groups: Groups) -> None:
 
 
 def test_invalid_pixels_are_left_out(scene: Scene, groups: Groups) -> None:
-    valid = scene.valid.copy()
+    valid = scene.pixels.shown.copy()
     valid[0, :4, :4] = False  # a whole superpixel
     valid[1, 0, 0] = False
-    partial = replace(scene, pixel_ids=grid_ids(valid))
+    partial = scenes.shown_in(scene, valid)
     starts, ids, views = member_rows(partial, scene_members(partial), groups)
     assert np.diff(starts).tolist() == [16] * 5 + [15] + [16] * 5
     assert views.tolist() == [0] * 5 + [1] * 6
-    assert valid.reshape(-1)[ids].all()
     assert len(np.unique(ids)) == len(ids) == int(valid.sum())
-    features = encoded(replace(scene, pixel_ids=grid_ids(valid)), groups)
+    features = encoded(scenes.shown_in(scene, valid), groups)
     assert len(features) == 11
 
 
 @pytest.mark.parametrize("rule", ["depth", "paper"])
 def test_no_valid_pixel(scene: Scene, groups: Groups, rule: str) -> None:
-    assert len(encoded(replace(scene, pixel_ids=grid_ids(np.zeros_like(scene.valid))), groups, rule)) == 0
+    assert len(encoded(scenes.shown_in(scene, np.zeros_like(scene.pixels.shown)), groups, rule)) == 0
 
 
 def test_views_may_have_different_counts(scene: Scene, groups: Groups) -> None:

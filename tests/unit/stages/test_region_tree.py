@@ -21,9 +21,9 @@ from gsmerge.stages.segment import (
     SegmentOptions,
     SuperpixelChoices,
     cut_tree,
+    front_depths,
     knee,
     knee_count,
-    pixel_depths,
     region_tree,
     segment,
 )
@@ -138,9 +138,9 @@ def test_strange_depths_do_no_harm() -> None:
     assert len(cut_tree(tree, 100)) == 100
 
 
-def test_pixel_depths() -> None:
+def test_front_depths() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 8, 6))
-    depths = pixel_depths(scene)
+    depths = front_depths(scene)
     eyes = scene.cameras.centres.repeat(48, 0)
     forward = scene.cameras.viewmats[:, 2, :3].repeat(48, 0)
     expected = ((scene.gaussians.means - eyes) * forward).sum(1)

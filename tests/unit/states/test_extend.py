@@ -63,7 +63,7 @@ def test_gaussians_cameras_and_photos_add_up(room: Scene) -> None:
     np.testing.assert_allclose(both.cameras.viewmats, room.cameras.viewmats, atol=1e-6)
     np.testing.assert_array_equal(both.images, room.images)
     np.testing.assert_array_equal(both.gaussians.means[: len(one.gaussians)], one.gaussians.means)
-    assert not both.aligned
+    assert not both.has_own_pixels
 
 
 def test_a_name_that_is_taken_gets_a_number(room: Scene) -> None:

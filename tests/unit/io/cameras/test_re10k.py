@@ -32,7 +32,7 @@ def test_the_scene_is_picked_by_the_name_of_the_ply(tmp_path: Path) -> None:
     assert files.cameras == files.images == tmp_path / "000000.torch"
     loaded = load_scene(tmp_path)
     scene = loaded.pixel_scene()
-    assert scene.valid.all()
+    assert scene.pixels.shown.all()
     assert loaded.cameras.source == "re10k chunk"
     assert np.allclose(scene.cameras.Ks, SMOOTH.K, atol=1e-4)
     assert np.allclose(scene.cameras.viewmats, SMOOTH.w2c, atol=1e-6)
@@ -92,7 +92,7 @@ def test_without_photos(tmp_path: Path) -> None:
         assert np.allclose(actual.Ks[:, :2, :2], (SMOOTH.K / np.array([[48], [36], [1.0]]))[:2, :2])
     SMOOTH.save(tmp_path, cameras=False)
     (tmp_path / "images").rename(tmp_path / "photos")
-    assert load_scene(tmp_path, images=tmp_path / "photos").pixel_scene().valid.all()
+    assert load_scene(tmp_path, images=tmp_path / "photos").pixel_scene().pixels.shown.all()
 
 
 def test_tensors_that_want_gradients(tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def test_frames_and_poses_of_a_long_sequence(tmp_path: Path, tiny: Tiny) -> None
     assert files.plys == tuple(frames)
     assert files.base == tmp_path / "out/scene.ply"
     load = load_scene(tmp_path / "out")
-    assert load.scene.aligned
+    assert load.scene.has_own_pixels
     assert load.scene.images is not None
     assert np.array_equal(np.rint(load.scene.images * 255), tiny.images)
     assert np.allclose(load.scene.cameras.viewmats, tiny.w2c)

@@ -18,7 +18,6 @@ from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.research.baselines.simple import summed_weights
 from gsmerge.runtime.plugins import METHODS, find_plugins, load_plugin
 from gsmerge.stages.superpixels import grid_labels
-from gsmerge.types import grid_ids
 
 COUNT = 200
 KEEPERS = ("unmerged", "unmerged-fit")
@@ -102,22 +101,15 @@ def test_the_order_of_the_rows_does_not_matter(scene: Scene, method: str) -> Non
 
 @pytest.mark.parametrize("method", EACH)
 def test_rows_that_are_not_there_stay_out(scene: Scene, method: str) -> None:
-    valid = scene.valid.copy()
+    valid = scene.pixels.shown.copy()
     valid[:, :4] = False
-    gone = ~valid.reshape(-1)
-    means, opacities = scene.gaussians.means.copy(), scene.gaussians.opacities.copy()
-    opacities[gone], means[gone] = 0, 50.0
-    holed = replace(
-        scene, gaussians=replace(scene.gaussians, means=means, opacities=opacities), pixel_ids=grid_ids(valid)
-    )
-    result = made(holed, method)
-    assert np.abs(result.gaussians.means).max() < 10
+    result = made(scenes.shown_in(scene, valid), method)
     assert len(result.gaussians) <= int(valid.sum())
 
 
 def test_photos_are_asked_for(scene: Scene) -> None:
     with refuses(UsageError, "method unmerged-fit", "photos", "none"):
-        made(replace(scene, images=None, pixel_ids=None), "unmerged-fit")
+        made(replace(scene, images=None, pixels=None), "unmerged-fit")
 
 
 @pytest.mark.parametrize("method", ["blocks", "contribution", "greedy", "voxel"])

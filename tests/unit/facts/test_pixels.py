@@ -1,0 +1,88 @@
+"""Homes and fronts of Gaussians in any order, and of such that are wider apart than pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import unaligned_scenes
+
+from gsmerge import Scene
+from gsmerge.facts.pixels import choose_level, find_pixels
+from gsmerge.frame import canonicalise
+from gsmerge.geometry import camera_depths
+
+WIDTH, HEIGHT = 96, 72
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return canonicalise(scenes.make_scene(scenes.room(), scenes.arc(3, WIDTH, HEIGHT)))[0]
+
+
+def depth_errors(scene: Scene, room: Scene) -> np.ndarray:
+    """Logarithms of the depths of fronts over those of the surfaces, of pixels with one."""
+    fronts = find_pixels(scene).fronts
+    depths, true = (
+        np.stack([camera_depths(some.gaussians.means[front], pose) for front, pose in zip(f, poses, strict=True)])
+        for some, f, poses in (
+            (scene, fronts, scene.cameras.viewmats),
+            (room, room.pixels.fronts, room.cameras.viewmats),
+        )
+    )
+    return np.abs(np.log(depths / true))[fronts >= 0]
+
+
+def test_rows_in_any_order_are_in_front_where_their_surface_is(room: Scene) -> None:
+    scene = unaligned_scenes.shuffled(room)
+    pixels = find_pixels(scene)
+    assert not pixels.own
+    assert pixels.shown.mean() > 0.99
+    assert (pixels.homes >= 0).mean() > 0.99
+    assert np.median(depth_errors(scene, room)) < 0.01
+
+
+@pytest.mark.parametrize(("every", "level"), [(1, 0), (4, 1), (16, 2), (64, 3)])
+def test_cells_are_as_wide_as_gaussians_are_apart(every: int, level: int, room: Scene) -> None:
+    """What lies behind shows through gaps between centres, not between cells."""
+    few = np.random.default_rng(0).permutation(WIDTH * HEIGHT)[: WIDTH * HEIGHT // every]
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask.reshape(-1)[few] = True
+    assert choose_level(mask, 64.0) in (level, level + 1)
+    step = round(every**0.5)
+    kept = np.arange(len(room.gaussians)).reshape(3, HEIGHT, WIDTH)[:, ::step, ::step].reshape(-1)
+    g = room.gaussians
+    scene = unaligned_scenes.without_order(replace(room, gaussians=replace(g, scales=step * g.scales)), kept)
+    assert find_pixels(scene).shown.mean() > 0.97
+    assert (depth_errors(scene, room) < 0.1).mean() > 0.9
+
+
+def test_gaps_wider_than_cells_stay_gaps(room: Scene) -> None:
+    kept = np.ones((3, HEIGHT, WIDTH), bool)
+    kept[:, 20:40, 30:60] = False
+    scene = unaligned_scenes.without_order(room, np.flatnonzero(kept)[np.flatnonzero(kept) < WIDTH * HEIGHT])
+    shown = find_pixels(replace(scene, cameras=scene.cameras[[0]], images=None, names=("a",))).shown[0]
+    assert not shown[22:38, 32:58].any()
+    assert shown[:18].mean() > 0.99
+
+
+def test_pixels_do_not_depend_on_the_order_of_rows(room: Scene) -> None:
+    """Where no two are equally deep."""
+    rng, g = np.random.default_rng(4), room.gaussians
+    uneven = replace(g, means=g.means + rng.normal(0, 1e-3, g.means.shape).astype(np.float32))
+    for every in (1, 9):
+        scene = unaligned_scenes.without_order(replace(room, gaussians=uneven[::every], pixels=None))
+        order = rng.permutation(len(scene.gaussians))
+        one, other = find_pixels(scene), find_pixels(replace(scene, gaussians=scene.gaussians[order]))
+        np.testing.assert_array_equal(other.homes, one.homes[order])
+        np.testing.assert_array_equal(np.where(other.shown, order[other.fronts], -1), one.fronts)
+
+
+def test_nothing_is_in_front_of_views_that_look_away(room: Scene) -> None:
+    viewmats = room.cameras.viewmats.copy()
+    viewmats[1] = np.diag([-1.0, 1, -1, 1]) @ viewmats[1]
+    away = replace(room, cameras=replace(room.cameras, viewmats=viewmats), pixels=None)
+    shown = find_pixels(away).shown
+    assert shown.any((1, 2)).tolist() == [True, False, True]
