@@ -7,7 +7,7 @@ the view's farthest surface: the depth at which the pictures of the nearest othe
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -56,8 +56,10 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     assert scene.pixels is not None, "prepared scenes have pixels"
     fronts = scene.pixels.fronts
     free, bare = shown & (fronts < 0), (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)
-    cut: Iterable[np.ndarray] = [] if everywhere else bare
-    if not (free.any() or any(large_parts(view).any() for view in cut if view.any())):
+    gaps = [
+        view for view in range(len(scene)) if free[view].any() or (not everywhere and large_parts(bare[view]).any())
+    ]
+    if not gaps:
         return scene
     holes, empty, edges = np.zeros_like(free), np.zeros_like(free), dict[int, _Edges]()
     gap = 2 * round(GAP * max(shown.shape[1:]) / 2) + 1
@@ -78,7 +80,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             beside = fill_gaps(depths[..., None], covered)[..., 0][holes[view]]
             edges[view] = _Edges(beside, float(np.quantile(depths[covered], FARTHEST)))
 
-    tile_views(scene, find)
+    tile_views(scene, find, gaps)
     filled = scene
     if edges and (scene.pixels.own or np.count_nonzero(holes) < MOST * np.count_nonzero(shown)):
         filled = _add_holes(scene, holes, edges)
@@ -115,6 +117,8 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
     There are none where such squares cover little of the picture. Borders that exporters leave out, and gaps, are
     narrower, and the farthest tenth that Depth Anything 3 leaves out is less.
     """
+    if empty.mean() < PART:
+        return np.zeros_like(empty)
     side = 2 * round(LARGE * max(empty.shape) / 2) + 1
     square, rim = np.ones((side, side), np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)
     opened = cv2.morphologyEx(empty.astype(np.uint8), cv2.MORPH_OPEN, square) > 0

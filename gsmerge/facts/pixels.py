@@ -12,7 +12,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from gsmerge.kernels.gaussians.fronts import project_centres, weigh_centres
+from gsmerge.kernels.gaussians.fronts import order_by_depth, project_centres, weigh_centres
 from gsmerge.raster.images import ONE_AT_A_TIME
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.threads import in_turn
@@ -63,23 +63,23 @@ def _weigh_view(
     """
     height, width = fronts.shape
     ids, pixels, depths, areas = project_centres(means, scales, viewmat, K, width, height, NEAR_PLANE)
-    inside = areas > 0
+    order, inside = order_by_depth(depths), areas > 0
     shown = np.zeros((height, width), bool)
     shown.reshape(-1)[pixels[inside]] = True
     level = choose_level(shown, REACH * float(np.sqrt(np.median(areas[inside]))) if inside.any() else 1.0)
-    weights = weigh_centres(ids, pixels, depths, areas, opacities, fronts) if level == 0 else None
-    if weights is not None and (shown.all() or not shown.any()):
-        return ids, pixels, weights
+    if level == 0:
+        weights = weigh_centres(order, ids, pixels, areas, opacities, fronts)
+        if shown.all() or not shown.any():
+            return ids, pixels, weights
     cells, shape = _cells_of(pixels, fronts.shape, max(level, 1))
-    front_of = np.empty(shape, np.int32)
-    of_cells = weigh_centres(ids, cells, depths, areas, opacities, front_of)
-    if weights is None:
-        weights, nearest = of_cells, np.full(front_of.size, np.inf, np.float32)
-        np.minimum.at(nearest, cells[inside], np.where(front_of.reshape(-1)[cells] == ids, depths, np.inf)[inside])
-        surface = np.flatnonzero(inside & (depths <= SAME_DEPTH * nearest[cells]))
-        weigh_centres(ids[surface], pixels[surface], depths[surface], areas[surface], opacities, fronts)
-    beside = front_of.reshape(-1)[_cells_of(np.arange(fronts.size, dtype=np.int32), fronts.shape, max(level, 1))[0]]
-    np.copyto(fronts, beside.reshape(fronts.shape), where=fronts < 0)
+    first = np.empty(shape, np.int32)
+    of_cells = weigh_centres(order, ids, cells, areas, opacities, first)
+    if level > 0:
+        weights, place = of_cells, np.searchsorted(ids, first.reshape(-1))
+        surface = SAME_DEPTH * np.where(first.reshape(-1) >= 0, depths[place.clip(max=len(ids) - 1)], np.inf)
+        weigh_centres(order[(depths <= surface[cells])[order]], ids, pixels, areas, opacities, fronts)
+    in_cell, _ = _cells_of(np.arange(fronts.size, dtype=np.int32), fronts.shape, max(level, 1))
+    np.copyto(fronts, first.reshape(-1)[in_cell].reshape(fronts.shape), where=fronts < 0)
     return ids, pixels, weights
 
 

@@ -79,10 +79,8 @@ def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
     """Draw the Gaussians of all ``views`` of one camera, and choose between the drawing and their colours."""
     part = subset(scene, views.tolist())
     if len(part.gaussians) == 0:
-        black, nowhere = (
-            np.zeros((*scene.pixels.fronts.shape[1:], 3), np.float32),
-            np.zeros(scene.pixels.fronts.shape[1:], bool),
-        )
+        nowhere = np.zeros((scene.cameras.height, scene.cameras.width), bool)
+        black = np.zeros((*nowhere.shape, 3), np.float32)
         return RowPicture(black, nowhere, nowhere, black)
     tiled = tile_view(make_splats(part.gaussians), **blank_photos(part.cameras).camera(0))
     seen = view_colors(tiled)

@@ -149,18 +149,19 @@ def seen_weights(scene: Scene) -> np.ndarray:
     return most
 
 
-def tile_views(scene: Scene, use: Callable[[int, TiledView], None]) -> None:
-    """Call ``use(view, tiled)`` with every view, tiled, in parallel if memory allows."""
+def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Sequence[int] | None = None) -> None:
+    """Call ``use(view, tiled)`` with every view, or some ``views``, tiled, in parallel if memory allows."""
     splats, cameras = make_splats(scene.gaussians), scene.cameras
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def one_view(view: int) -> None:
         use(view, tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR_PLANE))
 
+    ids = range(len(scene)) if views is None else views
     if len(splats) <= ONE_AT_A_TIME:
-        parallel_map(one_view, range(len(scene)))
+        parallel_map(one_view, ids)
         return
-    for view in range(len(scene)):
+    for view in ids:
         one_view(view)
 
 

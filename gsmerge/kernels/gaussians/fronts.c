@@ -43,13 +43,13 @@ API int64_t project_centres(const float *restrict means, const float *restrict s
   return m;
 }
 
-// One pass through all Gaussians, nearest first: what passes is kept for each pixel.
+// One pass through Gaussians, nearest first: what passes is kept for each pixel.
 API int32_t weigh_centres(const int32_t *restrict order, const int32_t *restrict ids,
                           const int32_t *restrict pixels, const float *restrict areas,
                           const float *restrict opacities, float *restrict passing,
                           float *restrict most, int32_t *restrict fronts, float *restrict weights,
-                          int64_t m, int64_t n, int64_t h, int64_t w) {
-  for (int64_t k = 0; k < m; k++) {
+                          int64_t some, int64_t m, int64_t n, int64_t h, int64_t w) {
+  for (int64_t k = 0; k < some; k++) {
     int64_t j = order[k];
     if (j < 0 || j >= m) return OUTSIDE;
     int64_t i = ids[j], p = pixels[j];

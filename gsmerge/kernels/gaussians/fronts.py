@@ -17,10 +17,15 @@ _project_centres = declare(
     pixels=i4("n", out=True), depths=f4("n", out=True), areas=f4("n", out=True),
 )  # fmt: skip
 _weigh_centres = declare(
-    "weigh_centres", STATUS, order=i4("m"), ids=i4("m"), pixels=i4("m"), areas=f4("m"), opacities=f4("n"),
+    "weigh_centres", STATUS, order=i4("some"), ids=i4("m"), pixels=i4("m"), areas=f4("m"), opacities=f4("n"),
     passing=f4("h", "w", out=True), most=f4("h", "w", out=True), fronts=i4("h", "w", out=True),
     weights=f4("m", out=True),
 )  # fmt: skip
+
+
+def order_by_depth(depths):
+    """Return the order ``[m]`` int32 of depths ``[m]`` float32 above 0, nearest first; of equal ones the first row."""
+    return depth_order(depths.view(np.uint32))
 
 
 def project_centres(means, scales, viewmat, K, width, height, near):
@@ -43,10 +48,11 @@ def project_centres(means, scales, viewmat, K, width, height, near):
     return tuple(array[:m].copy() for array in (ids, pixels, depths, areas))
 
 
-def weigh_centres(ids, places, depths, areas, opacities, fronts):
-    """Weigh Gaussians at the places of their centres, nearest first; of equal depths the first row comes first.
+def weigh_centres(order, ids, places, areas, opacities, fronts):
+    """Weigh Gaussians at the places of their centres.
 
     Args:
+        order: ``[k]`` int32, those of the m Gaussians that count, nearest first.
         ids: ``[m]`` int32 rows.
         places: ``[m]`` int32, the pixel or cell ``row * w + column`` of each.
         areas: ``[m]`` float32, see :func:`project_centres`.
@@ -55,10 +61,9 @@ def weigh_centres(ids, places, depths, areas, opacities, fronts):
             without any.
 
     Returns:
-        Opacity times transmittance times area ``[m]`` float32.
+        Opacity times transmittance times area ``[m]`` float32; 0 of those that do not count.
     """
-    weights, passing = np.empty(len(ids), np.float32), np.ones(fronts.shape, np.float32)
+    weights, passing = np.zeros(len(ids), np.float32), np.ones(fronts.shape, np.float32)
     fronts[:] = -1
-    order = depth_order(depths.view(np.uint32))
     _weigh_centres(order, ids, places, areas, opacities, passing, np.zeros_like(passing), fronts, weights)
     return weights

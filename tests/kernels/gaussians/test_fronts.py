@@ -12,7 +12,7 @@ from gsmerge.facts import pixels as pixels_module
 from gsmerge.facts.pixels import find_pixels
 from gsmerge.geometry import project
 from gsmerge.kernels import elementary
-from gsmerge.kernels.gaussians.fronts import project_centres, weigh_centres
+from gsmerge.kernels.gaussians.fronts import order_by_depth, project_centres, weigh_centres
 from gsmerge.types import Cameras, Gaussians, Scene
 
 WIDTH, HEIGHT, NEAR = 23, 17, 0.01
@@ -55,7 +55,7 @@ def weigh(gaussians: Gaussians, view: int) -> tuple[np.ndarray, ...]:
     columns = (np.ascontiguousarray(column, np.float32) for column in (gaussians.means, gaussians.scales))
     opacities = gaussians.opacities.astype(np.float32)
     ids, pixels, depths, areas = project_centres(*columns, CAMERAS.viewmats[view], K, WIDTH, HEIGHT, NEAR)
-    return ids, pixels, weigh_centres(ids, pixels, depths, areas, opacities, fronts), fronts
+    return ids, pixels, weigh_centres(order_by_depth(depths), ids, pixels, areas, opacities, fronts), fronts
 
 
 @pytest.mark.parametrize("case", CASES)
