@@ -338,6 +338,7 @@ class Scene:
         large_photos: The photos with more pixels than the views, or None.
         masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. A view without a photo has none such.
         importance: ``[v,h,w]`` float32, how many pixels a photo's pixel counts as in a fit; None: one everywhere.
+        filled: ``[n]`` bool, Gaussians that the file lacks and that fill holes; None: none.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -356,6 +357,7 @@ class Scene:
     large_photos: LargePhotos | None = None
     masks: np.ndarray | None = None
     importance: np.ndarray | None = None
+    filled: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
@@ -391,10 +393,11 @@ class Scene:
 
     @property
     def covered(self) -> np.ndarray | None:
-        """Mask ``[v,h,w]`` of pixels with a Gaussian of their view's own, where others have none; None elsewhere."""
-        if self.pixels is None or not self.pixels.own or self.pixels.shown.all():
+        """Mask ``[v,h,w]`` of pixels with a Gaussian of their view's own and of the file; None where these are all."""
+        if self.pixels is None or not self.pixels.own or (self.filled is None and self.pixels.shown.all()):
             return None
-        return self.pixels.shown
+        shown = self.pixels.shown
+        return shown if self.filled is None else shown & ~self.filled[self.pixels.fronts]
 
     @property
     def is_shown(self) -> bool:
@@ -418,8 +421,13 @@ class Scene:
 
     @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians, n; budgets and ratios refer to it."""
-        return len(self.gaussians)
+        """Number of Gaussians of the file; budgets and ratios refer to it."""
+        return len(self.gaussians) - (0 if self.filled is None else int(self.filled.sum()))
+
+    @property
+    def file_gaussians(self) -> Gaussians:
+        """Gaussians of the file, without those that fill holes."""
+        return self.gaussians if self.filled is None else self.gaussians[~self.filled]
 
     @property
     def pixels_per_view(self) -> int:
@@ -427,17 +435,27 @@ class Scene:
         return self.cameras.height * self.cameras.width
 
 
+def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:
+    """Add Gaussians to a scene, each in front of one of the pixels ``places [n]``, over all views, that show none."""
+    assert scene.pixels is not None, "pixels are known"
+    first, homes, fronts = len(scene.gaussians), scene.pixels.homes, scene.pixels.fronts.copy()
+    fronts.reshape(-1)[places] = np.arange(first, first + len(added), dtype=np.int32)
+    pixels = replace(scene.pixels, homes=np.concatenate([homes, places.astype(homes.dtype)]), fronts=fronts)
+    before = np.zeros(first, bool) if scene.filled is None else scene.filled
+    filled = np.concatenate([before, np.ones(len(added), bool)])
+    return replace(scene, gaussians=Gaussians.concat([scene.gaussians, added]), pixels=pixels, filled=filled)
+
+
 @dataclass(frozen=True)
 class PicturedScene(Scene):
     """A scene that has a picture of every view: its photo, or what stands in for it.
 
     Pictures are black, and do not count for scores, where ``empty [v,h,w]``, a mask or shares: nothing may be there;
-    None: nowhere. Gaussians that are True in ``filled [n]`` fill holes, and are not the file's; None: none are.
+    None: nowhere.
     """
 
     images: np.ndarray
     empty: np.ndarray | None = None
-    filled: np.ndarray | None = None
 
     @staticmethod
     def of(scene: Scene, images: np.ndarray, masks: np.ndarray | None) -> PicturedScene:

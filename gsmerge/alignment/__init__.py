@@ -32,6 +32,7 @@ from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, che
 if TYPE_CHECKING:
     from gsmerge.alignment.cameras import move_cameras, other_conventions
     from gsmerge.alignment.doubted_depths import choose_depths
+    from gsmerge.alignment.dropped_depths import fill_from_depths
     from gsmerge.alignment.estimate import estimate_cameras, estimate_from_rows
     from gsmerge.alignment.explain import explain_misalignment, misalignment_error
     from gsmerge.alignment.focal import estimate_focal
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 _LATER = {
     "cameras": ("move_cameras", "other_conventions"),
     "doubted_depths": ("choose_depths",),
+    "dropped_depths": ("fill_from_depths",),
     "estimate": ("estimate_cameras", "estimate_from_rows"),
     "explain": ("explain_misalignment", "misalignment_error"),
     "focal": ("estimate_focal",),

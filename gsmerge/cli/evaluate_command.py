@@ -131,7 +131,7 @@ def _facts(
         for name, info in infos.items()
     }
     if own.speed or own.merge_seconds:
-        scenes = {INPUT: pair.scene.gaussians, **pair.gaussians}
+        scenes = {INPUT: pair.scene.file_gaussians, **pair.gaussians}
         cameras = shrink_cameras(pair.scene.cameras, options.photo_side)
         zooms = SPEED_ZOOMS if options.zoom == EvaluateOptions().zoom else options.zoom
         near = near_plane(pair.scene)
@@ -184,7 +184,7 @@ def _write_maps(folder: Path, pair: BeforeAfter, *, context: bool) -> list[Path]
     from gsmerge.measure.preview import save_picture
 
     views = picture_stems([*pair.scene.names, *(() if pair.held_out is None else pair.held_out.names)])
-    results, paths = pair.gaussians or {INPUT: pair.scene.gaussians}, list[Path]()
+    results, paths = pair.gaussians or {INPUT: pair.scene.file_gaussians}, list[Path]()
     stems = dict(
         zip(results, picture_stems([Path(name).with_suffix(".png").as_posix() for name in results]), strict=True)
     )

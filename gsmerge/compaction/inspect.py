@@ -176,13 +176,13 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     facts |= _describe_scene(load, is_result=is_result)
     if shows_nothing(load.scene):
         return facts | {"alignment_problem": str(nothing_left(files.ply)), "compact": None, "auto": None}
-    if load.recovery is None or load.alignment is None or load.scene.pixels is None:
+    if load.recovery is None or load.alignment is None:
         return facts | {"alignment_problem": load.problem}
     return facts | {
         "width": load.scene.cameras.width,
         "height": load.scene.cameras.height,
         "per_pixel": load.recovery.best.layout.per_pixel,
-        "num_missing": int((load.scene.pixels.fronts < 0).sum()),
+        "num_missing": 0 if load.scene.covered is None else int((~load.scene.covered).sum()),
         "alignment": asdict(load.alignment),
         "rows": load.recovery.description,
     }

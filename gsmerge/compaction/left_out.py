@@ -97,7 +97,7 @@ def can_leave_out(prepared: Prepared) -> bool:
 
 def file_rows(scene: PicturedScene) -> Gaussians:
     """Return the Gaussians that the file has, without those that fill holes."""
-    return scene.gaussians if scene.filled is None else scene.gaussians[~scene.filled]
+    return scene.file_gaussians
 
 
 def cover(rest: PicturedScene, views: PicturedScene) -> np.ndarray:

@@ -120,7 +120,9 @@ class CompactResult:
 
         middle = self.cameras.numpy()[[len(self.cameras) // 2]]
         given = self.scene() if isinstance(self.scene, ReferenceType) else None  # a path is not read again for this
-        drawn = {"after": self.gaussians} if given is None else {"before": given.gaussians, "after": self.gaussians}
+        drawn = (
+            {"after": self.gaussians} if given is None else {"before": given.file_gaussians, "after": self.gaussians}
+        )
         return (
             "".join(
                 picture_html(to_picture(render(each.numpy(), middle).images[0]), f"the middle view {name}")
@@ -242,7 +244,7 @@ def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
     if shown.empty is not None:  # where a result may show nothing, the input is not compared either
         scene = replace(scene, masks=prepared.result_views().masks)
     covered = None if scene.covered is None else list(scene.covered[list(plan.scored_views)])
-    return _score_photos("input", scene.gaussians, scene, prepared, plan, covered)
+    return _score_photos("input", scene.file_gaussians, scene, prepared, plan, covered)
 
 
 def _score_photos(
@@ -303,7 +305,7 @@ class InputScores:
 
 def score_input(prepared: Prepared, plan: Plan) -> InputScores:
     """Score the input's own Gaussians, unless the plan has that."""
-    photos, gaussians = plan.before or measure_input(prepared, plan), prepared.input_scene.gaussians
+    photos, gaussians = plan.before or measure_input(prepared, plan), prepared.input_scene.file_gaussians
     return InputScores(
         photos, measure_on_files(gaussians, prepared, plan), measure_protected(gaussians, prepared, plan)
     )

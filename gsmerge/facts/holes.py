@@ -24,7 +24,7 @@ from gsmerge.raster.composite import blend_depths
 from gsmerge.raster.images import tile_views
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Gaussians, PicturedScene
+from gsmerge.types import Gaussians, PicturedScene, fill_pixels
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
@@ -100,15 +100,8 @@ def _add_holes(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edg
     views = sorted(edges)
     added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), views))
     note(f"{len(added):,} pixels that Gaussians hardly cover, or not at all, get the colours of their pictures")
-    assert scene.pixels is not None, "prepared scenes have pixels"
-    homes, fronts, first = scene.pixels.homes, scene.pixels.fronts.copy(), len(scene.gaussians)
     holes[[view for view in range(len(scene)) if view not in edges]] = False
-    places = np.flatnonzero(holes)
-    fronts.reshape(-1)[places] = np.arange(first, first + len(added), dtype=np.int32)
-    return replace(
-        scene, gaussians=Gaussians.concat([scene.gaussians, added]), filled=np.arange(first + len(added)) >= first,
-        pixels=replace(scene.pixels, homes=np.concatenate([homes, places.astype(homes.dtype)]), fronts=fronts),
-    )  # fmt: skip
+    return fill_pixels(scene, added, np.flatnonzero(holes))
 
 
 def large_parts(empty: np.ndarray) -> np.ndarray:

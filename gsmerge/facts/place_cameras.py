@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.facts.views import concat_cameras
+from gsmerge.facts.views import concat_cameras, take_rows
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry import motion_matrices, motion_vectors, nearest_views, normalize
 from gsmerge.kernels.elementary import cos, sin
@@ -87,7 +87,7 @@ def keep_finite(scene: Scene) -> Scene:
         raise ValueError("expected at least one finite Gaussian, got none")
     if count:
         note(f"{count} Gaussians are not finite and were left out")
-        scene = replace(scene, gaussians=g[finite])
+        scene = take_rows(scene, np.flatnonzero(finite))
     return scene
 
 
@@ -120,7 +120,9 @@ def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
     images = np.concatenate([scene.images, drawn.images.clip(0, 1)])
     empty = np.concatenate([np.zeros(scene.images.shape[:3], np.float32), 1 - drawn.alphas[..., 0]])
     names = (*scene.names, *(f"around {view}" for view in range(len(more))))
-    return replace(scene, cameras=concat_cameras(scene.cameras, more), images=images, empty=empty, names=names)
+    return replace(
+        scene, cameras=concat_cameras(scene.cameras, more), images=images, empty=empty, names=names, pixels=None
+    )
 
 
 def add_judges(scene: Scene) -> Scene:
@@ -150,7 +152,7 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
         more = concat_cameras(between_cameras(scene.cameras), more)
     images = np.concatenate([scene.images, render(scene.gaussians, more).images.clip(0, 1)])
     names = (*scene.names, *(f"around {view}" for view in range(len(more))))
-    return replace(scene, cameras=concat_cameras(scene.cameras, more), images=images, names=names)
+    return replace(scene, cameras=concat_cameras(scene.cameras, more), images=images, names=names, pixels=None)
 
 
 def between_cameras(cameras: Cameras, *further: float) -> Cameras:

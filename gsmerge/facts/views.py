@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.types import PER_PIXEL, Cameras, PicturedScene, Pixels, Scene, SceneT
+from gsmerge.types import PER_PIXEL, Cameras, Pixels, Scene, SceneT
 
 MAX_SCORED_VIEWS = 24  # views by which whole scenes are judged where something depends on it
 REPORT_VIEWS = 4  # views that input and result are scored on for the report alone
@@ -93,14 +93,14 @@ def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
     if scene.pixels is not None and scene.pixels.own:
         rows, parts["pixels"] = scene.pixels.select(ids)
         parts["gaussians"] = scene.gaussians[rows]
-        if isinstance(scene, PicturedScene) and scene.filled is not None:
-            parts["filled"] = scene.filled[rows]
+        parts["filled"] = None if scene.filled is None else scene.filled[rows]
     return replace(scene, **parts)
 
 
 def take_rows(scene: SceneT, rows: np.ndarray) -> SceneT:
     """Return the scene with only the Gaussians ``rows [m]``, ascending; pixels that showed others show none."""
-    part = replace(scene, gaussians=scene.gaussians[rows], pixels=None)
+    filled = None if scene.filled is None else scene.filled[rows]
+    part = replace(scene, gaussians=scene.gaussians[rows], filled=filled, pixels=None)
     if scene.pixels is None or not scene.pixels.own:
         return part
     numbers = np.full(len(scene.gaussians), -1, np.int32)

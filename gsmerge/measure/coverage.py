@@ -49,7 +49,8 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
     shares = shares_inside(scene, MAX_SAMPLE_GAUSSIANS)
     pixels: list[float | None] = [None] * len(scene)
     if scene.pixels is not None and scene.pixels.own:
-        visible = (scene.gaussians.opacities >= TRANSPARENT)[scene.pixels.fronts] & scene.pixels.shown
+        visible = scene.pixels.shown if scene.covered is None else scene.covered
+        visible = visible & (scene.gaussians.opacities >= TRANSPARENT)[scene.pixels.fronts]
         pixels = [float(view.mean()) for view in visible]
     keys = ("name", "share_of_pixels", "share_of_gaussians")
     return [dict(zip(keys, view, strict=True)) for view in zip(scene.names, pixels, shares, strict=True)]
@@ -57,6 +58,6 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
 
 def shares_inside(scene: Scene, most: int) -> list[float]:
     """Measure the share of the Gaussians, of at most so many, whose centres lie in each view."""
-    rows = np.arange(0, len(scene.gaussians), max(1, -(-len(scene.gaussians) // most)))
-    points = scene.gaussians.means[rows].astype(np.float64)
+    rows = np.arange(0, scene.num_gaussians, max(1, -(-scene.num_gaussians // most)))
+    points = scene.file_gaussians.means[rows].astype(np.float64)
     return [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]

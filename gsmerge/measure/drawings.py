@@ -325,7 +325,7 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     load = _with_views(own, inside=photos)
     if options.overlay is not None and load is not own:
         load = replace(load, notes=(*load.notes, "overlay: these views count, so it says nothing of photos"))
-    scenes = [load.scene.gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
+    scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     named = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
     if options.overlay is not None and len(load.scene):

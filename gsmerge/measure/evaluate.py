@@ -224,7 +224,7 @@ def evaluate(
         raise UsageError("expected a scene with views, got none")
     given = scene
     scene, mended = judged_pictures(given)
-    inputs, results = scene.gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
+    inputs, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
         targets = shrink_views(targets, options.photo_side)

@@ -187,7 +187,7 @@ def page_data(
     splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
     splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
     frame = scene_frame(scene)
-    named = {INPUT: scene.gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
+    named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
     entered = {name: frame.enter(gaussians) for name, gaussians in named.items()}
     placed = frame.enter_cameras(scene.cameras.numpy())
     looked_at = [name for name in named if name != INPUT or not results]
@@ -223,7 +223,7 @@ def page_data(
     lacks_pixels = share is not None and share < WHOLE
     return ViewData(
         title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
-        lacks_pixels, confirm_depths(replace(scene, gaussians=entered[INPUT], cameras=placed)),
+        lacks_pixels, confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=placed)),
     )  # fmt: skip
 
 
@@ -268,7 +268,7 @@ def _page_views(
 
 def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
     """Draw Gaussians of a scene's world from outside of its capture."""
-    camera, distance = outside_camera(scene.cameras.numpy(), scene.gaussians.means)
+    camera, distance = outside_camera(scene.cameras.numpy(), scene.file_gaussians.means)
     renders = (render(gaussians, camera, near=near_plane(scene)) for gaussians in named.values())
     return PageView(
         name=OUTSIDE,
@@ -343,7 +343,9 @@ def _pack(
         return *pack_splats(gaussians), highest
     if light:
         return None, highest, highest
-    homes = scene.pixels.homes if scene.pixels is not None and scene.pixels.own else None
+    homes = None
+    if scene.pixels is not None and scene.pixels.own:
+        homes = scene.pixels.homes if scene.filled is None else scene.pixels.homes[~scene.filled]
     return *pack_splats(gaussians, cameras, homes), highest
 
 

@@ -38,7 +38,7 @@ def color_from_photos(gaussians: Gaussians, pixels: Pixels | None, images: np.nd
 
 
 def use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: float) -> tuple[Scene, list[str]]:
-    """Start from depth maps beside the file where they are better, with a note.
+    """Start from depth maps beside the file where they are better, or where the exporter dropped pixels; with notes.
 
     ``unit``: that of the cameras' file in the scene's.
     """
@@ -46,10 +46,17 @@ def use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: floa
     size = scene.cameras.height, scene.cameras.width
     if depths is None or depths.shape[1:] != size or len(depths) <= max(layout.views):
         return scene, []
-    from gsmerge.alignment import choose_depths
+    depths = depths[list(layout.views)]
+    from gsmerge.alignment import choose_depths, fill_from_depths
 
-    scene, moved = choose_depths(scene, depths[list(layout.views)], unit)
-    return scene, [f"{moved:,} Gaussians start at the depth maps, which other views confirm more often"] * (moved > 0)
+    scene, moved = choose_depths(scene, depths, unit)
+    notes = [f"{moved:,} Gaussians start at the depth maps, which other views confirm more often"] * (moved > 0)
+    if scene.images is None or layout.kind not in ("box+depth", "pruned"):
+        return scene, notes
+    full = fill_from_depths(scene, depths, scene.images)
+    count = len(full.gaussians) - len(scene.gaussians)
+    filled = f"{count:,} pixels that the exporter dropped are put back from the depth maps"
+    return full, [*notes, *[filled] * (count > 0)]
 
 
 def take_rows(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussians, Pixels | None]:

@@ -38,7 +38,7 @@ def test_compact_writes_beside_the_input_and_says_what_it_did(smallest_copy: Pat
 
 def test_json_report(smallest_copy: Path, run: Run) -> None:
     out = smallest_copy / "small.ply"
-    outcome = run("compact", smallest_copy, "-o", out, *SMALL, "--k", 2, "--seed", 3, "--json", code=0)
+    outcome = run("compact", smallest_copy, "-o", out, *SMALL, "--k", 1, "--seed", 3, "--json", code=0)
     assert outcome.err == ""
     document = json.loads(outcome.out)
     ply = smallest_copy / "scene.ply"
@@ -52,7 +52,7 @@ def test_json_report(smallest_copy: Path, run: Run) -> None:
     assert document["output"]["bytes"] == out.stat().st_size
     assert document["output"]["num_gaussians"] == len(gsmerge.read_ply(out).gaussians)
     assert document["ratio"] == pytest.approx(document["output"]["num_gaussians"] / (3 * 24 * 16))
-    assert (document["seed"], document["options"]["k"], document["options"]["superpixels"]) == (3, 2, 200)
+    assert (document["seed"], document["options"]["k"], document["options"]["superpixels"]) == (3, 1, 200)
     assert set(document["seconds"]) >= {"import", "read", "segment", "encode", "decode", "write"}
     assert document["total_seconds"] == pytest.approx(sum(document["seconds"].values()), abs=1e-2)
     assert document["psnr_input_views"]["after"] > 15

@@ -134,8 +134,16 @@ def save_export(folder: Path, tiny: Tiny, rows: np.ndarray, *, cameras: bool = T
 
 def home(scene: Scene, tiny: Tiny, kept: np.ndarray | None = None) -> float:
     """Share of the stored (or of the kept) pixels whose Gaussian is the one made for them, known by its opacity."""
-    same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
+    same = np.abs(of_pixels(scene, "opacities") - tiny.gaussians.opacities) < 1e-5
     return float(same[scene.pixels.shown.reshape(-1) if kept is None else kept].mean())
+
+
+def of_pixels(scene: Scene, name: str) -> np.ndarray:
+    """A column of the Gaussian in front of each pixel, over all views; 0 where there is none."""
+    assert scene.pixels is not None
+    values = getattr(scene.gaussians, name)[scene.pixels.fronts.reshape(-1)].copy()
+    values[~scene.pixels.shown.reshape(-1)] = 0
+    return values
 
 
 def da3_rows(tiny: Smooth, depths: np.ndarray | None = None) -> np.ndarray:

@@ -44,16 +44,16 @@ def test_the_input_is_scored_as_its_file_has_it(scene: Scene) -> None:
     """What fills holes is merged, but is not the input's."""
     missing = np.zeros_like(scene.pixels.shown)
     missing[:, 6:18, 8:24] = True
-    some = scenes.shown_in(scene, ~missing)
+    some = replace(scene, filled=missing.reshape(-1))
     before = scenes.compacted(some, fit="none").report
     assert before.num_input == int((~missing).sum())
-    assert before.psnr_before == pytest.approx(scenes.psnr_of(some.gaussians, scene), abs=0.1)
+    assert before.psnr_before == pytest.approx(scenes.psnr_of(some.file_gaussians, scene), abs=0.1)
     assert before.psnr_before < scenes.psnr_of(scene.gaussians, scene) - 3
     assert before.psnr_after > before.psnr_before
     assert before.covered is not None
-    assert before.covered.share == pytest.approx(some.pixels.shown.mean(), abs=0.02)
-    images = scenes.images_of(some.gaussians, some.cameras)[0].clip(0, 1)
-    inside = -10 * elementary.log10(np.square(images - some.images)[some.pixels.shown].mean())
+    assert before.covered.share == pytest.approx(some.covered.mean(), abs=0.02)
+    images = scenes.images_of(some.file_gaussians, some.cameras)[0].clip(0, 1)
+    inside = -10 * elementary.log10(np.square(images - some.images)[some.covered].mean())
     assert before.covered.before == pytest.approx(inside, abs=0.5)  # the mean over views, not over pixels
     assert before.covered.before > before.psnr_before + 3
     assert scenes.compacted(scene, fit="none").report.covered is None
@@ -63,7 +63,7 @@ def test_a_result_that_loses_what_the_input_covers_is_worse(scene: Scene) -> Non
     """Over all pixels it gains, as it fills the gap."""
     missing = np.zeros_like(scene.pixels.shown)
     missing[:, 6:18, 8:24] = True
-    report = scenes.compacted(scenes.shown_in(scene, ~missing), fit="none", budget=40).report
+    report = scenes.compacted(replace(scene, filled=missing.reshape(-1)), fit="none", budget=40).report
     assert report.covered is not None
     assert report.psnr_after > report.psnr_before
     assert report.covered.after < report.covered.before - 1

@@ -119,6 +119,7 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
         images=photos,
         pixels=_concat_pixels(scenes),
         names=tuple(name for scene in scenes for name in scene.names),
+        filled=_concat_filled(scenes),
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
         masks=None if photos is None else _concat_values(scenes, [scene.masks for scene in scenes], usual=True),
         importance=_concat_values(scenes, [scene.importance for scene in scenes], usual=np.float32(1)),
@@ -135,6 +136,14 @@ def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
         fronts.append(np.where(scene.pixels.shown, scene.pixels.fronts + np.int32(rows), np.int32(-1)))
         rows, views = rows + len(scene.gaussians), views + len(scene)
     return Pixels(np.concatenate(homes), np.concatenate(fronts), own=True)
+
+
+def _concat_filled(scenes: Sequence[Scene]) -> np.ndarray | None:
+    """Concatenate which Gaussians ``[n]`` fill holes; None if none do."""
+    if all(scene.filled is None for scene in scenes):
+        return None
+    each = [np.zeros(len(scene.gaussians), bool) if scene.filled is None else scene.filled for scene in scenes]
+    return np.concatenate(each)
 
 
 def _concat_values(

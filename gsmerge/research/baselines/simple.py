@@ -30,7 +30,7 @@ MAX_TILED = 2_000_000  # Gaussians in the tiled views under way: each is as larg
 
 def own_gaussians(scene: PicturedScene) -> Gaussians:
     """Return the Gaussians of the file, without those that fill holes."""
-    return scene.gaussians if scene.filled is None else scene.gaussians[~scene.filled]
+    return scene.file_gaussians
 
 
 def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:

@@ -200,7 +200,7 @@ class ChartRun:
             raise ValueError(f"expected at most {len(scene)} views, got {views}")
         part, targets = choose_views(scene, held_out, views)
         facts: dict[str, Any] = {"seconds": 0.0}
-        gaussians = part.gaussians
+        gaussians = part.file_gaussians
         if method != INPUT:
             settings = replace(self.settings, threads=threads)
             kind = (method, *(self.record.settings.get(name) for name in ("fit", "segmentation", "k")))

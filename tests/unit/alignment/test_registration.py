@@ -131,7 +131,8 @@ def test_files_that_cannot_be_joined(parts: list[Scene]) -> None:
     with refuses(SceneError, "b.ply", "-o"):
         join_scenes([parts[0], unaligned], PATHS[:2])
     small = replace(parts[1].cameras, width=HEIGHT, height=WIDTH)
-    tall = replace(parts[1], cameras=small, images=parts[1].images.reshape(1, WIDTH, HEIGHT, 3))
+    pixels = Pixels.of_grid(np.ones((1, WIDTH, HEIGHT), bool))
+    tall = replace(parts[1], cameras=small, images=parts[1].images.reshape(1, WIDTH, HEIGHT, 3), pixels=pixels)
     with refuses(SceneError, "b.ply", "144 x 96", "a.ply", "96 x 144"):
         join_scenes([parts[0], tall], PATHS[:2])
     g = parts[1].gaussians

@@ -165,7 +165,7 @@ def test_more_blocks_than_views(scene: Scene) -> None:
 def test_unaligned_scenes_have_no_blocks(scene: Scene) -> None:
     unaligned = replace(scene, pixels=None)
     assert count_blocks(unaligned) == 1
-    with refuses(UsageError, "blocks 2", "Gaussian"):
+    with refuses(UsageError, "blocks 2", "Gaussians"):
         compact(unaligned, blocks=2)
 
 

@@ -108,8 +108,9 @@ def test_coverage_per_view(tiny_folder: Path, tiny: Tiny) -> None:
     actual = inspect(tiny_folder)
     assert [view["share_of_pixels"] for view in actual["coverage"]] == [1, 0.75, 1]
     assert [view["name"] for view in actual["coverage"]] == [f"images/{name}" for name in tiny.names]
+    means = tiny.gaussians.means[opacities > 0].astype(np.float64)
     for view, w2c in zip(actual["coverage"], tiny.w2c, strict=True):
-        image = (tiny.gaussians.means.astype(np.float64) @ w2c[:3, :3].T + w2c[:3, 3]) @ tiny.K.T
+        image = (means @ w2c[:3, :3].T + w2c[:3, 3]) @ tiny.K.T
         xy = image[:, :2] / image[:, 2:]
         inside = (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < (20, 14)).all(1)
         assert view["share_of_gaussians"] == pytest.approx(inside.mean())

@@ -16,6 +16,7 @@ from exports import (
     da3_rows,
     export_rows,
     home,
+    of_pixels,
     save_export,
     smooth_scene,
     turned,
@@ -68,7 +69,7 @@ def test_depth_maps_that_were_rounded(tmp_path: Path, decimals: int) -> None:
     write_npz(tmp_path / "exports/mini_npz/results.npz", tiny, extrinsics=w2c, depth=depths.round(decimals))
     loaded = load_scene(tmp_path / "gs_ply/0000.ply")
     scene = loaded.pixel_scene()
-    same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
+    same = np.abs(of_pixels(scene, "opacities") - tiny.gaussians.opacities) < 1e-5
     assert float(same[da3_rows(tiny)].mean()) > 0.99
     assert scene.num_gaussians == loaded.info.count
 
@@ -84,10 +85,10 @@ def test_poses_of_the_user(tmp_path: Path, aligned: bool) -> None:
     write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths.astype(np.float32))
     loaded = load_scene(tmp_path / "gs_ply/0000.ply")
     scene = loaded.pixel_scene()
-    same = np.abs(scene.gaussians.opacities - tiny.gaussians.opacities) < 1e-5
+    same = np.abs(of_pixels(scene, "opacities") - tiny.gaussians.opacities) < 1e-5
     assert same[da3_rows(tiny)].all()
     assert loaded.alignment.worst_px < 0.5
-    assert np.array_equal(scene.gaussians.means[da3_rows(tiny)[0]], read_ply(loaded.info.path).gaussians.means[0])
+    assert np.array_equal(of_pixels(scene, "means")[da3_rows(tiny)[0]], read_ply(loaded.info.path).gaussians.means[0])
 
 
 def test_depth_is_the_distance_along_the_ray(tmp_path: Path) -> None:
@@ -97,10 +98,10 @@ def test_depth_is_the_distance_along_the_ray(tmp_path: Path) -> None:
     write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths.astype(np.float32))
     scene = load_scene(tmp_path / "gs_ply/0000.ply").pixel_scene()
     assert scene.pixels.shown.all()
-    assert np.linalg.norm(scene.gaussians.means - tiny.gaussians.means, axis=1).max() < 0.05
+    assert np.linalg.norm(of_pixels(scene, "means") - tiny.gaussians.means, axis=1).max() < 0.05
     rows = da3_rows(tiny)  # and is never taken for the file's own
-    assert np.array_equal(np.flatnonzero(scene.pixels.shown.reshape(-1)), rows)
-    assert np.array_equal(scene.gaussians.means, tiny.gaussians.means[rows])
+    assert np.array_equal(np.flatnonzero(scene.covered.reshape(-1)), rows)
+    assert np.array_equal(scene.file_gaussians.means, tiny.gaussians.means[rows])
 
 
 @pytest.mark.parametrize("images", [True, False])
@@ -119,7 +120,7 @@ def test_depth_is_wrongly_the_distance_along_the_ray(tmp_path: Path, images: boo
     loaded = load_scene(tmp_path / "gs_ply/0000.ply")
     assert f"{len(kept):,} Gaussians start at the depth maps, which other views confirm more often" in loaded.notes
     rows = slice(None) if images else kept
-    assert np.abs(loaded.scene.gaussians.means - scene.gaussians.means)[rows].max() < 1e-3
+    assert np.abs(of_pixels(loaded.scene, "means") - scene.gaussians.means)[rows].max() < 1e-3
 
 
 def test_depth_maps_of_fewer_views_are_left_alone(tmp_path: Path) -> None:
@@ -140,7 +141,7 @@ def test_rotations_are_never_changed(tmp_path: Path) -> None:
     loaded = load_scene(tmp_path / "gs_ply/0000.ply")
     assert not any("rotations" in note for note in loaded.notes)
     first = np.array([x[0], y[0], z[0], w[0]])
-    assert np.allclose(loaded.scene.gaussians.quats[da3_rows(tiny)[0]], first, atol=1e-5)
+    assert np.allclose(of_pixels(loaded.scene, "quats")[da3_rows(tiny)[0]], first, atol=1e-5)
 
 
 def test_arrays_as_the_demo_names_them(tmp_path: Path) -> None:
@@ -170,7 +171,7 @@ def test_several_gaussians_per_pixel(tmp_path: Path, axes: tuple[int, ...], trim
     rows["opacity"] = np.broadcast_to(np.arange(3) - 1.0, (*inner.shape, 3)).transpose(axes).reshape(-1)
     scene = load_scene(save_export(tmp_path, SMOOTH, rows)).pixel_scene()
     assert scene.names == tuple(f"images/{name}" for name in SMOOTH.names for _ in range(3))
-    opacities = scene.gaussians.opacities.reshape(9, -1)[scene.pixels.shown.reshape(9, -1)].reshape(9, -1)
+    opacities = scene.gaussians.opacities.reshape(9, -1)
     assert (opacities == opacities[:, :1]).all()
     assert np.allclose(opacities[3:6, 0], 1 / (1 + np.exp([1, 0, -1])))
 

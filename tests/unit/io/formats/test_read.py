@@ -54,7 +54,7 @@ def test_values_are_activated_by_hand(tmp_path: Path) -> None:
     assert gaussians.quats[0].tolist() == pytest.approx([0, 0.6, 0, 0.8], abs=1e-6)
     assert gaussians.sh0[:, 0, 2].tolist() == rows["f_dc_2"].tolist()
     assert gaussians.means.dtype == np.float32
-    assert scene.pixels.shown.all()
+    assert scene.valid.all()
 
 
 def test_info_of_the_common_layouts(tmp_path: Path) -> None:

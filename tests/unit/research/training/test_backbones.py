@@ -126,7 +126,7 @@ def test_pixels_may_lack_a_gaussian(scene: Scene, data: Path) -> None:
 
     (capture,) = bind_backbone(list_captures(data), with_holes)
     example = capture.draw(PAPER, np.random.default_rng(0))
-    assert not example.members.opacities[::7].any()
+    assert not (example.members.pixels % 7 == 0).any()
     assert np.isfinite(example.base.means).all()
 
 
