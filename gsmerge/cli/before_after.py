@@ -74,10 +74,9 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     if args.targets is not None or views is not None:
         require_views(load)
     scene, held_out, adapted = held_out_views(load, args.targets, vars(args).get("target_images"), views)
-    if not scene.has_own_pixels:
-        with record_run() as record:
-            scene = add_views(scene, shown=True)
-        notes = [PLACED_VIEWS if note == NO_VIEWS and not args.after else note for note in record.notes]
+    with record_run() as record:
+        scene = add_views(scene, shown=True)
+    notes = [PLACED_VIEWS if note == NO_VIEWS and not args.after else note for note in record.notes]
     plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
     if plys and all(len(ply.gaussians) > len(load.scene.gaussians) for ply in plys.values()):
         notes.append(

@@ -92,7 +92,7 @@ def _compact_sizes(
         results[name] = result.gaussians
         if result.report.new_views is not None:
             gains[name] = result.report.new_views.bounds
-        if pair.scene.has_own_pixels and len(result.cameras) == len(pair.scene):
+        if len(result.cameras) == len(pair.scene):
             cameras[name] = replace(pair.scene.cameras, viewmats=result.cameras.viewmats)
     return results, cameras, gains, [file_bytes(len(gaussians), gaussians.sh_degree) for gaussians in results.values()]
 

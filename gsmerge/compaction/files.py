@@ -178,7 +178,7 @@ def _compact_notes(loaded: Loaded) -> tuple[str, ...]:
     """Return a note if the scene is a result of gsmerge, by its header or by its small number of Gaussians."""
     scene, comments = loaded.scene, loaded.info.comments
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
-    few = is_from_gsmerge(comments) and not scene.has_own_pixels and scene.num_gaussians <= pixels / 2
+    few = is_from_gsmerge(comments) and scene.num_gaussians <= pixels / 2
     if not few and RESULT_COMMENT not in comments:
         return ()
     count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"

@@ -130,7 +130,7 @@ def _photo_notes(scene: Scene) -> list[str]:
 
 
 def _measure_agreement(scene: Scene) -> Agreement | None:
-    return confirm_depths(canonicalise(scene)[0]) if scene.has_own_pixels and len(scene.gaussians) else None
+    return confirm_depths(canonicalise(scene)[0]) if len(scene) and len(scene.gaussians) else None
 
 
 def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] | None:
@@ -210,10 +210,10 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         "auto": _describe_auto(scene, agreement),
         "agreement": agreement and agreement.to_dict(),
     }
-    if is_result and len(scene) and not scene.has_own_pixels:  # those of views hide each other where these overlap
+    if is_result and len(scene):
         facts["num_unseen"] = int((count_views_in_world(scene.gaussians, scene.cameras) == 0).sum())
     if not is_result:
-        is_known = scene.has_own_pixels or any(exporter.is_marked for exporter in load.exporters)
+        is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)
         facts["exporter"] = exporter_names(load.exporters) if is_known else f"not known: {load.info.layout}"
     return facts
 

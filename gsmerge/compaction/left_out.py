@@ -102,5 +102,4 @@ def file_rows(scene: PicturedScene) -> Gaussians:
 
 def cover(rest: PicturedScene, views: PicturedScene) -> np.ndarray:
     """Mark the pixels ``[v,h,w]`` of views that surfaces which views of the ``rest`` see cover."""
-    points = file_rows(rest).means.astype(np.float64) if rest.has_own_pixels else context_points(rest, NEAR_PLANE)
-    return visible_pixels(points, views.cameras, NEAR_PLANE, rest.cameras)
+    return visible_pixels(context_points(rest, NEAR_PLANE), views.cameras, NEAR_PLANE, rest.cameras)

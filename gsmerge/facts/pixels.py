@@ -1,8 +1,7 @@
 """Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel, by projection of centres.
 
-Each view is looked at in cells so wide that nearly every one has a centre in it where any is near: a pixel, or several
-where Gaussians are wider apart. What is behind the front of a cell is hidden, and a pixel without a centre of its own
-shows the front of its cell.
+Each view is looked at in cells wider than its Gaussians are apart. What is behind the front of a cell is hidden, and a
+pixel without a centre of its own shows the front of its cell.
 """
 
 from __future__ import annotations
@@ -63,22 +62,19 @@ def _weigh_view(
     """
     height, width = fronts.shape
     ids, pixels, depths, areas = project_centres(means, scales, viewmat, K, width, height, NEAR_PLANE)
-    order, inside = order_by_depth(depths), areas > 0
-    shown = np.zeros((height, width), bool)
+    if len(ids) == 0:
+        fronts[:] = -1
+        return ids, pixels, areas
+    inside, shown = areas > 0, np.zeros(fronts.shape, bool)
     shown.reshape(-1)[pixels[inside]] = True
-    level = choose_level(shown, REACH * float(np.sqrt(np.median(areas[inside]))) if inside.any() else 1.0)
-    if level == 0:
-        weights = weigh_centres(order, ids, pixels, areas, opacities, fronts)
-        if shown.all() or not shown.any():
-            return ids, pixels, weights
-    cells, shape = _cells_of(pixels, fronts.shape, max(level, 1))
+    level = choose_level(shown, REACH * float(np.sqrt(np.median(np.abs(areas)))))
+    order, (cells, shape) = order_by_depth(depths), _cells_of(pixels, fronts.shape, level)
     first = np.empty(shape, np.int32)
-    of_cells = weigh_centres(order, ids, cells, areas, opacities, first)
-    if level > 0:
-        weights, place = of_cells, np.searchsorted(ids, first.reshape(-1))
-        surface = SAME_DEPTH * np.where(first.reshape(-1) >= 0, depths[place.clip(max=len(ids) - 1)], np.inf)
-        weigh_centres(order[(depths <= surface[cells])[order]], ids, pixels, areas, opacities, fronts)
-    in_cell, _ = _cells_of(np.arange(fronts.size, dtype=np.int32), fronts.shape, max(level, 1))
+    weights = weigh_centres(order, ids, cells, areas, opacities, first)
+    nearest = depths[np.searchsorted(ids, first.reshape(-1)).clip(max=len(ids) - 1)]
+    surface = SAME_DEPTH * np.where(first.reshape(-1) >= 0, nearest, np.inf)
+    weigh_centres(order[(depths <= surface[cells])[order]], ids, pixels, areas, opacities, fronts)
+    in_cell, _ = _cells_of(np.arange(fronts.size, dtype=np.int32), fronts.shape, level)
     np.copyto(fronts, first.reshape(-1)[in_cell].reshape(fronts.shape), where=fronts < 0)
     return ids, pixels, weights
 
@@ -86,8 +82,8 @@ def _weigh_view(
 def choose_level(shown: np.ndarray, widest: float) -> int:
     """Choose how wide cells are, as a power of 2, from the mask ``shown [h,w]`` of pixels with a centre.
 
-    Nearly all cells that lie between others with a centre have one, too, and none is wider than ``widest``, pixels; 0
-    where no width has that.
+    They are twice as wide as those of which nearly all between others with a centre have one, too, or as pixels where
+    none up to ``widest``, pixels, are so: what a cell hides must not show through where a centre is missing.
     """
     fine, level = shown, 0
     while 2**level <= max(widest, 1.0):
@@ -95,9 +91,9 @@ def choose_level(shown: np.ndarray, widest: float) -> int:
         height, width = fine.shape
         between = around.repeat(2, 0)[:height].repeat(2, 1)[:, :width]
         if between.any() and np.count_nonzero(fine & between) >= COVERED * np.count_nonzero(between):
-            return level
+            return level + 1
         fine, level = _coarser(fine), level + 1
-    return 0
+    return 1
 
 
 def _coarser(mask: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ def context_points(scene: Scene, near: float, cameras: Cameras | None = None) ->
     into the ``cameras``; None: those of the scene.
     """
     if scene.has_own_pixels:
-        return scene.gaussians.means.astype(np.float64)
+        return scene.file_gaussians.means.astype(np.float64)
     cameras = scene.cameras if cameras is None else cameras
     return np.concatenate([_rendered_points(scene.gaussians, cameras[[i]], near) for i in range(len(cameras))])
 

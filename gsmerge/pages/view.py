@@ -90,7 +90,7 @@ def view(
     """
     with record_run(progress):
         read = as_scene(scene).numpy()
-        shown = read if read.has_own_pixels else add_views(read, shown=True)
+        shown = add_views(read, shown=True)
     given = results if isinstance(results, Mapping) else {} if results is None else {"result": results}
     files = {name: read_gaussians(value) for name, value in given.items() if isinstance(value, str | PathLike)}
     loaded: dict[str, Any] = {**given, **files}

@@ -168,7 +168,10 @@ def test_pixels_of_some_views(views: list[int]) -> None:
     shown = np.random.default_rng(0).random((2, 3, 4)) < 0.7
     pixels = Pixels.of_grid(shown)
     order = np.random.default_rng(1).permutation(len(pixels.homes))
-    for whole in (pixels, Pixels(pixels.homes[order], np.where(shown, np.argsort(order)[pixels.fronts], -1), own=True)):
+    for whole in (
+        pixels,
+        Pixels(pixels.homes[order], np.where(shown, np.argsort(order, kind="stable")[pixels.fronts], -1), own=True),
+    ):
         rows, part = whole.select(views)
         assert np.array_equal(part.shown, shown[views])
         assert np.array_equal(rows[part.fronts[part.shown]], whole.fronts[views][part.shown])

@@ -13,6 +13,7 @@ from gsmerge import Scene
 from gsmerge.facts.pixels import choose_level, find_pixels
 from gsmerge.frame import canonicalise
 from gsmerge.geometry import camera_depths
+from gsmerge.kernels import elementary
 
 WIDTH, HEIGHT = 96, 72
 
@@ -32,7 +33,7 @@ def depth_errors(scene: Scene, room: Scene) -> np.ndarray:
             (room, room.pixels.fronts, room.cameras.viewmats),
         )
     )
-    return np.abs(np.log(depths / true))[fronts >= 0]
+    return np.abs(elementary.log(depths / true))[fronts >= 0]
 
 
 def test_rows_in_any_order_are_in_front_where_their_surface_is(room: Scene) -> None:
@@ -44,7 +45,7 @@ def test_rows_in_any_order_are_in_front_where_their_surface_is(room: Scene) -> N
     assert np.median(depth_errors(scene, room)) < 0.01
 
 
-@pytest.mark.parametrize(("every", "level"), [(1, 0), (4, 1), (16, 2), (64, 3)])
+@pytest.mark.parametrize(("every", "level"), [(1, 1), (4, 2), (16, 3)])
 def test_cells_are_as_wide_as_gaussians_are_apart(every: int, level: int, room: Scene) -> None:
     """What lies behind shows through gaps between centres, not between cells."""
     few = np.random.default_rng(0).permutation(WIDTH * HEIGHT)[: WIDTH * HEIGHT // every]

@@ -63,7 +63,9 @@ def test_gaussians_belong_to_the_superpixel_of_their_pixel(room: Scene, groups: 
 def test_rows_by_pixel_are_those_of_the_grid(room: Scene, groups: Groups) -> None:
     """Members that know their pixels are grouped as those of a scene in order."""
     order = np.random.default_rng(0).permutation(len(room.gaussians))
-    pixels = replace(room.pixels, homes=order, fronts=np.argsort(order)[room.pixels.fronts].astype(np.int32))
+    pixels = replace(
+        room.pixels, homes=order, fronts=np.argsort(order, kind="stable")[room.pixels.fronts].astype(np.int32)
+    )
     scene = replace(room, gaussians=room.gaussians[order], pixels=pixels)
     members, in_order = scene_members(scene), scene_members(room)
     (starts, ids, views), expected = (member_rows(room, each, groups) for each in (members, in_order))

@@ -1,0 +1,53 @@
+"""Fill pixels that an exporter dropped, borders and the farthest ones, from depth maps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.geometry import camera_depths, rgb_to_sh0
+from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.types import Gaussians, Scene, fill_pixels
+
+_MAX_SPREAD = 0.15  # of the Gaussians' depth over a depth map's: above it the map is not that of the Gaussians
+
+
+def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scene:
+    """Add a Gaussian at the depth of ``maps [v,h,w]`` for each pixel without one.
+
+    The unit of the depths, and whether they are along z or distances, follow from the other pixels. Colours are those
+    of the photos ``images [v,h,w,3]``. Opacity, rotation and size in pixels are copied from the pixel before. The scene
+    is returned unchanged if its Gaussians do not lie at the depths of the maps.
+    """
+    assert scene.pixels is not None, "views have Gaussians of their own"
+    g, V, fronts = scene.gaussians, scene.cameras.viewmats, scene.pixels.fronts.reshape(len(scene), -1)
+    height, width = scene.cameras.height, scene.cameras.width
+    y, x = np.mgrid[:height, :width].reshape(2, -1) + 0.5
+    pixels = np.stack([x, y, np.ones(x.size)], 1)
+    rays = matmul(pixels, invert(scene.cameras.Ks).transpose(0, 2, 1))  # [v,p,3] in the camera, z = 1
+    z = camera_depths(g.means[fronts].astype(np.float64), V[:, None])
+    length, maps = np.linalg.norm(rays, axis=2), maps.reshape(len(scene), -1).astype(np.float64)
+    known = (maps > 0) & np.isfinite(maps)
+    usable = (fronts >= 0) & known & (z > 0)
+    if not usable.any():
+        return scene
+    ratio = z[usable] / maps[usable]
+    fits = []
+    for along, ratios in enumerate((ratio, ratio * length[usable])):  # depth along z, distance
+        middle = float(np.median(ratios))
+        fits.append((float(np.median(np.abs(ratios / middle - 1))), middle, along))
+    spread, unit, along = min(fits)
+    if spread > _MAX_SPREAD:
+        return scene
+    places = np.flatnonzero((fronts < 0) & known)
+    views = places // (height * width)
+    new_z = (unit * maps / (length if along else 1)).reshape(-1)[places]
+    local = rays.reshape(-1, 3)[places] * new_z[:, None]
+    means = (V[views, :3, :3] * (local - V[views, :3, 3])[:, :, None]).sum(1)
+    before = np.flatnonzero(usable)
+    before = before[np.maximum(np.searchsorted(before, places) - 1, 0)]
+    like = g[fronts.reshape(-1)[before]]
+    scales = like.scales * (new_z / z.reshape(-1)[before]).astype(np.float32)[:, None]
+    sh0 = rgb_to_sh0(images.reshape(-1, 1, 3)[places]).astype(g.sh0.dtype)
+    means = means.astype(g.means.dtype)
+    added = Gaussians(means, like.quats, scales, like.opacities, sh0, np.zeros_like(like.shN))
+    return fill_pixels(scene, added, places)
