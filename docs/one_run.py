@@ -245,12 +245,13 @@ def align_section(run: Run) -> str:
             ),
             f"{best.alignment.middle_px:.2f} pixels, {recovery.margin:.0f} times less than with shuffled pixels.",
             say(
-                f"So row {ROW} is pixel ({VIEW} · {HEIGHT} + {Y}) · {WIDTH} + {X}, and the scene is aligned:",
-                int(made.pixel_ids[ROW]) == ROW and run.prepared.input_scene.aligned,
+                f"So row {ROW} is pixel ({VIEW} · {HEIGHT} + {Y}) · {WIDTH} + {X}, and each view has Gaussians of",
+                int(made.pixel_ids[ROW]) == ROW and run.prepared.input_scene.has_own_pixels,
             ),
             say(
-                "every pixel is stored and valid, none is missing.",
-                bool(run.prepared.input_scene.pixels.shown.all()) and run.prepared.input_scene.num_missing == 0,
+                f"its own: row {ROW} is also the Gaussian in front of that pixel, and every pixel shows one.",
+                bool(run.prepared.input_scene.pixels.shown.all())
+                and int(run.prepared.input_scene.pixels.fronts[VIEW, Y, X]) == ROW,
             ),
         ),
     ])  # fmt: skip
@@ -311,7 +312,7 @@ def plan_section(run: Run) -> str:
         ]),
         text(
             say(
-                f"No option asks for a number, and the scene is aligned, so {plan.settings['superpixels']} of the",
+                f"No option asks for a number, and each view has Gaussians of its own, so {plan.settings['superpixels']} of the",
                 limits.exact is None and not plan.keeps_input and plan.target_psnr is None,
             ),
             f"{pixels:,} pixels of a view become Gaussians: {limits.per_view} for each view,",

@@ -44,7 +44,7 @@ _SATURATED = 1e-6  # of an opacity's distance to 0 or 1: its logit changes in fl
 _OWN = "gsmerge"  # the exporter's name of files that gsmerge wrote
 _FILE_KEYS = (
     "path", "layout", "format", "count", "bytes_by_attribute", "extra_columns", "extra_elements", "sh_degree",
-    "opacity_encoding", "num_nonfinite", "num_clipped_scales", "num_zero_quats",
+    "opacity_encoding", "num_nonfinite", "num_empty", "num_clipped_scales", "num_zero_quats",
 )  # fmt: skip
 _CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
 _REPEATED = ("read as: ", "the Gaussians belong to no pixels")  # notes that repeat a line of their own
@@ -75,7 +75,7 @@ def inspect(
     Returns:
         Plain JSON types, None for what is not known. Of the file: ``path``, ``bytes``, ``bytes_by_attribute``,
         ``layout``, ``format``, ``exporter``, ``extra_columns``, ``extra_elements``, ``sh_degree``,
-        ``opacity_encoding``. Of the Gaussians: ``count``, ``num_nonfinite``, ``num_clipped_scales``,
+        ``opacity_encoding``. Of the rows: ``count``, ``num_nonfinite``, ``num_empty``, ``num_clipped_scales``,
         ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255), ``num_saturated``
         (within 1e-6 of 0 or 1), ``extents``. Of the views: ``cameras``, ``camera_format``, ``images``, ``num_views``,
         ``width``, ``height``, ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order),
@@ -229,7 +229,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"marks      {'; '.join(scene['marks'])}" if scene["marks"] else "",
         f"exporter   {scene['exporter']}",
         f"ignored    {', '.join(ignored)}" if ignored else "",
-        f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_transparent']:,} transparent,"
+        f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_empty']:,} empty, {scene['num_transparent']:,} transparent,"
         f" {scene['num_opaque']:,} opaque, {scene['num_saturated']:,} of opacity 0 or 1",
         f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.3g} % beyond ten times that box",
         f"floaters   about {round(size['share_floaters'] * scene['count']):,}: isolated, or beyond that;"

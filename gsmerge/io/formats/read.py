@@ -218,7 +218,7 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         num_nonfinite=num_bad,
         num_empty=num_empty,
         num_clipped_scales=num_clipped,
-        num_zero_quats=num_zero_quats,
+        num_zero_quats=max(0, num_zero_quats - num_empty),  # which have none as a rule
         odd_scales=_describe_odd_scales(out["means"], out["scales"], out["valid"]),
         adapted=(*notes, *stored.notes, *_describe_end(out["valid"])),
     )
