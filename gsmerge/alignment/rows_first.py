@@ -273,7 +273,8 @@ def _read_place(source: RowSource, place: Place, check: CentreCheck) -> Recovery
         if layout is None or not source.may_be(layout.order) or _are_few(source, len(layout.views), grid):
             return None
         readings = [GridReading(grid, score_layout(inputs, layout, frame))]
-    return judge(readings, source.inputs, lambda candidate: candidate)
+    is_solved = frame.scale != 1 and source.scale is None  # roughly: rows show it better
+    return judge(readings, source.inputs, partial(refine, source) if is_solved else lambda candidate: candidate)
 
 
 def _are_few(source: RowSource, views: int, grid: Grid) -> bool:
