@@ -19,7 +19,7 @@ import numpy as np
 from gsmerge.alignment.calibration import Calibration
 from gsmerge.alignment.cameras import NEAR_PX, describe_reading, max_pixels, move_cameras
 from gsmerge.alignment.centres import CentreCheck, check_centres, find_rows, sample_points
-from gsmerge.alignment.frames import scale_by, usual_frames
+from gsmerge.alignment.frames import exporter_frames, scale_by
 from gsmerge.alignment.grids import (
     Grid,
     Place,
@@ -233,7 +233,7 @@ def _at_photo_size(place: Place, named: Sequence[Grid]) -> Place:
 def _usual_places(source: RowSource, grid: Grid) -> Iterator[Place]:
     """Yield the cameras of a grid in each frame of exporters, and in each other convention of their poses."""
     how = "Gaussians' places in their pixels"
-    yield from (Place(grid, frame, how) for frame in usual_frames(grid.cameras, source.scale))
+    yield from (Place(grid, frame, how) for frame in exporter_frames(grid.cameras, source.scale))
     yield from (Place(other, IDENTITY) for other in other_grids(source, grid))
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.alignment.cameras import Poses, other_conventions
 from gsmerge.alignment.centres import check_centres, sample_points
-from gsmerge.alignment.frames import usual_frames
+from gsmerge.alignment.frames import exporter_frames
 from gsmerge.alignment.grids import Grid, Place, read_as
 from gsmerge.alignment.score import MARGIN, RANDOM_SHARE, SAME_COLORS, AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
@@ -199,14 +199,6 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: Scen
         raise SceneError(why.path, f"{why.problem}; {found} others", remedy)
 
 
-def _exporter_frames(inputs: AlignmentInput) -> Iterator[Similarity]:
-    """Yield the frames that exporters use for rows, at the scale of the cameras."""
-    yield from usual_frames(inputs.cameras)[1:]
-    yield Similarity(np.diag([1.0, -1, -1]), 1.0, np.zeros(3), "turned to y up, as .spz files are", "other")
-    first = inputs.cameras.viewmats[0]
-    yield Similarity(first[:3, :3], 1.0, first[:3, 3], "moved into the first camera", "first")
-
-
 def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
     """Choose the exporter's frame in which the colours fit the photos clearly better; None without one.
 
@@ -215,7 +207,7 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     """
     if not len(inputs.images):
         return None
-    frames = [IDENTITY, *_exporter_frames(inputs)]
+    frames = exporter_frames(inputs.cameras)
     best, score = _best_frame(inputs, frames)
     stands_out = _stands_out(inputs, best, score)
     if inputs.scale is None and not stands_out:
