@@ -8,7 +8,7 @@ nearest centre is at most r pixels off with a probability of 1 - (1 - pi r^2)^k.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
 _SAMPLE_POINTS, _LEAST_POINTS = 20_000, 60  # that cameras are tried with, about; fewer may lie near centres by chance
+# Of them are compared first, and how much farther they may be off: four standard errors of their median, each
+# 0.72 / sqrt(2000)
+_FIRST_POINTS, _ROUGHLY = 2000, 1.07
 _PART = 1 << 16  # points that are projected at once
 _MIN_SEEN = 0.95  # share of the points that some view must show, as it does all that are its pixels
 # Times the median distance, and pixels: about a centre lie more points than by chance, in each view, by so many
@@ -66,21 +69,28 @@ def sample_points(means: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 def check_centres(points: np.ndarray, cameras: Cameras) -> CentreCheck:
     """Measure how near points ``[n,3]`` float32 are to the centres of pixels of cameras."""
+    for step in (max(1, len(points) // _FIRST_POINTS), 1):  # a few tell most wrong cameras
+        check, views = _compare_with_chance(points[::step], cameras)
+        if not check.px <= _ROUGHLY * _NEARER * check.chance_px:
+            return check
+    radius = min(_WIDE * check.px, _WIDEST_PX)
+    share, right = math.pi * radius**2, np.zeros(len(cameras), bool)
+    for view in np.unique(views).tolist():
+        _, distances, _ = _find_nearest(points, cameras[view : view + 1])
+        near, count = np.count_nonzero(distances <= radius), np.count_nonzero(distances < math.inf)
+        right[view] = near - share * count > _ERRORS * math.sqrt(share * (1 - share) * count)
+    return replace(check, share_right=float(right[views].mean()))
+
+
+def _compare_with_chance(points: np.ndarray, cameras: Cameras) -> tuple[CentreCheck, np.ndarray]:
+    """Compare distances of points from centres with those by chance; also return the view of each that is shown."""
     ids, distances, seen = _find_nearest(points, cameras)
     shown = seen > 0
     if len(points) < _LEAST_POINTS or shown.sum() < _MIN_SEEN * len(points):
-        return CentreCheck(math.inf, 0.0, 0.0)
+        return CentreCheck(math.inf, 0.0, 0.0), ids[:0]
     exponents = 1 / seen[shown]
     chance = np.sqrt((1 - power(np.full_like(exponents, 0.5), exponents)) / np.pi)
-    px, right = median(distances), np.zeros(len(cameras), bool)
-    radius = min(_WIDE * px, _WIDEST_PX)
-    share = math.pi * radius**2
-    for view in range(len(cameras)):
-        _, own, _ = _find_nearest(points, cameras[view : view + 1])
-        near, count = np.count_nonzero(own <= radius), np.count_nonzero(own < math.inf)
-        right[view] = near - share * count > _ERRORS * math.sqrt(share * (1 - share) * count)
-    views = ids[shown] // (cameras.width * cameras.height)
-    return CentreCheck(px, median(chance), float(right[views].mean()))
+    return CentreCheck(median(distances), median(chance), 0.0), ids[shown] // (cameras.width * cameras.height)
 
 
 def find_rows(means: np.ndarray, valid: np.ndarray, cameras: Cameras, check: CentreCheck) -> np.ndarray | None:

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment.calibration import Calibration
 from gsmerge.alignment.cameras import NEAR_PX, describe_reading, max_pixels, move_cameras
 from gsmerge.alignment.centres import CentreCheck, check_centres, find_rows, sample_points
 from gsmerge.alignment.frames import exporter_frames, scale_by
@@ -39,9 +38,7 @@ from gsmerge.alignment.layouts import (
     Layout,
     depth_layouts,
     dropped_layout,
-    every_nth,
     exact_layouts,
-    move_layout,
     plain_layout,
     subsample,
     view_orders,
@@ -59,8 +56,6 @@ from gsmerge.types import Cameras
 _PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
 _ENOUGH, _FEW = 24, 0.05  # finite rows that decide between readings; fewer will do where they are no such small share
 _MANY_PIXELS = 4  # times as many pixels as rows: likely of photos three times the size of the grid, or more
-_PER_VIEW = 500  # finite rows for each camera, from which it is searched which pixels lack one
-_SAME_FOCAL, _OFF = 0.1, 1  # by which focal lengths may differ, relative, and principal points, pixels
 _MOVED_GAUSSIANS = 2000  # Gaussians of a view that its moved pose is solved from
 
 
@@ -207,14 +202,6 @@ def _findings(source: RowSource, named: Sequence[Grid]) -> Iterator[Recovery | P
     usual = grids_of(source.camera_file, source.size, network_sizes)
     other = _read_centres(source, (place for grid in usual for place in _usual_places(source, grid)))
     yield other if isinstance(other, Recovery) else None  # cameras alone are better at the photos' size
-    if source.order not in MAY_BE_UNALIGNED and _may_lack_pixels(source, named):
-        from gsmerge.alignment.dropped_rows import find_dropped_grid
-
-        lines = find_dropped_grid(source.ply.gaussians.means, source.ply.valid)
-        if lines is None:
-            return
-        for grids in (named, usual):
-            yield _match(source, [(g, place) for g in grids for place in _moved_layouts(source, g, lines)])
 
 
 def _match(source: RowSource, places: Sequence[GridLayout]) -> Recovery | None:
@@ -298,32 +285,6 @@ def _are_same(layout: Layout, shown: Sequence[Layout]) -> bool:
     y, x = np.divmod(layout.pixels[0][[0, -1]], layout.width)
     what = int(np.ptp(x)) + 1, int(np.ptp(y)) + 1, layout.order, layout.per_pixel
     return any(what == (other.width, other.height, other.order, other.per_pixel) for other in shown)
-
-
-def _may_lack_pixels(source: RowSource, grids: Sequence[Grid]) -> bool:
-    """Return whether rows may be pixels of some of the grids, of which many are missing."""
-    most = max((len(grid.cameras) * math.prod(grid.size) for grid in grids), default=0)
-    enough = _PER_VIEW * len(source.camera_file) <= int(source.ply.valid.sum())
-    return enough and len(source.ply.gaussians) < most
-
-
-def _moved_layouts(source: RowSource, grid: Grid, lines: tuple[Layout, Calibration]) -> list[Layout]:
-    """List the places in a grid of rows that lack pixels, whose ``lines`` show a layout and cameras of their own."""
-    layout, cameras, own = lines[0], grid.cameras, lines[1].cameras
-    margins = cameras.width - layout.width, cameras.height - layout.height
-    focal = np.median(own.Ks[:, (0, 1), (0, 1)], 0) / np.median(cameras.Ks[:, (0, 1), (0, 1)], 0)
-    if min(margins) < 0 or len(layout.views) > len(cameras) or not (np.abs(focal - 1) <= _SAME_FOCAL).all():
-        return []
-    if not source.may_be(layout.order):
-        return []
-    chosen = next((ids for ids in every_nth(len(cameras)) if len(ids) == len(layout.views)), layout.views)
-    layout = replace(layout, views=chosen)
-    shifts = np.rint(np.median(cameras.Ks[:, :2, 2], 0) - np.median(own.Ks[:, :2, 2], 0)).astype(int)
-    lefts, tops = (
-        sorted({place for place in (margin // 2, *range(shift - _OFF, shift + _OFF + 1)) if 0 <= place <= margin})
-        for margin, shift in zip(margins, shifts.tolist(), strict=True)
-    )
-    return [move_layout(layout, cameras.width, cameras.height, left, top) for left in lefts for top in tops]
 
 
 # Cameras that are off

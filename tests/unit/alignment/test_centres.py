@@ -63,7 +63,7 @@ def test_distances_by_chance(views: int) -> None:
     cameras.Ks[:, :2, 2] = 200, 150
     points = np.concatenate([rng.uniform(-0.2, 0.2, (20_000, 2)), np.ones((20_000, 1))], 1).astype(np.float32)
     check = check_centres(points, cameras)
-    assert check.px == pytest.approx(check.chance_px, rel=0.05)
+    assert check.px == pytest.approx(check.chance_px, rel=0.06)
     assert check.chance_px == pytest.approx(np.sqrt((1 - 0.5 ** (1 / views)) / np.pi), rel=0.01)
     assert not check.ok
     assert check.share_right < 0.2
