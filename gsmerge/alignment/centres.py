@@ -113,20 +113,27 @@ def find_rows(means: np.ndarray, valid: np.ndarray, cameras: Cameras, check: Cen
 
 def _follow(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:
     """Find the pixels ``[n]`` of rows in the order of pixels, -1 for few without; None for rows in another order."""
-    ids = None
+    ids, size = None, (cameras.width, cameras.height)
     for part in (points[:_FIRST_ROWS], points):
-        count, views = len(part), len(cameras)
-        if count * views > _MOST_PLACES:
+        if len(part) * len(cameras) > _MOST_PLACES:
             return None
-        ids, tails, ends = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int32)
-        scratch = (
-            tails,
-            ends,
-            *(np.empty(size, kind) for size, kind in ((count * views, np.int32), (views, np.int64), (views, np.int32))),
-        )
-        size = cameras.width, cameras.height
-        if follow_pixels(part, *_matrices(cameras), ids, *scratch, *size, int(mixed)) < _MIN_PLACED * count:
+        ids = follow_rows(part, *_matrices(cameras), *size, mixed=mixed)
+        if (ids >= 0).sum() < _MIN_PLACED * len(part):
             return None
+    return ids
+
+
+def follow_rows(
+    points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, width: int, height: int, *, mixed: bool = False
+) -> np.ndarray:
+    """Find pixels ``[n]`` of rows at ``points [n,3]`` float32, as many as come in the order of pixels; -1 for others.
+
+    The order is view by view and line by line, or if ``mixed`` line by line with the views of a pixel side by side.
+    """
+    count, views = len(points), len(viewmats)
+    kinds = ((count, np.int64), (count, np.int64), (count, np.int32), (count * views, np.int32))
+    ids, *scratch = (np.empty(size, kind) for size, kind in (*kinds, (views, np.int64), (views, np.int32)))
+    follow_pixels(points, viewmats, Ks, ids, *scratch, width, height, int(mixed))
     return ids
 
 

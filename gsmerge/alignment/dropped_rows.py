@@ -7,12 +7,13 @@ where the rows of a view end, and also those that lack pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.alignment.calibration import Calibration, calibrate
+from gsmerge.alignment.centres import follow_rows
 from gsmerge.alignment.layouts import Layout, dropped_layout, subsample
 from gsmerge.alignment.resection import projective_camera
 from gsmerge.alignment.score import find_correspondences, is_as_near
@@ -23,20 +24,14 @@ _LOOKED_AT = 1500  # rows whose nearest neighbour is searched among those that f
 _ALIKE, _LENGTHS = 0.02, 2  # share of them that have it as far, and such distances that are tried
 _SEEDS, _TRIED = 12, 200  # series of lines: looked at first, and solved
 _RARE = 0.05  # of the lines that a column has, at least
-_OUTSIDE = 1e6  # pixels
 _WRAP, _BELOW = 8.0, 0.25  # times the usual step: back to the left; share of it at most, to the pixel below
 _MOST_JUMPS = 100  # in a line; more are rows in no order
 _MIN_LINES = 6  # whole lines in a row
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 1.0  # median distance of rows from their pixels
-_GAP, _RISE = 4.0, 2.0  # pixels that a piece of a line may lack at once, and of a step to another line, at most
-_CROOKED = 0.8  # mean distance of rows from their line, pixels
-_SPARSE = 1.8  # pixels of a piece for each of its rows, at most
-_AROUND = 3  # rows before and after
-_FIRST_LINES, _MORE = 2, 8  # lines of rows that are walked first; times as many rows next
-_RUN = 8  # rows from pixel to pixel that are no chance
 _SAME = 2  # pixels by which the principal point may be off
 _AHEAD, _MIN_AHEAD = 0.3, 2  # lines that a camera is trusted beyond those it is solved from, as a share, and at least
+_MOST_LOST = 16  # rows one after the other that follow no pixels: another view begins
 _MIN_PLACED = 0.9  # share of the rows that come to a pixel
 
 
@@ -172,38 +167,25 @@ def _shift(view: _View, columns: int) -> _View:
     return replace(view, x=view.x + columns, camera=camera)
 
 
-def _project(points: np.ndarray, camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project points ``[n,3]``; return columns and lines, 0 at the centre of the first pixel."""
-    with np.errstate(all="ignore"):
-        places = matmul(points.astype(np.float64, copy=False), camera[:, :3].T) + camera[:, 3]
-        u, v = (np.nan_to_num(places[:, i] / places[:, 2] - 0.5, nan=-_OUTSIDE) for i in (0, 1))
-    return u.clip(-_OUTSIDE, _OUTSIDE), v.clip(-_OUTSIDE, _OUTSIDE)
-
-
 def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _View:
-    """Grow a view over the free rows before and after it."""
+    """Grow a view over the free rows before and after it, as far as a row in some follows its pixels."""
     low, high = _free_range(free, view.rows)
     while True:
-        lines = int(view.y.max() - view.y.min()) + 1
+        top, lines = int(view.y.min()), int(np.ptp(view.y)) + 1
         reach = max(_MIN_AHEAD, int(_AHEAD * lines))
-        after = _walk(points[view.rows[-1] + 1 : high], view.camera, (view.x[-1], view.y[-1]), width, reach)
-        ahead = points[low : view.rows[0]][::-1]
-        last = width - 1 - view.x[0], -1 - view.y[0]
-        before = _walk(ahead, matmul(_backwards(width), view.camera), last, width, reach)
-        if not len(after[0]) + len(before[0]):
-            return view
-        rows = np.concatenate([view.rows[0] - 1 - before[0][::-1], view.rows, view.rows[-1] + 1 + after[0]])
-        x = np.concatenate([width - 1 - before[1][::-1], view.x, after[1]])
-        y = np.concatenate([-1 - before[2][::-1], view.y, after[2]])
-        grown = _solve(points, _View(rows, x, y, view.camera))
-        if grown.px > _MAX_PX:
+        first, last = max(low, view.rows[0] - reach * width), min(high, view.rows[-1] + 1 + reach * width)
+        shift = np.array([[1.0, 0, 0], [0, 1, reach - top], [0, 0, 1]])
+        viewmat = np.concatenate([view.camera, [[0, 0, 0, 1]]])
+        part = np.ascontiguousarray(points[first:last], np.float32)
+        pixels = follow_rows(part, viewmat[None], shift[None], width, lines + 2 * reach)
+        rows = np.flatnonzero(pixels >= 0)
+        stretches = np.split(rows, np.flatnonzero(np.diff(rows) > _MOST_LOST) + 1)
+        rows = max(stretches, key=len)
+        y, x = np.divmod(pixels[rows], width)
+        grown = _solve(points, _View(first + rows, x, y + top - reach, view.camera)) if len(rows) else view
+        if grown.px > _MAX_PX or len(grown.rows) <= len(view.rows):
             return view
         view = grown
-
-
-def _backwards(width: int) -> np.ndarray:
-    """Return the matrix ``[3,3]`` that turns pixels so that the last come first."""
-    return np.array([[-1, 0, width], [0, -1, 0], [0, 0, 1.0]])
 
 
 def _free_range(free: np.ndarray, rows: np.ndarray) -> tuple[int, int]:
@@ -217,79 +199,8 @@ def _solve(points: np.ndarray, view: _View) -> _View:
     chosen = np.linspace(0, len(view.rows) - 1, min(_SOLVED_FROM, len(view.rows))).astype(int)
     pixels = np.stack([view.x[chosen], view.y[chosen]], 1) + 0.5
     camera, px = projective_camera(points[view.rows[chosen]], pixels)
-    return replace(view, camera=camera, px=px)
-
-
-def _walk(
-    points: np.ndarray, camera: np.ndarray, last: tuple[int, int], width: int, reach: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Place rows that follow the pixel ``last`` one after the other, up to ``reach`` lines on.
-
-    Rows of a piece of a line, which lacks few pixels at once, come to one line together. Returns rows ``[p]`` and their
-    ``x``, ``y``; ends where as many rows as a line has do not follow the ones before.
-    """
-    for part in _grow_parts(points[: (reach + 1) * width], _FIRST_LINES * width):
-        rows, x, y, ended = _walk_part(part, camera, last, width, reach)
-        if ended:
-            break
-    return rows, x, y
-
-
-def _grow_parts(points: np.ndarray, count: int) -> Iterator[np.ndarray]:
-    """Yield the first ``count`` rows, more each time, then all: those that do not follow end in the first ones."""
-    while count < len(points):
-        yield points[:count]
-        count *= _MORE
-    yield points
-
-
-def _walk_part(
-    points: np.ndarray, camera: np.ndarray, last: tuple[int, int], width: int, reach: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
-    """Place rows as :func:`_walk`; also return whether they end before the last piece of a line of ``points``."""
-    if not len(points):
-        return *(np.empty(0, np.int64),) * 3, True
-    u, v = _project(points, camera)
-    cuts = (np.abs(np.diff(u) - 1) > _GAP) | (np.abs(np.diff(v)) > _RISE)
-    starts = np.flatnonzero(np.concatenate([[True], cuts]))
-    lengths = np.diff(np.append(starts, len(u)))
-    x = _smooth_columns(u, starts, lengths).clip(0, width - 1)
-    middles = np.add.reduceat(v, starts) / lengths
-    y = np.rint(middles).astype(np.int64)
-    straight = np.add.reduceat(np.abs(v - np.repeat(y, lengths)), starts) <= _CROOKED * lengths
-    firsts, lasts = x[starts], x[starts + lengths - 1]
-    ends = u[starts], u[starts + lengths - 1]
-    after, line, lost, end = last[1] * width + last[0], last[1], 0, 0
-    follows, ended = np.zeros(len(starts), bool), False
-    dense = lasts - firsts < _SPARSE * lengths
-    inside = straight & dense & (ends[0] >= -1.5) & (ends[1] < width + 0.5) & (y <= last[1] + reach)
-    pieces = zip(y.tolist(), firsts.tolist(), lasts.tolist(), lengths.tolist(), strict=True)
-    for i, (height, first_x, last_x, length) in enumerate(pieces):
-        if inside[i] and height * width + first_x > after:
-            follows[i], after = True, height * width + last_x
-        if follows[i] and (length >= _RUN or height == line):  # short pieces on other lines may be chance
-            line, lost, end = height, 0, i + 1
-        else:
-            lost += length
-            if lost > width:
-                ended = i + 1 < len(starts)  # the last piece may go on
-                break
-    follows[end:] = False
-    placed = np.flatnonzero(np.repeat(follows, lengths))
-    return placed, x[placed], np.repeat(y, lengths)[placed], ended
-
-
-def _smooth_columns(u: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Round the columns ``u [n]`` of rows in pieces of a line that begin at ``starts [p]``.
-
-    Gaussians lie anywhere in their pixels. So the number of pixels that a piece lacks so far is the median over some
-    rows before and after, which is exact for numbers that only grow.
-    """
-    every = np.arange(len(u))
-    first, last = np.repeat(starts, lengths), np.repeat(starts + lengths - 1, lengths)
-    lacking = u - every
-    around = np.stack([lacking[np.clip(every + k, first, last)] for k in range(-_AROUND, _AROUND + 1)])
-    return (every + np.rint(np.median(around, 0))).astype(np.int64)
+    depths = matmul(points[view.rows[chosen]], camera[2, :3]) + camera[2, 3]
+    return replace(view, camera=camera * np.copysign(1.0, np.median(depths)), px=px)
 
 
 def _make_layout(rows: np.ndarray, views: list[_View]) -> Layout:
