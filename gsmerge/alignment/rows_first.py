@@ -1,9 +1,9 @@
-"""Find which row is which pixel: by the grid that rows show, whose views are then found among the file's cameras.
+"""Find the cameras that show the Gaussians of a file in their place, and which row is which pixel where that shows.
 
-Most files are plain: rows are the pixels in order, which the stored cameras show. Otherwise rows show by themselves
-whether they are the pixels of a grid, since some camera shows them in their pixels then, and the pose of each of its
-views. What is left to find is which of the file's cameras each view is, and how their world lies in that of the
-Gaussians: one similarity, for every convention of the poses and every likely order of the views.
+Most files are plain: rows are the pixels in order, which the stored cameras show. Rows of every pixel in another order,
+or in another world, show the pose of each view by themselves; what is left to find is which of the file's cameras each
+view is, and how their world lies in that of the Gaussians: one similarity, for every convention of the poses and every
+likely order of the views. Gaussians of other rows show the cameras by the centres of pixels, about which they lie.
 """
 
 from __future__ import annotations
@@ -188,17 +188,18 @@ def _search(source: RowSource, named: Sequence[Grid]) -> Recovery | Place | None
 
 def _findings(source: RowSource, named: Sequence[Grid]) -> Iterator[Recovery | Place | None]:
     """Yield what the number of rows, centres of pixels, and the rows themselves show, in turn."""
-    yield _match(source, [(grid, layout) for grid in named for layout in _layouts(source, grid)])
-    if named:
+    found = _match(source, [(grid, layout) for grid in named for layout in _layouts(source, grid)])
+    yield found
+    if found is None and named:
         yield _move_cameras(source, named[0])
     yield _read_centres(source, (place for grid in named for place in _usual_places(source, grid)))
     if source.order not in MAY_BE_UNALIGNED:
         from gsmerge.alignment.row_grid import find_layouts  # few files come here
 
         layouts = find_layouts(source.ply.gaussians, source.ply.valid)
-        shown = [partial(shown_sizes, shape=(layout.width, layout.height)) for layout in layouts[:1]]
-        sized = [grid for sizes in shown for grid in grids_of(source.camera_file, source.size, sizes)]
-        yield _match(source, [(g, each) for g in sized for each in _layouts(source, g) if _are_same(each, layouts)])
+        shape = (layouts[0].width, layouts[0].height) if layouts else (0, 0)
+        shown = grids_of(source.camera_file, source.size, partial(shown_sizes, shape=shape)) if layouts else []
+        yield _match(source, [(g, each) for g in shown for each in _layouts(source, g) if _are_same(each, layouts)])
     usual = grids_of(source.camera_file, source.size, network_sizes)
     other = _read_centres(source, (place for grid in usual for place in _usual_places(source, grid)))
     yield other if isinstance(other, Recovery) else None  # cameras alone are better at the photos' size
