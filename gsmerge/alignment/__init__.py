@@ -1,11 +1,11 @@
-"""Find the pixel that each row of a file belongs to, and estimate cameras; the door: modules in here are private.
+"""Find cameras that show Gaussians in their place, the pixel of each row, and estimate cameras; modules are private.
 
-``rows_first`` takes files that are plain, or finds the grid that rows show (``layouts``, ``row_grid`` and
-``dropped_rows``) at a size that cameras and photos can have (``grids``), and with ``match`` which cameras of the file
-its views are, in which of the ``frames``. ``score`` measures readings, ``judge`` takes one, and ``explain`` says why
-none fits. ``cameras`` reads or moves poses, ``unaligned`` chooses those of rows without pixels, ``upright`` those of
-fused rows in a frame that no file has, ``estimate`` and ``focal`` solve for cameras. What few files need loads at first
-use.
+``rows_first`` takes files that are plain, or leads the search: by layouts of as many rows (``layouts``) at a size that
+cameras and photos can have (``grids``), whose views ``match`` finds among the file's cameras, in which of the
+``frames``; by ``centres`` of pixels; and by the grid that rows show (``row_grid``). ``score`` measures readings,
+``judge`` takes one, and ``explain`` says why none fits. ``cameras`` reads or moves poses, ``unaligned`` chooses those
+of rows without pixels, ``upright`` those of rows in a frame that no file has, ``estimate`` (with ``dropped_rows``) and
+``focal`` solve for cameras. What few files need loads at first use.
 """
 
 # ruff: noqa: F401  names for other packages

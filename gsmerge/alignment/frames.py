@@ -28,6 +28,7 @@ _SMALL_ROTATION, _SMALL_SCALE = 10.0, 0.05  # degrees, and natural logarithm
 _HALF = np.sqrt(0.5)
 # As the pixelSplat family turns its world: axes swapped, then an eighth of a turn about the last one.
 UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
+_VIEWER = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])  # as Splatter Image's demo turns its world
 
 
 def scale_by(scale: float, note: str = "") -> Similarity:
@@ -56,6 +57,21 @@ def usual_frames(cameras: Cameras, scale: float | None = None) -> list[Similarit
     for rotation, name, kind in _usual_rotations(cameras)[1:]:
         frames.append(Similarity(rotation, scale or 1.0, np.zeros(3), name, kind))
     return frames if scale is not None else [*frames, mean_pose_frame(cameras.viewmats)]
+
+
+def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Similarity]:
+    """List the usual frames, then those that viewers ask for, and that of the first camera.
+
+    The frame of the cameras comes first, that of the first camera last.
+    """
+    pose, unit = cameras.viewmats[0], scale or 1.0
+    origin = np.zeros(3)
+    return [
+        *usual_frames(cameras, scale),
+        Similarity(np.diag([1.0, -1, -1]), unit, origin, "turned to y up, as .spz files are", "other"),
+        Similarity(_VIEWER, unit, origin, "turned for a viewer, as by Splatter Image", "other"),
+        Similarity(pose[:3, :3], unit, unit * pose[:3, 3], "moved into the first camera", "first"),
+    ]
 
 
 def solved_frames(

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.alignment.cameras import Poses, describe_reading
 from gsmerge.alignment.layouts import TRIMS, da3_box
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import PATCH, CameraFile, sizes_of, to_cameras
+from gsmerge.geometry import IDENTITY, Similarity
+from gsmerge.io.cameras.camera_file import PATCH, CameraFile, Convention, sizes_of, to_cameras
 from gsmerge.io.cameras.json_files import FFGS
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
@@ -41,6 +43,36 @@ class Grid:
     def size(self) -> Size:
         """(width, height) of the grid, pixels."""
         return self.cameras.width, self.cameras.height
+
+
+@dataclass(frozen=True)
+class Place:
+    """Cameras that show Gaussians in their place: those of a grid, moved into a frame."""
+
+    grid: Grid
+    frame: Similarity
+    shown_by: str = ""  # what shows the frame, for people; empty for one that a file names
+
+    @property
+    def cameras(self) -> Cameras:
+        """The cameras in the frame of the Gaussians."""
+        return self.grid.cameras if self.frame is IDENTITY else self.frame.move(self.grid.cameras)
+
+    def notes(self, usual: Convention) -> list[str]:
+        """List what was adapted, for people; ``usual``: the convention of the poses' format."""
+        notes, convention = [*self.grid.notes], self.grid.camera_file.convention
+        if convention != usual:
+            notes.append(f"{describe_reading(convention, usual)}: read so")
+        if self.frame is not IDENTITY:
+            why = f", as the {self.shown_by} show" if self.shown_by else ""
+            notes.append(f"the cameras are {self.frame.description}{why}")
+        return notes
+
+
+def read_as(grid: Grid, poses: Poses) -> Grid:
+    """Return a grid with the poses of its cameras read in another convention."""
+    file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
+    return replace(grid, camera_file=file, cameras=replace(grid.cameras, viewmats=poses.viewmats))
 
 
 def with_photo_size(camera_file: CameraFile, size: Size | None, most: float = 1) -> CameraFile:

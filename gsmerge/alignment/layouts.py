@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,8 @@ ESTIMATED = "estimated from the grid"  # source of cameras
 TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every side
 _MAX_TRIM = 0.25  # of the shorter side, cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
+_FEW_ROWS = 0.01  # of those of the part that has the most: none of its own
+_ORDERED = 0.99  # share of the rows that come after the one before them
 DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
 
 
@@ -44,6 +45,13 @@ class Layout:
         ids = [i for i, other in enumerate(self.views) if other == view]
         rows, pixels = (tuple(arrays[i] for i in ids) for arrays in (self.rows, self.pixels))
         return replace(self, views=(view,) * len(ids), rows=rows, pixels=pixels)
+
+    def without_empty_parts(self) -> Layout:
+        """Return the layout of the parts that have rows, but for a few."""
+        least = _FEW_ROWS * max(map(len, self.rows))
+        ids = [i for i, rows in enumerate(self.rows) if len(rows) >= least]
+        rows, pixels = (tuple(arrays[i] for i in ids) for arrays in (self.rows, self.pixels))
+        return replace(self, views=tuple(self.views[i] for i in ids), rows=rows, pixels=pixels)
 
     @property
     def is_plain(self) -> bool:
@@ -156,9 +164,10 @@ def dropped_layout(pixel_ids: np.ndarray, views: int, width: int, height: int) -
     """Return the layout of rows by their pixels ``[n]``, -1 for none; some pixels may have no row."""
     area = width * height
     parts = [np.flatnonzero(pixel_ids // area == view) for view in range(views)]
-    mixed = any(len(a) and len(b) and a[-1] > b[0] for a, b in pairwise(parts))
-    pixels, order = tuple(pixel_ids[rows] % area for rows in parts), "view-fastest" if mixed else "view-major"
-    chosen = tuple(range(views))
+    placed = pixel_ids[pixel_ids >= 0]
+    keys = {"view-major": placed, "view-fastest": placed % area * views + placed // area}
+    order = next((name for name, key in keys.items() if (np.diff(key) > 0).mean() >= _ORDERED), "unordered")
+    pixels, chosen = tuple(pixel_ids[rows] % area for rows in parts), tuple(range(views))
     return Layout(f"some pixels dropped, {order}", "pruned", order, width, height, chosen, tuple(parts), pixels)
 
 

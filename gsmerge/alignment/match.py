@@ -7,7 +7,7 @@ cameras to these poses, in the right convention and order alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import chain
@@ -16,7 +16,7 @@ import numpy as np
 
 from gsmerge.alignment.cameras import other_conventions
 from gsmerge.alignment.frames import own_poses, solved_frames, usual_frames
-from gsmerge.alignment.grids import Grid
+from gsmerge.alignment.grids import Grid, read_as
 from gsmerge.alignment.judge import GridReading
 from gsmerge.alignment.layouts import Layout, every_nth, some_views, subsample, view_orders
 from gsmerge.alignment.resection import projective_error
@@ -102,13 +102,15 @@ def match_views(source: RowSource, places: Sequence[GridLayout]) -> list[GridRea
     far = _AS_SHOWN * max(min(errors, default=0.0), AS_NEAR_PX)
     shown = [place for place, error in zip(places, errors, strict=True) if error <= far and math.isfinite(error)]
     candidates = [candidate for place in shown for candidate in _fit_views(source, *place)]
-    usual, convention = source.camera_file.viewmats, source.camera_file.convention
-    for poses in other_conventions(usual, convention) if shown and not candidates else ():
-        for grid, layout in shown:
-            file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
-            moved = replace(grid, camera_file=file, cameras=replace(grid.cameras, viewmats=poses.viewmats))
-            candidates += _fit_views(source, moved, layout)
+    for grid, layout in shown if not candidates else ():
+        candidates += [each for other in other_grids(source, grid) for each in _fit_views(source, other, layout)]
     return candidates
+
+
+def other_grids(source: RowSource, grid: Grid) -> Iterator[Grid]:
+    """Return a grid with its poses read in each other convention."""
+    poses = other_conventions(source.camera_file.viewmats, source.camera_file.convention)
+    return (read_as(grid, each) for each in poses)
 
 
 def _projective_error(source: RowSource, grid: Grid, layout: Layout) -> float:

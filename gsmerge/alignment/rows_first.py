@@ -1,26 +1,27 @@
-"""Find which row is which pixel: by the grid that rows show, whose views are then found among the file's cameras.
+"""Find the cameras that show the Gaussians of a file in their place, and which row is which pixel where that shows.
 
-Most files are plain: rows are the pixels in order, which the stored cameras show. Otherwise rows show by themselves
-whether they are the pixels of a grid, since some camera shows them in their pixels then, and the pose of each of its
-views. What is left to find is which of the file's cameras each view is, and how their world lies in that of the
-Gaussians: one similarity, for every convention of the poses and every likely order of the views.
+Most files are plain: rows are the pixels in order, which the stored cameras show. Rows of every pixel in another order,
+or in another world, show the pose of each view by themselves; what is left to find is which of the file's cameras each
+view is, and how their world lies in that of the Gaussians: one similarity, for every convention of the poses and every
+likely order of the views. Gaussians of other rows show the cameras by the centres of pixels, about which they lie.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment.cameras import NEAR_PX, describe_reading, max_pixels, move_cameras, other_conventions
-from gsmerge.alignment.frames import scale_by, usual_frames
+from gsmerge.alignment.cameras import NEAR_PX, describe_reading, max_pixels, move_cameras
+from gsmerge.alignment.centres import CentreCheck, check_centres, find_rows, sample_points
+from gsmerge.alignment.frames import exporter_frames, scale_by
 from gsmerge.alignment.grids import (
     Grid,
+    Place,
     check_photo_size,
     file_grids,
     grids_of,
@@ -37,28 +38,24 @@ from gsmerge.alignment.layouts import (
     Layout,
     depth_layouts,
     dropped_layout,
-    every_nth,
     exact_layouts,
-    move_layout,
     plain_layout,
     subsample,
     view_orders,
 )
-from gsmerge.alignment.match import GridLayout, RowSource, match_views, refine
+from gsmerge.alignment.match import GridLayout, RowSource, match_views, other_grids, refine
 from gsmerge.alignment.score import AS_NEAR_PX, SHUFFLED_MARGIN, score_layout
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, photo_size
+from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, photo_size, same_shape
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
 _PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
 _ENOUGH, _FEW = 24, 0.05  # finite rows that decide between readings; fewer will do where they are no such small share
-_MANY_PIXELS = 2  # times as many pixels as rows: likely photos of another size than the grid's
-_PER_VIEW = 500  # finite rows for each camera, from which it is searched which pixels lack one
-_SAME_FOCAL, _OFF = 0.1, 1  # by which focal lengths may differ, relative, and principal points, pixels
+_MANY_PIXELS = 4  # times as many pixels as rows: likely of photos three times the size of the grid, or more
 _MOVED_GAUSSIANS = 2000  # Gaussians of a view that its moved pose is solved from
 
 
@@ -124,13 +121,17 @@ def align(
         grids.insert(0, photo_grid(camera_file, source.size))
     except SceneError as error:
         problem = error
-    found = _read_in_order(source, grids) or _find_pixels(source, grids)
-    if found is not None:
+    found = _read_in_order(source, grids) or _search(source, grids)
+    if problem is not None:
+        if isinstance(found, Recovery) and (found.best.layout.kind != "pruned" or found.confirmed):
+            return _make_result(source, found)  # rows that lack pixels fit cameras of other shapes, too
+        cropped = _cropped_grid(source, grids)
+        if cropped is None:
+            raise problem
+        return _choose_cameras(source, cropped, frames, None)
+    if isinstance(found, Recovery):
         return _make_result(source, found)
-    cropped = None if problem is None else _cropped_grid(source, grids)
-    if problem is not None and cropped is None:
-        raise problem
-    return _choose_cameras(source, cropped or grids[0], frames)
+    return _choose_cameras(source, grids[0] if found is None else found.grid, frames, found)
 
 
 def _read_in_order(source: RowSource, grids: Sequence[Grid]) -> Recovery | None:
@@ -161,62 +162,112 @@ def _has_enough(source: RowSource) -> bool:
     return finite >= _ENOUGH or finite >= _FEW * len(source.ply.gaussians)
 
 
-# Rows show their grid
+# Rows and cameras that belong together
 
 
-def _find_pixels(source: RowSource, named: Sequence[Grid]) -> Recovery | None:
-    """Find the grid that the rows are the pixels of, and which of the cameras are those of its views; None if neither.
+def _search(source: RowSource, named: Sequence[Grid]) -> Recovery | Place | None:
+    """Find which pixels the rows are, or at least cameras that show them in their place; None if neither.
 
     ``named``: the grids of sizes that files name.
     """
-    if source.order in MAY_BE_UNALIGNED or not _has_enough(source):
+    if source.order == "none" or not _has_enough(source):
         return None
-    found = None
-    for turn, places in enumerate(_rounds(source, named)):
-        candidates = match_views(source, places)
-        other = judge(candidates, source.inputs, partial(refine, source)) if candidates else None
-        if other is None and turn == 0 and named:
-            other = _move_cameras(source, named[0])
-        found = min(filter(None, (found, other)), key=lambda each: each.chosen.px, default=None)
-        if found is not None and not found.chosen.is_doubtful:
-            return found
-    return found
+    found: Recovery | None = None
+    place: Place | None = None
+    for other in _findings(source, named):
+        if isinstance(other, Place):
+            place = place or _at_photo_size(other, named)
+            if not _are_few(source, len(other.grid.cameras), other.grid):
+                break
+        elif other is not None:
+            found = other if found is None or other.chosen.px < found.chosen.px else found
+            if not found.chosen.is_doubtful:
+                return found
+    return found or place
 
 
-def _rounds(source: RowSource, named: Sequence[Grid]) -> Iterator[list[GridLayout]]:
-    """Yield places of the rows: by their number, where they follow the cameras, and where they show a grid."""
-    from gsmerge.alignment.row_grid import find_layouts  # few files come here
+def _findings(source: RowSource, named: Sequence[Grid]) -> Iterator[Recovery | Place | None]:
+    """Yield what the number of rows, centres of pixels, and the rows themselves show, in turn."""
+    found = _match(source, [(grid, layout) for grid in named for layout in _layouts(source, grid)])
+    yield found
+    if found is None and named:
+        yield _move_cameras(source, named[0])
+    yield _read_centres(source, (place for grid in named for place in _usual_places(source, grid)))
+    if source.order not in MAY_BE_UNALIGNED:
+        from gsmerge.alignment.row_grid import find_layouts  # few files come here
 
-    yield [(grid, layout) for grid in named for layout in _layouts(source, grid)]
-    pixels = max((len(grid.cameras) * math.prod(grid.size) for grid in named), default=0)
-    is_small = _MANY_PIXELS * len(source.ply.gaussians) < pixels  # and likely a whole grid of another size
-    if not is_small:
-        yield from _follow_cameras(source, named)
-    layouts = find_layouts(source.ply.gaussians, source.ply.valid)
-    if layouts:
-        shown = partial(shown_sizes, shape=(layouts[0].width, layouts[0].height))
-        grids = grids_of(source.camera_file, source.size, shown)
-        yield [(grid, each) for grid in grids for each in _layouts(source, grid) if _are_same(each, layouts)]
-        return
-    if is_small:
-        yield from _follow_cameras(source, named)
-    yield from _lacking_places(source, named)
-
-
-def _lacking_places(source: RowSource, named: Sequence[Grid]) -> Iterator[list[GridLayout]]:
-    """Yield the places of rows that lack pixels at random, in grids that files name or networks have."""
-    from gsmerge.alignment.dropped_rows import find_dropped_grid  # few files come here
-
-    if not _may_lack_pixels(source, named):
-        return
-    shown = find_dropped_grid(source.ply.gaussians.means, source.ply.valid)
+        layouts = find_layouts(source.ply.gaussians, source.ply.valid)
+        shape = (layouts[0].width, layouts[0].height) if layouts else (0, 0)
+        shown = grids_of(source.camera_file, source.size, partial(shown_sizes, shape=shape)) if layouts else []
+        yield _match(source, [(g, each) for g in shown for each in _layouts(source, g) if _are_same(each, layouts)])
     usual = grids_of(source.camera_file, source.size, network_sizes)
-    if shown is None:
-        yield from _follow_cameras(source, usual)
-        return
-    layout, own = shown[0], shown[1].cameras
-    for grids in (named, usual):
-        yield [(g, place) for g in grids for place in _moved_layouts(source, g, layout, own)]
+    other = _read_centres(source, (place for grid in usual for place in _usual_places(source, grid)))
+    yield other if isinstance(other, Recovery) else None  # cameras alone are better at the photos' size
+
+
+def _match(source: RowSource, places: Sequence[GridLayout]) -> Recovery | None:
+    """Match the views of layouts with the file's cameras; None if none fit."""
+    candidates = match_views(source, places)
+    return judge(candidates, source.inputs, partial(refine, source)) if candidates else None
+
+
+def _at_photo_size(place: Place, named: Sequence[Grid]) -> Place:
+    """Bring cameras to the size of the photos, which show more than those of the size of a network's grid."""
+    grid = next((grid for grid in named if same_shape(grid.size, place.grid.size)), place.grid)
+    cameras = replace(grid.cameras, viewmats=place.grid.cameras.viewmats)
+    return replace(place, grid=replace(grid, camera_file=place.grid.camera_file, cameras=cameras))
+
+
+def _usual_places(source: RowSource, grid: Grid) -> Iterator[Place]:
+    """Yield the cameras of a grid in each frame of exporters, and in each other convention of their poses."""
+    how = "Gaussians' places in their pixels"
+    yield from (Place(grid, frame, how) for frame in exporter_frames(grid.cameras, source.scale))
+    yield from (Place(other, IDENTITY) for other in other_grids(source, grid))
+
+
+def _read_centres(source: RowSource, places: Iterable[Place]) -> Recovery | Place | None:
+    """Choose cameras under which the Gaussians lie about centres of pixels, and find their rows' pixels.
+
+    The cameras alone where the rows are no pixels in their order, nor lie so near that they show them in any.
+    """
+    points = sample_points(source.ply.gaussians.means, source.ply.valid)
+    checked = [(check_centres(points, place.cameras), place) for place in places]
+    right = [each for each in checked if each[0].ok]
+    if not right:
+        return None
+    check, place = min(right, key=lambda each: each[0].px / each[0].chance_px)
+    found = _read_place(source, place, check)
+    return place if found is None and _shows_colors(source, place) else found
+
+
+def _shows_colors(source: RowSource, place: Place) -> bool:
+    """Return whether photos, if there are any, have the colours of the Gaussians that the cameras show."""
+    from gsmerge.alignment.unaligned import check_cameras  # few files come here
+
+    inputs = source.inputs(place.grid)
+    return check_cameras(inputs.gaussians, inputs.valid, place.cameras, inputs.images).ok
+
+
+def _read_place(source: RowSource, place: Place, check: CentreCheck) -> Recovery | None:
+    """Find the pixels of rows whose cameras are known: of their number, or of the rows that are there; None without."""
+    grid, frame = place.grid, place.frame
+    inputs = source.inputs(grid, photos=False)
+    layouts = [each for layout in _layouts(source, grid) for each in layout.with_views_in(source.orders(grid))]
+    readings = [GridReading(grid, score_layout(inputs, each, frame)) for each in layouts]
+    readings = [each for each in readings if each.reading.alignment.ok and each.px <= _PLAIN_PX]
+    if not readings:
+        ids = find_rows(source.ply.gaussians.means, source.ply.valid, place.cameras, check)
+        layout = None if ids is None else dropped_layout(ids, len(grid.cameras), *grid.size).without_empty_parts()
+        if layout is None or not source.may_be(layout.order) or _are_few(source, len(layout.views), grid):
+            return None
+        readings = [GridReading(grid, score_layout(inputs, layout, frame))]
+    is_solved = frame.scale != 1 and source.scale is None  # roughly: rows show it better
+    return judge(readings, source.inputs, partial(refine, source) if is_solved else lambda candidate: candidate)
+
+
+def _are_few(source: RowSource, views: int, grid: Grid) -> bool:
+    """Return whether rows are so few for some views of a grid that they are likely every pixel of a smaller one."""
+    return _MANY_PIXELS * len(source.ply.gaussians) < views * math.prod(grid.size)
 
 
 def _layouts(source: RowSource, grid: Grid) -> list[Layout]:
@@ -235,60 +286,6 @@ def _are_same(layout: Layout, shown: Sequence[Layout]) -> bool:
     y, x = np.divmod(layout.pixels[0][[0, -1]], layout.width)
     what = int(np.ptp(x)) + 1, int(np.ptp(y)) + 1, layout.order, layout.per_pixel
     return any(what == (other.width, other.height, other.order, other.per_pixel) for other in shown)
-
-
-def _may_lack_pixels(source: RowSource, grids: Sequence[Grid]) -> bool:
-    """Return whether rows may be pixels of some of the grids, of which many are missing."""
-    most = max((len(grid.cameras) * math.prod(grid.size) for grid in grids), default=0)
-    enough = _PER_VIEW * len(source.camera_file) <= int(source.ply.valid.sum())
-    return enough and len(source.ply.gaussians) < most
-
-
-def _follow_cameras(source: RowSource, grids: Sequence[Grid]) -> Iterator[list[GridLayout]]:
-    """Yield the place of rows that lack pixels and follow the cameras, as exporters move or misread them.
-
-    Rows cannot always show them alone: where a border and each faint pixel are missing, no line is whole.
-    """
-    from gsmerge.alignment.dropped_rows import follow_rows  # few files come here
-
-    others = other_conventions(source.camera_file.viewmats, source.camera_file.convention)
-    rows = np.flatnonzero(source.ply.valid)
-    points = source.ply.gaussians.means[rows]
-    for grid in grids:
-        if not _may_lack_pixels(source, [grid]):
-            continue
-        moved = chain(
-            (frame.move(grid.cameras) for frame in usual_frames(grid.cameras, source.scale)),
-            (replace(grid.cameras, viewmats=poses.viewmats) for poses in others),
-        )
-        for cameras in moved:
-            pixels = follow_rows(points, cameras)
-            if pixels is None:
-                continue
-            ids = np.full(len(source.ply.gaussians), -1)
-            ids[rows] = pixels
-            layout = dropped_layout(ids, len(cameras), cameras.width, cameras.height)
-            if source.may_be(layout.order):
-                yield [(grid, layout)]
-
-
-def _moved_layouts(source: RowSource, grid: Grid, layout: Layout, own: Cameras) -> list[Layout]:
-    """List the places in a grid of rows that lack pixels, which show a ``layout`` and cameras of their ``own``."""
-    cameras = grid.cameras
-    margins = cameras.width - layout.width, cameras.height - layout.height
-    focal = np.median(own.Ks[:, (0, 1), (0, 1)], 0) / np.median(cameras.Ks[:, (0, 1), (0, 1)], 0)
-    if min(margins) < 0 or len(layout.views) > len(cameras) or not (np.abs(focal - 1) <= _SAME_FOCAL).all():
-        return []
-    if not source.may_be(layout.order):
-        return []
-    chosen = next((ids for ids in every_nth(len(cameras)) if len(ids) == len(layout.views)), layout.views)
-    layout = replace(layout, views=chosen)
-    shifts = np.rint(np.median(cameras.Ks[:, :2, 2], 0) - np.median(own.Ks[:, :2, 2], 0)).astype(int)
-    lefts, tops = (
-        sorted({place for place in (margin // 2, *range(shift - _OFF, shift + _OFF + 1)) if 0 <= place <= margin})
-        for margin, shift in zip(margins, shifts.tolist(), strict=True)
-    )
-    return [move_layout(layout, cameras.width, cameras.height, left, top) for left in lefts for top in tops]
 
 
 # Cameras that are off
@@ -335,53 +332,50 @@ def _cropped_grid(source: RowSource, grids: Sequence[Grid]) -> Grid | None:
     return best
 
 
-def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
-    """Choose cameras that see rows without pixels; SceneError if none do, or if the rows should have pixels."""
-    from gsmerge.alignment.explain import explain_count
+def _choose_cameras(
+    source: RowSource, grid: Grid, frames: Callable[[], Sequence[Similarity]], place: Place | None
+) -> AlignmentResult:
+    """Choose cameras that see rows, if no ``place`` is known; SceneError if none do, or if rows are their pixels."""
+    from gsmerge.alignment.explain import check_frame, count_error
     from gsmerge.alignment.unaligned import choose_cameras
     from gsmerge.alignment.upright import upright_rotation
 
-    info, camera_file, inputs = source.ply.info, source.camera_file, source.inputs(grid)
+    camera_file, inputs = source.camera_file, source.inputs(grid)
     if source.order not in MAY_BE_UNALIGNED:
-        check_photo_size(info, camera_file, source.size)
-    rotation = upright_rotation(inputs)
+        check_photo_size(source.ply.info, camera_file, source.size)
+    rotation = upright_rotation(inputs) if place is None else None
     if rotation is not None:
-        return _place_upright(source, grid, rotation)
-    why = explain_count(info, inputs, camera_file)
-    if source.scale is not None:
-        inputs = replace(inputs, cameras=scale_by(source.scale).move(inputs.cameras))
-    cameras, camera_file, notes = choose_cameras(inputs, camera_file, frames(), why)
-    return AlignmentResult(
-        None, cameras, inputs.images, camera_file, (*grid.notes, *notes), grid.transform, problem=why.problem
-    )
+        place = _place_upright(source, grid, rotation)
+        points = sample_points(inputs.gaussians.means, inputs.valid)
+        found = _read_place(source, place, check_centres(points, place.cameras))
+        if found is not None:
+            return _make_result(source, found)
+    why, more = count_error(source.ply.info, grid.cameras), list[str]()
+    if place is None:
+        check_frame(inputs, camera_file)
+        if source.scale is not None:
+            grid = replace(grid, cameras=scale_by(source.scale).move(grid.cameras))
+        place, more = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), why)
+        again = None if place.frame is IDENTITY or source.order == "none" else _read_centres(source, [place])
+        if isinstance(again, Recovery):
+            return _make_result(source, again)
+    cameras, camera_file, grid = place.cameras, place.grid.camera_file, place.grid
+    if place.frame is not IDENTITY:
+        camera_file = replace(camera_file, viewmats=cameras.viewmats)
+    notes, images = (*place.notes(source.camera_file.convention), *more), source.inputs(grid).images
+    return AlignmentResult(None, cameras, images, camera_file, notes, grid.transform, problem=why.problem)
 
 
-def _place_upright(source: RowSource, grid: Grid, rotation: Similarity) -> AlignmentResult:
-    """Find pixels or cameras of rows that an exporter centred, rescaled and turned; SceneError if that fails."""
+def _place_upright(source: RowSource, grid: Grid, rotation: Similarity) -> Place:
+    """Find where rows lie that an exporter centred, rescaled and turned; SceneError if that fails."""
     from gsmerge.alignment.upright import solve_upright, upright_error
 
     grids = [grid, *grids_of(source.camera_file, source.size, square_sizes)] if len(source.photos) else []
     solved = ((each, solve_upright(source.inputs(each), rotation)) for each in grids)
-    placed = next(((each, frame) for each, frame in solved if frame is not None), None)
-    if placed is None:
+    place = next((Place(each, frame, "photos' colours") for each, frame in solved if frame is not None), None)
+    if place is None:
         raise upright_error(source.ply.info, len(source.photos))
-    grid, frame = placed
-    inputs, moved = source.inputs(grid), replace(grid, cameras=frame.move(grid.cameras))
-    for ((_, layout),) in _follow_cameras(source, [moved]):
-        found = judge(
-            [GridReading(grid, score_layout(inputs, layout, frame))], source.inputs, lambda candidate: candidate
-        )
-        if found is not None:
-            return _make_result(source, found)
-    return AlignmentResult(
-        None,
-        moved.cameras,
-        inputs.images,
-        replace(source.camera_file, viewmats=moved.cameras.viewmats),
-        (*grid.notes, f"the cameras are {frame.description}, as the photos' colours show"),
-        grid.transform,
-        problem="expected one Gaussian per pixel, found Gaussians that were merged",
-    )
+    return place
 
 
 def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:

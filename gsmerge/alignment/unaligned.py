@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.alignment.cameras import Poses, describe_reading, other_conventions
-from gsmerge.alignment.frames import usual_frames
+from gsmerge.alignment.cameras import Poses, other_conventions
+from gsmerge.alignment.centres import check_centres, sample_points
+from gsmerge.alignment.frames import exporter_frames
+from gsmerge.alignment.grids import Grid, Place, read_as
 from gsmerge.alignment.score import MARGIN, RANDOM_SHARE, SAME_COLORS, AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity, is_inside, lower_median, project_points, sh0_to_rgb
-from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention
+from gsmerge.io.cameras.camera_file import Convention
 from gsmerge.kernels.elementary import exp
 from gsmerge.types import Cameras, Gaussians
 
@@ -29,6 +31,7 @@ _SCALES = np.geomspace(1 / 30, 30, 55)  # of the cameras' positions, tried in tu
 _SCALE_GAUSSIANS = 2000  # Gaussians that they are tried on
 # next, nearer and nearer: reach (natural logarithm), steps, Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
+_CENTRED = ((0.02, 81), (5e-4, 51))  # then nearer to centres of pixels: reach and steps
 _MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
 
 
@@ -156,37 +159,32 @@ def find_padding(gaussians: Gaussians) -> np.ndarray:
 
 
 def choose_cameras(
-    inputs: AlignmentInput, camera_file: CameraFile, frames: Sequence[Similarity], why: SceneError
-) -> tuple[Cameras, CameraFile, list[str]]:
+    inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], why: SceneError
+) -> tuple[Place, list[str]]:
     """Choose cameras that see the Gaussians: unchanged, in another frame, or in another convention; with notes.
 
     ``frames`` are the frames that a file names; the usual frames of exporters are tried next. If no camera sees the
     Gaussians, a SceneError gives ``why`` there are no pixels.
     """
     inputs = replace(inputs, valid=inputs.valid & ~find_padding(inputs.gaussians))
-    rows = inputs.gaussians, inputs.valid
-    moved = [(frame, frame.move(inputs.cameras)) for frame in (IDENTITY, *frames)]
+    rows, stay = (inputs.gaussians, inputs.valid), Place(grid, IDENTITY)
     if frames:
-        stay, *checks = (check_cameras(*rows, cameras, inputs.images) for _, cameras in moved)
+        least = check_cameras(*rows, inputs.cameras, inputs.images).score
+        checks = [check_cameras(*rows, frame.move(inputs.cameras), inputs.images) for frame in frames]
         best = max(checks, key=lambda check: check.score)
-        if best.ok and best.score > stay.score:
-            frame, cameras = moved[1 + checks.index(best)]
-            return cameras, replace(camera_file, viewmats=cameras.viewmats), [f"the cameras are {frame.description}"]
-    poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, camera_file.convention)
+        if best.ok and best.score > least:
+            return replace(stay, frame=frames[checks.index(best)]), []
+    poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
     other = _choose_frame(inputs, check)
     if other is not None:
-        cameras = other.move(inputs.cameras)
-        _check_colors(inputs, cameras, other.description, why)
-        note = f"the cameras are {other.description}, as the photos' colours show"
-        return cameras, replace(camera_file, viewmats=cameras.viewmats), [note]
+        _check_colors(inputs, other.move(inputs.cameras), other.description, why)
+        return Place(grid, other, "photos' colours"), []
     if not check.ok:
         raise SceneError(why.path, f"{why.problem}; {check.description}", why.remedy)
     if poses is None:
-        return inputs.cameras, camera_file, [note] if note else []
-    cameras = replace(inputs.cameras, viewmats=poses.viewmats)
-    _check_colors(inputs, cameras, f"read as {poses.description}", why)
-    note = f"{describe_reading(poses.convention, camera_file.convention)}: read so"
-    return cameras, with_convention(camera_file, poses.convention), [note]
+        return stay, [note] if note else []
+    _check_colors(inputs, replace(inputs.cameras, viewmats=poses.viewmats), f"read as {poses.description}", why)
+    return replace(stay, grid=read_as(grid, poses)), []
 
 
 def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: SceneError) -> None:
@@ -201,14 +199,6 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: Scen
         raise SceneError(why.path, f"{why.problem}; {found} others", remedy)
 
 
-def _exporter_frames(inputs: AlignmentInput) -> Iterator[Similarity]:
-    """Yield the frames that exporters use for rows, at the scale of the cameras."""
-    yield from usual_frames(inputs.cameras)[1:]
-    yield Similarity(np.diag([1.0, -1, -1]), 1.0, np.zeros(3), "turned to y up, as .spz files are", "other")
-    first = inputs.cameras.viewmats[0]
-    yield Similarity(first[:3, :3], 1.0, first[:3, 3], "moved into the first camera", "first")
-
-
 def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
     """Choose the exporter's frame in which the colours fit the photos clearly better; None without one.
 
@@ -217,7 +207,7 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     """
     if not len(inputs.images):
         return None
-    frames = [IDENTITY, *_exporter_frames(inputs)]
+    frames = exporter_frames(inputs.cameras)
     best, score = _best_frame(inputs, frames)
     stands_out = _stands_out(inputs, best, score)
     if inputs.scale is None and not stands_out:
@@ -264,9 +254,15 @@ def _scaled(frame: Similarity, factor: float) -> Similarity:
 
 
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
-    """Find the scale at which the colours are nearest to the photos."""
+    """Find the scale at which the colours are nearest to the photos, and of those about it the Gaussians to centres."""
     best, _ = _best_frame(inputs, (_scaled(frame, float(scale)) for scale in _SCALES), _SCALE_GAUSSIANS)
     for reach, steps, samples in _FINER:
         factors = exp(np.linspace(-reach, reach, steps))
         best, _ = _best_frame(inputs, [_scaled(best, float(factor)) for factor in factors], samples)
+    points = sample_points(inputs.gaussians.means, inputs.valid)
+    for reach, steps in _CENTRED:
+        scales = [_scaled(best, float(factor)) for factor in exp(np.linspace(-reach, reach, steps))]
+        checks = [check_centres(points, scaled.move(inputs.cameras)) for scaled in scales]
+        nearest = min(range(steps), key=lambda number: checks[number].px)
+        best = scales[nearest] if checks[nearest].ok else best
     return best

@@ -23,6 +23,75 @@ API int32_t pixel_errors(const double *points, const int64_t *views, const doubl
   return 0;
 }
 
+// Where a camera shows a point, pixels; whether that is in its picture.
+static inline int show(const float *point, const double *viewmat, const double *K, int64_t width, int64_t height,
+                       double place[2]) {
+  double world[3] = {point[0], point[1], point[2]}, camera[3], image[3];
+  for (int c = 0; c < 3; c++) camera[c] = row_times(viewmat + 4 * c, world) + viewmat[4 * c + 3];
+  if (!(camera[2] > 0.0)) return 0;
+  for (int c = 0; c < 3; c++) image[c] = row_times(K + 3 * c, camera);
+  double x = image[0] / image[2], y = image[1] / image[2];
+  if (!(x >= 0.0 && x < (double)width && y >= 0.0 && y < (double)height)) return 0;
+  place[0] = x, place[1] = y;
+  return 1;
+}
+
+API void nearest_centres(const float *points, const double *viewmats, const double *Ks, int64_t *ids,
+                         double *squares, int32_t *seen, int64_t width, int64_t height, int64_t n, int64_t v) {
+  for (int64_t i = 0; i < n; i++) {
+    double nearest = __builtin_inf(), place[2];
+    int64_t id = -1;
+    int32_t count = 0;
+    for (int64_t view = 0; view < v; view++) {
+      if (!show(points + 3 * i, viewmats + 16 * view, Ks + 9 * view, width, height, place)) continue;
+      int64_t column = (int64_t)place[0], row = (int64_t)place[1];
+      double right = place[0] - ((double)column + 0.5), down = place[1] - ((double)row + 0.5);
+      double xx = right * right, yy = down * down, square = xx + yy;  // statements of their own are not contracted
+      count++;
+      if (square < nearest) nearest = square, id = (view * height + row) * width + column;
+    }
+    ids[i] = id, squares[i] = nearest, seen[i] = count;
+  }
+}
+
+// The longest ascending series of keys, of each point at most one (Schensted 1961): tails [length] are the smallest
+// keys with which series of each length end, ends their numbers i * v + view, before the numbers that precede each.
+API int64_t follow_pixels(const float *points, const double *viewmats, const double *Ks, int64_t *ids, int64_t *tails,
+                          int32_t *ends, int32_t *before, int64_t *keys, int32_t *views, int64_t width,
+                          int64_t height, int32_t mixed, int64_t n, int64_t v, int64_t m) {
+  int64_t length = 0, area = width * height;
+  if (m != n * v) return -1;
+  double place[2];
+  for (int64_t i = 0; i < n; i++) {
+    int64_t count = 0;
+    ids[i] = -1;
+    for (int64_t view = 0; view < v; view++) {
+      if (!show(points + 3 * i, viewmats + 16 * view, Ks + 9 * view, width, height, place)) continue;
+      int64_t pixel = (int64_t)place[1] * width + (int64_t)place[0], at = count++;
+      int64_t key = mixed ? pixel * v + view : view * area + pixel;
+      for (; at > 0 && keys[at - 1] < key; at--) keys[at] = keys[at - 1], views[at] = views[at - 1];
+      keys[at] = key, views[at] = (int32_t)view;
+    }
+    for (int64_t k = 0; k < count; k++) {  // the largest first, so that none follows another one of its point
+      int64_t low = 0, high = length;
+      while (low < high) {
+        int64_t middle = (low + high) / 2;
+        if (tails[middle] < keys[k]) low = middle + 1; else high = middle;
+      }
+      int64_t number = i * v + views[k];
+      before[number] = low ? ends[low - 1] : -1;
+      tails[low] = keys[k], ends[low] = (int32_t)number;
+      if (low == length) length++;
+    }
+  }
+  for (int64_t number = length ? ends[length - 1] : -1; number >= 0; number = before[number]) {
+    int64_t i = number / v, view = number % v;
+    show(points + 3 * i, viewmats + 16 * view, Ks + 9 * view, width, height, place);
+    ids[i] = (view * height + (int64_t)place[1]) * width + (int64_t)place[0];
+  }
+  return length;
+}
+
 // Products are statements of their own, so that they are rounded one by one.
 static inline double minus(double a, double b, double c, double d) {
   double left = a * b, right = c * d;

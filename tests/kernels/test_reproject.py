@@ -7,7 +7,7 @@ import pytest
 
 from gsmerge.geometry import motion_matrices, project_points
 from gsmerge.kernels.elementary import exp
-from gsmerge.kernels.reproject import linearise, pixel_errors
+from gsmerge.kernels.reproject import follow_pixels, linearise, nearest_centres, pixel_errors
 
 K = np.array([[300.0, 0, 150], [0, 310, 110], [0, 0, 1]])
 STEP = 1e-6
@@ -42,6 +42,71 @@ def test_a_view_that_is_not_there_is_refused(view: int) -> None:
         pixel_errors(
             np.zeros((1, 3)), np.array([view]), np.zeros((2, 4, 4)), np.zeros((2, 3, 3)), np.zeros((1, 2)), np.zeros(1)
         )
+
+
+def places_of(points: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where views show points, and whether, by the plain formula."""
+    with np.errstate(all="ignore"):
+        places, depths = project_points(points.astype(np.float64)[None], poses, np.tile(K, (len(poses), 1, 1)))
+        x, y = np.moveaxis(places, -1, 0)
+        return places, (depths > 0) & (x >= 0) & (x < 300) & (y >= 0) & (y < 220)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nearest_centres_are_those_of_all_views(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, poses = rng.normal(0, 3, (400, 3)).astype(np.float32), make_poses(7, rng)
+    points[0], points[1] = np.nan, np.inf
+    ids, squares, seen = np.empty(400, np.int64), np.empty(400), np.empty(400, np.int32)
+    nearest_centres(points, poses, np.tile(K, (7, 1, 1)), ids, squares, seen, 300, 220)
+    places, shown = places_of(points, poses)
+    with np.errstate(invalid="ignore"):
+        cells = np.floor(places)
+        expected = np.where(shown, ((places - (cells + 0.5)) ** 2).sum(-1), np.inf)
+    assert np.array_equal(squares, expected.min(0))
+    assert np.array_equal(seen, shown.sum(0))
+    for i in np.flatnonzero(shown.any(0)):
+        view = expected[:, i].argmin()
+        assert ids[i] == (view * 220 + cells[view, i, 1]) * 300 + cells[view, i, 0]
+    assert (ids[~shown.any(0)] == -1).all()
+
+
+def longest_series(choices: list[list[int]]) -> int:
+    """How many of some lists may give one number each, so that the numbers ascend; for each last number."""
+    lengths: dict[int, int] = {}
+    for keys in choices:
+        best = {key: 1 + max((n for last, n in lengths.items() if last < key), default=0) for key in keys}
+        for key, length in best.items():
+            lengths[key] = max(length, lengths.get(key, 0))
+    return max(lengths.values(), default=0)
+
+
+@pytest.mark.parametrize("mixed", [0, 1])
+@pytest.mark.parametrize("seed", range(3))
+def test_rows_follow_the_longest_series_of_pixels(seed: int, mixed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, poses = rng.normal(0, 3, (150, 3)).astype(np.float32), make_poses(3, rng)
+    ids, tails, ends, before = (np.empty(n, t) for n, t in ((150, "i8"), (150, "i8"), (150, "i4"), (450, "i4")))
+    scratch = ids, tails, ends, before, np.empty(3, np.int64), np.empty(3, np.int32)
+    count = follow_pixels(points, poses, np.tile(K, (3, 1, 1)), *scratch, 300, 220, mixed)
+    places, shown = places_of(points, poses)
+    pixels = np.where(
+        shown, np.floor(np.nan_to_num(places[..., 1])) * 300 + np.floor(np.nan_to_num(places[..., 0])), -1
+    )
+    views = np.arange(3)[:, None]
+    keys = pixels * 3 + views if mixed else views * 66000 + pixels
+    choices = [[int(key) for key in keys[shown[:, i], i]] for i in range(150)]
+    assert count == (ids >= 0).sum() == longest_series(choices)
+    view, pixel = np.divmod(ids[ids >= 0], 66000)
+    chosen = pixel * 3 + view if mixed else ids[ids >= 0]
+    assert (np.diff(chosen) > 0).all()
+    assert all(key in choices[i] for key, i in zip(chosen.tolist(), np.flatnonzero(ids >= 0), strict=True))
+
+
+def test_scratch_of_another_size_is_refused() -> None:
+    scratch = [np.empty(n, t) for n, t in ((1, "i8"), (1, "i8"), (1, "i4"), (3, "i4"), (2, "i8"), (2, "i4"))]
+    with pytest.raises(ValueError, match="follow_pixels"):
+        follow_pixels(np.zeros((1, 3), np.float32), np.zeros((2, 4, 4)), np.zeros((2, 3, 3)), *scratch, 4, 4, 0)
 
 
 def residuals_of(points: np.ndarray, pixels: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:

@@ -106,13 +106,13 @@ def test_photos_that_agree_or_cannot_tell(tmp_path: Path) -> None:
 def test_a_plain_file_is_not_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files in which the rows as they are leave a doubt are."""
     tiny, searched = smooth_scene(48, 36), []
-    usual = rows_first._find_pixels
+    usual = rows_first._search
 
     def search(*args: object) -> object:
         searched.append(args)
         return usual(*args)
 
-    monkeypatch.setattr(rows_first, "_find_pixels", search)
+    monkeypatch.setattr(rows_first, "_search", search)
     _, recovery = read(tmp_path / "plain", tiny, tiny.images)
     assert recovery.best.layout.is_plain
     assert recovery.margin > SHUFFLED_MARGIN

@@ -99,31 +99,14 @@ def test_conventions_are_inverse_to_each_other(tiny: Tiny) -> None:
     assert np.allclose(to_viewmats(tiny.c2w @ FLIP, ("camera-to-world", "OpenGL")), tiny.w2c)
 
 
-def test_other_readings_are_named(tiny: Tiny) -> None:
+def test_other_orders_are_named(tiny: Tiny) -> None:
     good, valid, n = cameras_of(tiny), valid_of(tiny), len(tiny.gaussians)
 
-    def explain(cameras: Cameras = good, rows: np.ndarray | None = None) -> str | None:
-        gaussians = tiny.gaussians if rows is None else tiny.gaussians[rows]
-        assert not check_alignment(gaussians, cameras, valid).ok
-        return explain_misalignment(gaussians, cameras, valid, W2C_OPENCV)
-
-    flipped = tiny.w2c.copy()
-    flipped[:, 1] *= -1
-    assert "y axis flipped" in explain(cameras_of(tiny, flipped))
-    mirrored = tiny.w2c.copy()
-    mirrored[:, 0] *= -1
-    assert "x axis flipped" in explain(cameras_of(tiny, mirrored))
-    scaled = tiny.w2c.copy()
-    scaled[:, :3, 3] *= 1.7
-    assert "positions scaled by 0.588" in explain(cameras_of(tiny, scaled))
-    transposed = tiny.w2c.copy()
-    transposed[:, :3, :3] = tiny.w2c[:, :3, :3].transpose(0, 2, 1)
-    transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], tiny.c2w[:, :3, 3])
-    assert "rotations transposed" in explain(cameras_of(tiny, transposed))
-    assert "width and height swapped" in explain(replace(good, width=tiny.height, height=tiny.width))
+    def explain(rows: np.ndarray) -> str | None:
+        assert not check_alignment(tiny.gaussians[rows], good, valid).ok
+        return explain_misalignment(tiny.gaussians[rows], good, valid, W2C_OPENCV)
 
     rows = np.arange(n).reshape(3, tiny.height, tiny.width)
-    assert "view fastest" in explain(rows=rows.transpose(1, 2, 0).reshape(-1))
-    assert "column-major" in explain(rows=rows.transpose(0, 2, 1).reshape(-1))
-    assert "reverse order" in explain(rows=rows[::-1].reshape(-1))
-    assert explain(rows=np.random.default_rng(0).permutation(n)) is None
+    assert "view fastest" in str(explain(rows.transpose(1, 2, 0).reshape(-1)))
+    assert "column-major" in str(explain(rows.transpose(0, 2, 1).reshape(-1)))
+    assert explain(np.random.default_rng(0).permutation(n)) is None

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from exports import export_rows, save_export, smooth_scene, turned
 from messages import noted, refuses
+from model_rows import merge_voxels
 from sweeps import sweep
 from tiny_scene import make_tiny, write_images
 
@@ -25,10 +26,8 @@ SMOOTH = smooth_scene(WIDTH, HEIGHT)
 
 
 def voxels() -> np.ndarray:
-    """Rows of three fifths of the Gaussians, a prime number, in an order of space."""
-    means = SMOOTH.gaussians.means
-    chosen = np.random.default_rng(0).permutation(len(means))[:4027]
-    return export_rows(SMOOTH, chosen[np.lexsort(means[chosen].round(1).T)])
+    """Rows of merged Gaussians, a prime number, in an order of space."""
+    return export_rows(replace(SMOOTH, gaussians=merge_voxels(SMOOTH, 0.07)), np.arange(4027))
 
 
 def padded(rows: np.ndarray) -> np.ndarray:
@@ -93,7 +92,9 @@ def test_without_photos_no_other_frame_is_tried(tmp_path: Path) -> None:
 def test_no_other_frame_stands_against_the_foremost_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever chooses a frame: where the photos are far from what they should show, it is refused."""
     wrong = Similarity(np.eye(3), 1.0, np.array([0.9, 0.4, 0.0]), "somewhere else", "shifted")
-    folder = save_export(tmp_path, SMOOTH, voxels())
+    rows = voxels()
+    rows["x"] += np.random.default_rng(0).uniform(-0.05, 0.05, len(rows))  # a pixel to each side
+    folder = save_export(tmp_path, SMOOTH, rows)
     monkeypatch.setattr(unaligned, "_choose_frame", lambda inputs, usual: wrong)
     with refuses(SceneError, "scene.ply", "somewhere else", "colours", "--hint exporter"):
         load_scene(folder, cameras=folder)

@@ -105,16 +105,6 @@ def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured
         load_scene(folder, cameras=folder)
 
 
-def test_rows_scaled_and_shifted_again_show_their_pixels(tmp_path: Path, textured: Smooth) -> None:
-    rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)))
-    moved = turned(rows, np.eye(3), scale=1.3, shift=np.array([0.3, -0.2, 0.4]))
-    loaded = load_scene(save_export(tmp_path, textured, moved))
-    assert loaded.alignment is not None
-    assert loaded.alignment.ok
-    assert loaded.recovery is not None
-    assert loaded.recovery.confirmed
-
-
 def test_too_few_rows_for_a_stretch(tmp_path: Path, textured: Smooth) -> None:
     rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)[:100]))
     with refuses(SceneError, "scene.ply"):

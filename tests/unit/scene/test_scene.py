@@ -171,7 +171,7 @@ def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:
 def test_swapped_sizes_without_images(tmp_path: Path, tiny: Tiny) -> None:
     folder = tiny.save(tmp_path, images=False)
     rewrite(folder / "transforms.json", lambda data: data.update(w=14, h=20))
-    with refuses(SceneError, "transforms.json", "median", "swapped"):
+    with refuses(SceneError, "transforms.json", "median", "cameras"):
         read_scene(folder, order="view-major", cameras=folder)
 
 
