@@ -312,7 +312,8 @@ def plan_section(run: Run) -> str:
         ]),
         text(
             say(
-                f"No option asks for a number, and each view has Gaussians of its own, so {plan.settings['superpixels']} of the",
+                "No option asks for a number, and each view has Gaussians of its own, so"
+                f" {plan.settings['superpixels']} of the",
                 limits.exact is None and not plan.keeps_input and plan.target_psnr is None,
             ),
             f"{pixels:,} pixels of a view become Gaussians: {limits.per_view} for each view,",

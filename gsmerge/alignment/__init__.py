@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from gsmerge.alignment.estimate import estimate_cameras, estimate_from_rows
     from gsmerge.alignment.explain import explain_misalignment, misalignment_error
     from gsmerge.alignment.focal import estimate_focal
-    from gsmerge.alignment.unaligned import check_cameras, choose_poses, find_padding
+    from gsmerge.alignment.unaligned import check_cameras, choose_poses
 
 _LATER = {
     "cameras": ("move_cameras", "other_conventions"),
@@ -45,7 +45,7 @@ _LATER = {
     "estimate": ("estimate_cameras", "estimate_from_rows"),
     "explain": ("explain_misalignment", "misalignment_error"),
     "focal": ("estimate_focal",),
-    "unaligned": ("check_cameras", "choose_poses", "find_padding"),
+    "unaligned": ("check_cameras", "choose_poses"),
 }
 _HOMES = {name: home for home, names in _LATER.items() for name in names}
 

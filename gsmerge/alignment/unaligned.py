@@ -13,7 +13,7 @@ from gsmerge.alignment.frames import exporter_frames
 from gsmerge.alignment.grids import Grid, Place, read_as
 from gsmerge.alignment.score import MARGIN, RANDOM_SHARE, SAME_COLORS, AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
-from gsmerge.geometry import IDENTITY, Similarity, is_inside, lower_median, project_points, sh0_to_rgb
+from gsmerge.geometry import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import Convention
 from gsmerge.kernels.elementary import exp
 from gsmerge.types import Cameras, Gaussians
@@ -32,7 +32,6 @@ _SCALE_GAUSSIANS = 2000  # Gaussians that they are tried on
 # next, nearer and nearer: reach (natural logarithm), steps, Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
 _CENTRED = ((0.02, 81), (5e-4, 51))  # then nearer to centres of pixels: reach and steps
-_MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
 
 
 @dataclass(frozen=True)
@@ -147,17 +146,6 @@ def choose_poses(
     return None, usual, note if as_good else None
 
 
-def find_padding(gaussians: Gaussians) -> np.ndarray:
-    """Return a mask ``[n]`` of the equal rows at the origin with which VolSplat pads its files."""
-    padding = np.zeros(len(gaussians), bool)
-    rows = np.flatnonzero((gaussians.means == 0).all(1))
-    if len(rows) >= _MIN_PADDING:
-        columns = gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]
-        shape = np.concatenate(columns, 1)[rows]
-        padding[rows[(shape == lower_median(shape)).all(1)]] = True
-    return padding
-
-
 def choose_cameras(
     inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], why: SceneError
 ) -> tuple[Place, list[str]]:
@@ -166,7 +154,6 @@ def choose_cameras(
     ``frames`` are the frames that a file names; the usual frames of exporters are tried next. If no camera sees the
     Gaussians, a SceneError gives ``why`` there are no pixels.
     """
-    inputs = replace(inputs, valid=inputs.valid & ~find_padding(inputs.gaussians))
     rows, stay = (inputs.gaussians, inputs.valid), Place(grid, IDENTITY)
     if frames:
         least = check_cameras(*rows, inputs.cameras, inputs.images).score

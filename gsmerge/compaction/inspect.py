@@ -229,7 +229,8 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"marks      {'; '.join(scene['marks'])}" if scene["marks"] else "",
         f"exporter   {scene['exporter']}",
         f"ignored    {', '.join(ignored)}" if ignored else "",
-        f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_empty']:,} empty, {scene['num_transparent']:,} transparent,"
+        f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_empty']:,} empty,"
+        f" {scene['num_transparent']:,} transparent,"
         f" {scene['num_opaque']:,} opaque, {scene['num_saturated']:,} of opacity 0 or 1",
         f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.3g} % beyond ten times that box",
         f"floaters   about {round(size['share_floaters'] * scene['count']):,}: isolated, or beyond that;"

@@ -215,7 +215,7 @@ def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, l
     out["quats"][off] = normalize(out["quats"][off])
     out["quats"][(out["quats"] == 0).all(1)] = (1, 0, 0, 0)
     notes = [f"{num_bad:,} row(s) with NaN or inf, set aside"] if num_bad else []
-    num_empty = clear_empty(out | {"valid": valid})
+    num_empty = clear_empty("means", out | {"valid": valid})
     notes += [f"{num_empty:,} empty row(s) at the origin, set aside"] if num_empty else []
     return Gaussians(**out), valid, notes
 

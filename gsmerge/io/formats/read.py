@@ -194,7 +194,7 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
     encoding = _activate(out["opacities"], out["valid"], declared_encoding)
     notes = _apply_filter(out) if arrays.FILTER in out else ()
     num_bad = clear_invalid(path, out)
-    num_empty = clear_empty(out)
+    num_empty = clear_empty(path, out)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
     if byte_columns == arrays.NORMALS:
         _spread_low_degree(out["shN"])
@@ -470,11 +470,11 @@ def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
     return len(bad)
 
 
-def clear_empty(out: dict[str, np.ndarray]) -> int:
+def clear_empty(path: str | Path, out: dict[str, np.ndarray]) -> int:
     """Make rows that hold the place of a Gaussian transparent, in place; return their number.
 
     Those are rows at the origin, not turned, round and grey, as a table of zeros is; and rows at the origin that are
-    all equal, as VolSplat fills its files up. They stay where a file has no others.
+    all equal, as VolSplat fills its files up. A few stay where a file has no others; SceneError for many.
     """
     rows = np.flatnonzero((out["means"] == 0).all(1) & out["valid"])
     if len(rows) == 0:
@@ -486,7 +486,10 @@ def clear_empty(out: dict[str, np.ndarray]) -> int:
         empty |= (shape == lower_median(shape)).all(1)
     rows = rows[empty]
     if len(rows) == np.count_nonzero(out["valid"]):
-        return 0
+        if len(rows) < MIN_PADDING:
+            return 0
+        problem = f"expected Gaussians, found {len(rows):,} rows that are empty or equal, at the origin"
+        raise SceneError(path, problem, "the export may have broken off; export it again")
     out["valid"][rows] = False
     _clear(out, rows)
     return len(rows)

@@ -191,7 +191,7 @@ def test_a_file_in_any_order(tmp_path: Path, frame: str) -> None:
     loaded = load_scene(save_export(tmp_path, EXACT, rows))
     assert loaded.recovery is not None
     assert loaded.recovery.best.layout.order == "unordered"
-    stored = loaded.pixel_scene().stored.reshape(-1)
+    stored = loaded.pixel_scene().pixels.shown.reshape(-1)
     assert np.array_equal(np.flatnonzero(stored), np.sort(order))
 
 
@@ -199,7 +199,7 @@ def test_rows_about_their_centres_in_any_order_have_cameras(tmp_path: Path) -> N
     order = np.random.default_rng(0).permutation(COUNT)
     rows = turned(export_rows(JITTER, order), JITTER.w2c[0, :3, :3])
     loaded = load_scene(save_export(tmp_path, JITTER, rows))
-    assert not loaded.scene.aligned
+    assert not loaded.scene.has_own_pixels
     assert len(loaded.scene.gaussians) == COUNT
     assert np.allclose(loaded.scene.cameras.viewmats[0, :3, :3], np.eye(3), atol=1e-6)
 
@@ -213,15 +213,15 @@ def test_an_edited_file_keeps_its_cameras_and_every_row(tmp_path: Path) -> None:
     gaussians = Gaussians.concat([kept, replace(added, means=means)])
     edited = replace(EXACT, gaussians=gaussians)
     loaded = load_scene(save_rows(tmp_path, edited, np.arange(len(gaussians))))
-    assert not loaded.scene.aligned
+    assert not loaded.scene.has_own_pixels
     assert len(loaded.scene.gaussians) == len(gaussians)
     assert np.allclose(loaded.scene.cameras.viewmats, EXACT.w2c)
 
 
 def test_the_hint_of_an_order_stays(tmp_path: Path) -> None:
     folder = save_rows(tmp_path, EXACT, np.random.default_rng(0).permutation(COUNT))
-    assert load_scene(folder, order="unordered").scene.aligned
-    assert not load_scene(folder, order="none").scene.aligned
+    assert load_scene(folder, order="unordered").scene.has_own_pixels
+    assert not load_scene(folder, order="none").scene.has_own_pixels
     with refuses(SceneError, "scene.ply", "order=view-major"):
         load_scene(folder, order="view-major")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
+from messages import noted, refuses
 from numpy.lib.recfunctions import repack_fields
 from plyfile import PlyData, PlyElement
 from slow_readers import drawn, read_splat, read_spz
@@ -366,3 +366,42 @@ def test_parts_have_one_encoding_of_opacities(tmp_path: Path) -> None:
             read_parts(order)
     assert read_parts(paths, opacity="logit").gaussians.opacities[-1] == pytest.approx(1 / (1 + np.exp(-0.995)))
     assert read_parts(paths[:0:-1]).gaussians.opacities[0] == pytest.approx(0.12)
+
+
+def table_of(count: int) -> np.ndarray:
+    """Rows of Gaussians in the layout of INRIA, none of which is empty."""
+    names = ("x", "y", "z", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3)),
+             *(f"rot_{i}" for i in range(4)))  # fmt: skip
+    values = np.random.default_rng(0).uniform(0.1, 1, (count, len(names))).astype(np.float32)
+    return values.view([(name, "f4") for name in names]).reshape(-1)
+
+
+@pytest.mark.parametrize("turned", [True, False])
+def test_empty_rows_are_set_aside(tmp_path: Path, turned: bool) -> None:
+    """Rows of zeros, with or without a rotation; one Gaussian at the origin is none of them."""
+    rows = table_of(50)
+    rows[[3, 7, 48]] = 0
+    rows["rot_0"][[3, 7, 48]] = turned
+    for name in "xyz":
+        rows[name][20] = 0
+    actual = read_ply(save(tmp_path / "a.ply", rows))
+    assert np.flatnonzero(~actual.valid).tolist() == [3, 7, 48]
+    assert (actual.info.num_empty, actual.info.num_nonfinite, actual.info.num_zero_quats) == (3, 0, 0)
+    assert not actual.gaussians.opacities[[3, 7, 48]].any()
+    assert not noted(file_notes(actual.info), "broken off")
+    assert noted(file_notes(actual.info), "3 empty row(s)")
+
+
+@pytest.mark.parametrize(("last", "others", "broken"), [(30, 0, True), (30, 9, True), (3, 9, False), (1, 0, False)])
+def test_files_that_broke_off_are_said_to_have(tmp_path: Path, last: int, others: int, broken: bool) -> None:
+    rows = table_of(100)
+    rows[-last:] = 0
+    rows[:others] = 0
+    assert noted(file_notes(read_ply(save(tmp_path / "a.ply", rows)).info), "broken off") == broken
+
+
+def test_files_of_empty_rows_are_refused(tmp_path: Path) -> None:
+    rows = table_of(40)
+    rows[:] = 0
+    with refuses(SceneError, "a.ply", 40, "origin"):
+        read_ply(save(tmp_path / "a.ply", rows))
