@@ -319,15 +319,15 @@ def _whole_needed(options: CompactOptions) -> list[str]:
 
 
 def keeps_input(scene: SceneSize, options: CompactOptions) -> bool:
-    """Return whether the count is the fewest that keep the input, as neither options nor pixels decide it.
+    """Return whether the count is the fewest that keep the input, as neither options nor the scene's density decide it.
 
     Without photos the result has to be ``KEPT_PSNR`` from the input; with them it may show them ``KEPT_LOSS`` worse. A
-    share of the Gaussians says little where they belong to no pixels: a scene that is compact already needs most of its
-    Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
+    share of the Gaussians says little where they are fewer than pixels: a scene that is compact already needs most of
+    its Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
     """
     budget = options.budget
     asked = options.decides_count or options.replaces_stages  # which seldom come so near
-    return not (asked or scene.has_own_pixels or (budget.auto and not scene.rendered))
+    return not asked and (scene.rendered or not (scene.is_dense or budget.auto))
 
 
 def _check_photos(prepared: Prepared, options: CompactOptions) -> None:

@@ -14,6 +14,7 @@ from gsmerge.types import Gaussians, Scene
 # a far sky does not stretch, and of the diagonal of the box that holds most; median coefficient of the base colours; of
 # fewer nothing is said
 TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
+DENSE = 0.5  # Gaussians for each pixel
 FLAT, FAINT = 0.01, 1 / 255  # range of the base colours' coefficients, and median opacity, at least
 SAMPLE_GAUSSIANS = 65536  # Gaussians that these are measured on
 Pictures = Literal["photos", "renders"]  # photos or what stands in for them; drawings of the scene itself
@@ -41,6 +42,11 @@ class SceneSize:
     def pixels_per_view(self) -> int:
         """Pixels of each view."""
         return self.height * self.width
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether there are about as many Gaussians as pixels, so that a share of them is enough to show these."""
+        return self.has_own_pixels or self.num_gaussians >= DENSE * self.num_views * self.pixels_per_view > 0
 
 
 def measure_size(scene: Scene, pictures: Pictures | None = None) -> SceneSize:
