@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsmerge.evidence.offsets import DISPLACED, SAME, SIDE, PhotoOffsets, find_offsets
+from gsmerge.evidence.offsets import NEAR_PIXELS, SAME, SIDE, PhotoOffsets, find_offsets
 from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
 from gsmerge.kernels.pictures import turn_picture
@@ -25,7 +25,6 @@ from gsmerge.runtime.threads import parallel_map
 DOUBT = 2.0  # standard deviations of noise up to which two scores are one, and a photo is not like its view
 ALIKE = 4  # photos most like a view that are compared with it part by part
 FLAT = 1 / 255  # root mean square of a picture's contrast below which it shows nothing to go by: a rounding of 8 bits
-NORMAL_MEDIAN = 1.2533  # standard errors of a mean of normal values that the standard error of their median is
 FAR = 1e6  # cost of a pair that cannot be
 TOGETHER, TASKS = 8, 16  # least photos that one task compares, and most tasks: each looks at what all views show
 AT_ONCE = 256  # photos of a film that are compared first, at equal distances; then those around the most alike
@@ -58,6 +57,10 @@ class _Scores:
     def of(self, view: int, assignment: Assignment) -> float:
         """Return the score of a photo in a view, turned as assigned; NaN where that cannot be."""
         return float(self.values[view, self.photos.index(assignment.photo), assignment.turn])
+
+    def fits(self, assignment: Assignment) -> bool:
+        """Return whether a photo, turned as assigned, has a shape that can be that of the views."""
+        return bool(np.isfinite(self.values[:, self.photos.index(assignment.photo), assignment.turn]).any())
 
     def best(self) -> np.ndarray:
         """Return the score ``[v,p]`` of each photo in its best turn."""
@@ -124,15 +127,16 @@ class Assigner:
     def lies_elsewhere(self, view: int, given: Mapping[int, Assignment]) -> bool:
         """Return whether the parts of a given photo lie farther from their places than those of the others do.
 
-        That is more than twice as far as these do in the middle: wrong depth displaces what is drawn in all views.
+        That is more than twice as far as these do in the middle: wrong depth displaces what is drawn in all views, but
+        no farther than it moves the parts of one view apart.
         """
         offsets, others = self.find_offsets(view, given[view]), [each for each in given.items() if each[0] != view]
         if offsets is None or offsets.verdict is not False:
             return False
         known = [each.distances for each in parallel_map(lambda pair: self.find_offsets(*pair), others) if each]
         distances = np.concatenate([np.zeros(0), *known])
-        usual = 2 * float(np.median(distances)) if len(distances) else SAME
-        return replace(offsets, same=min(max(usual, SAME), DISPLACED)).verdict is False
+        usual = 2 * float(np.median(distances)) if len(distances) else 0.0
+        return replace(offsets, same=SAME + min(usual, NEAR_PIXELS)).verdict is False
 
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
         """Return the photos that names or order give to views, and whether what they show confirms each.
@@ -165,7 +169,7 @@ class Assigner:
             clear = score > MARGIN and score >= most
             if clear and exact:
                 out[view], sure[view] = assignment, True
-            elif np.isfinite(score) and (like or not self.judged[view]):
+            elif like or (not self.judged[view] and scores.fits(assignment)):
                 parts = self.compare(view, assignment)
                 out[view] = None if self.lies_elsewhere(view, usual) else assignment
                 sure[view] = bool(parts) or (clear and parts is None) or not self.judged[view]
@@ -258,8 +262,8 @@ def assign_photos(
 
 
 def _exceed_noise(scores: np.ndarray) -> bool:
-    """Return whether the middle of scores ``[n]`` is above that of so many wrong pairs."""
-    return bool(len(scores) and np.median(scores) * np.sqrt(len(scores)) > DOUBT * NORMAL_MEDIAN)
+    """Return whether the middle of scores ``[n]``, which no single one moves, is above that of so many wrong pairs."""
+    return bool(len(scores) and np.median(scores) * np.sqrt(len(scores)) > DOUBT)
 
 
 def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:

@@ -21,7 +21,6 @@ AROUND = 30  # pixels of the square whose mean contrast is taken from
 TAPS = 64  # of the Fourier transforms, at least PART + 2 REACH
 SAME = 1  # pixels to which a place is one: those of a correlation's peak
 NEAR_PIXELS = 3  # pixels to which parts moved alike: what different depths leave of a motion
-DISPLACED = SAME + NEAR_PIXELS  # pixels that wrong depth may displace parts by; more is another place
 
 
 @dataclass(frozen=True, eq=False)

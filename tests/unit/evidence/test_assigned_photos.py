@@ -136,7 +136,7 @@ def displaced(photos: list[np.ndarray], pixels: Sequence[int]) -> Assigner:
     ("pixels", "elsewhere"),
     [
         ([3, -3, 2, 3, -2, 3], []),  # as wrong depth does in all views
-        ([1, 0, 3, -1, 0, 1], [2]),  # as far as that in one alone
+        ([0, 0, 3, 1, 0, 0], [2]),  # as far as that in one alone
         ([3, -3, 9, 3, -2, 3], [2]),  # a neighbour's
         ([9, 9, -9, 9, -9, 9], [0, 1, 2, 3, 4, 5]),  # photos that were all taken from elsewhere
     ],
@@ -169,3 +169,15 @@ def test_one_right_photo_speaks_for_no_other(
     """What a photo of another place reaches by chance is no name's worth, however clear a single photo is."""
     pool = [photos[0], *others[1:]]
     assert assign(views, pool, range(VIEWS), exact=True) == [Assignment(0, 0), *[None] * (VIEWS - 1)]
+
+
+def test_a_view_that_shows_nothing_contradicts_no_name(views: np.ndarray, photos: list[np.ndarray]) -> None:
+    """Its rows are NaN, say; a photo that stands where the views lie is none of it."""
+    weights = np.ones(views.shape[:3], np.float32)
+    weights[2] = 0
+    pool = [*photos, np.ascontiguousarray(turn_back(photos[2], 1))]
+    for photo, expected in ((2, Assignment(2, 0)), (VIEWS, None)):
+        candidates = Candidates(lambda photo: pool[photo], len(pool), [0] * len(pool))
+        named = [0, 1, photo, 3, 4, 5]
+        chosen = assign_photos(lambda side: show(views, side, weights), candidates, named, exact=True)
+        assert chosen == [Assignment(0, 0), Assignment(1, 0), expected, *(Assignment(view, 0) for view in (3, 4, 5))]
