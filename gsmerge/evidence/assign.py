@@ -1,21 +1,22 @@
 """Which photo, turned how, shows which view: names propose, what photos and Gaussians show decides.
 
-A photo that its name gives to a view stays where it is more like it than other photos are, and more than other views
-are like it, beyond the noise of wrong pairs. Elsewhere the most alike photos are compared part by part: a neighbour's
-photo shows the same things, but in other places.
+A photo that a name gives to a view stays unless another photo or turn is clearly more like the view, it is no more
+like it than wrong pairs are where most names are right, or its parts lie farther from their places than those of the
+others. Elsewhere the most alike photos are compared part by part: a neighbour's photo shows the same things, but in
+other places.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from gsmerge.evidence.offsets import SIDE, find_offsets
+from gsmerge.evidence.offsets import NEAR_PIXELS, SAME, SIDE, PhotoOffsets, find_offsets
 from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
 from gsmerge.kernels.pictures import turn_picture
@@ -53,6 +54,14 @@ class _Scores:
     values: np.ndarray  # [v,p,8]; NaN where a photo's shape cannot be that of the views
     correlations: np.ndarray  # [v,p,8]
 
+    def of(self, view: int, assignment: Assignment) -> float:
+        """Return the score of a photo in a view, turned as assigned; NaN where that cannot be."""
+        return float(self.values[view, self.photos.index(assignment.photo), assignment.turn])
+
+    def fits(self, assignment: Assignment) -> bool:
+        """Return whether a photo, turned as assigned, has a shape that can be that of the views."""
+        return bool(np.isfinite(self.values[:, self.photos.index(assignment.photo), assignment.turn]).any())
+
     def best(self) -> np.ndarray:
         """Return the score ``[v,p]`` of each photo in its best turn."""
         return np.nan_to_num(self.values, nan=-np.inf).max(2)
@@ -73,6 +82,7 @@ class Assigner:
         small = show(SIZES[-1])
         self.candidates, self._show = candidates, show
         self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
+        self._offsets = dict[tuple[int, Assignment], PhotoOffsets | None]()
         self.judged = self._comparer.measure_contrast() > FLAT
 
     @cached_property
@@ -102,46 +112,66 @@ class Assigner:
 
         Returns how alike they are, from 1 on, 0 where it was taken from elsewhere, and None where parts do not tell.
         """
-        photo = turn_picture(self.candidates.read(assignment.photo), assignment.turn)
-        offsets = find_offsets(self.shown, view, np.ascontiguousarray(photo))
+        offsets = self.find_offsets(view, assignment)
         if offsets is None or offsets.verdict is None:
             return None
         return 1 + max(offsets.alike, 0.0) if offsets.verdict else 0.0
 
+    def find_offsets(self, view: int, assignment: Assignment) -> PhotoOffsets | None:
+        """Find where the parts of a photo lie in what a view shows; None where pictures are too small for parts."""
+        if (view, assignment) not in self._offsets:
+            photo = turn_picture(self.candidates.read(assignment.photo), assignment.turn)
+            self._offsets[view, assignment] = find_offsets(self.shown, view, np.ascontiguousarray(photo))
+        return self._offsets[view, assignment]
+
+    def lies_elsewhere(self, view: int, given: Mapping[int, Assignment]) -> bool:
+        """Return whether the parts of a given photo lie farther from their places than those of the others do.
+
+        That is more than twice as far as these do in the middle: wrong depth displaces what is drawn in all views, but
+        no farther than it moves the parts of one view apart.
+        """
+        offsets, others = self.find_offsets(view, given[view]), [each for each in given.items() if each[0] != view]
+        if offsets is None or offsets.verdict is not False:
+            return False
+        known = [each.distances for each in parallel_map(lambda pair: self.find_offsets(*pair), others) if each]
+        distances = np.concatenate([np.zeros(0), *known])
+        usual = 2 * float(np.median(distances)) if len(distances) else 0.0
+        return replace(offsets, same=SAME + min(usual, NEAR_PIXELS)).verdict is False
+
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
         """Return the photos that names or order give to views, and whether what they show confirms each.
 
-        None where a photo is not like its view, where another is clearly more so that is not needed elsewhere, or where
-        its parts lie elsewhere. Those that no other assignment makes more alike are confirmed if names are ``exact``;
-        otherwise, and in doubt, the parts tell.
+        A photo stays unless another photo, that is not needed elsewhere, or another turn is clearly more like its view,
+        it is no more like it than wrong pairs are where most photos are more, or its parts lie farther from their
+        places than those of the others do; None in place of those that do not stay. Noise of what is drawn moves the
+        scores and the parts of all photos, so that these themselves say what is to be expected of a right one.
+
+        Photos that no other assignment makes more alike are confirmed if names are ``exact``; otherwise, and in doubt,
+        the parts tell.
         """
         out, sure = list[Assignment | None]([None] * len(named)), [False] * len(named)
         given = [(view, photo) for view, photo in enumerate(named) if photo is not None]
         if not given:
             return out, sure
         scores = self.score(photo for _, photo in given)
-        turns = [self._usual_turn(scores, *pair) for pair in given]
+        usual = {view: Assignment(photo, self._usual_turn(scores, view, photo)) for view, photo in given}
         columns = [scores.photos.index(photo) for _, photo in given]
-        of_turn = [
-            scores.values[[view for view, _ in given], column, turn]
-            for column, turn in zip(columns, turns, strict=True)
-        ]
-        alike = np.nan_to_num(np.stack(of_turn, 1), nan=-np.inf)  # of each given view with each given photo
-        best, own = _match(alike), np.diag(alike)[self.judged[[view for view, _ in given]]]
+        alike = scores.best()[np.ix_(list(usual), columns)]  # of each given view with each given photo
+        of_names = np.nan_to_num([scores.of(*pair) for pair in usual.items()], nan=-np.inf)
+        best, own = _match(alike), of_names[self.judged[list(usual)]]
         # half-way from wrong pairs to right ones, if all together are these
         least = min(DOUBT, float(np.median(own)) / 2) if _exceed_noise(own) else DOUBT
-        for place, ((view, photo), column, turn) in enumerate(zip(given, columns, turns, strict=True)):
-            score, most = alike[place, place], alike[place, best[place]]
-            # more than wrong pairs, or most of what is seen; and no other clearly more
-            like = score > least or scores.correlations[view, column, turn] ** 2 > 0.5
+        for place, (view, assignment) in enumerate(usual.items()):
+            score, most = of_names[place], max(alike[place, place], alike[place, best[place]])
+            # more than wrong pairs, or most of what is seen; and no other photo or turn clearly more
+            like = score > least or scores.correlations[view, columns[place], assignment.turn] ** 2 > 0.5
             like = like and score > most - DOUBT
-            assignment = Assignment(photo, turn)
             clear = score > MARGIN and score >= most
             if clear and exact:
                 out[view], sure[view] = assignment, True
-            elif np.isfinite(score) and (like or not self.judged[view]):
+            elif like or (not self.judged[view] and scores.fits(assignment)):
                 parts = self.compare(view, assignment)
-                out[view] = assignment if parts != 0 else None
+                out[view] = None if self.lies_elsewhere(view, usual) else assignment
                 sure[view] = bool(parts) or (clear and parts is None) or not self.judged[view]
         return out, sure
 
@@ -149,7 +179,7 @@ class Assigner:
         """Return whether chosen photos together are like their views, beyond the noise of so many wrong pairs."""
         given = [(view, each) for view, each in enumerate(chosen) if each is not None and self.judged[view]]
         scores = self.score(self._correlations)
-        own = [scores.values[view, scores.photos.index(photo), turn] for view, (photo, turn) in given]
+        own = [scores.of(*pair) for pair in given]
         return not own or _exceed_noise(np.array(own))
 
     def _usual_turn(self, scores: _Scores, view: int, photo: int) -> int:
@@ -166,10 +196,10 @@ class Assigner:
         scores = self.score(self._correlations)
 
         def compare(pair: tuple[int, Assignment]) -> float:
-            alike, (view, (photo, turn)) = self.compare(*pair), pair
+            alike = self.compare(*pair)
             if alike is not None:
                 return alike
-            score = float(scores.values[view, scores.photos.index(photo), turn])
+            score = scores.of(*pair)
             return 1 - MARGIN / score if score > MARGIN else 0.0  # less than what parts say
 
         return _choose(pairs, parallel_map(compare, pairs))
@@ -216,10 +246,13 @@ def assign_photos(
     assigner = Assigner(show, candidates)
     out, sure = assigner.confirm(named, exact=exact)
     they_tell = 2 * sum(each is not None for each in out) > len(out) and assigner.stand_together(out)
-    left = [view for view, known in enumerate(sure) if not known and not (exact and they_tell and named[view] is None)]
+    if exact and they_tell:  # names stand but where something speaks against them
+        left = [view for view, each in enumerate(out) if each is None and named[view] is not None]
+    else:
+        left = [view for view, known in enumerate(sure) if not known]
     if not left:
         return out
-    used = {each.photo for each, known in zip(out, sure, strict=True) if each is not None and known}
+    used = {each.photo for view, each in enumerate(out) if each is not None and view not in left}
     if stored is not None:
         assigner = Assigner(show, stored)
     others = assigner.search(left, [photo for photo in range(candidates.count) if photo not in used])
@@ -229,8 +262,8 @@ def assign_photos(
 
 
 def _exceed_noise(scores: np.ndarray) -> bool:
-    """Return whether scores ``[n]`` together are above those of so many wrong pairs."""
-    return bool(scores.sum() > DOUBT * np.sqrt(len(scores)))
+    """Return whether the middle of scores ``[n]``, which no single one moves, is above that of so many wrong pairs."""
+    return bool(len(scores) and np.median(scores) * np.sqrt(len(scores)) > DOUBT)
 
 
 def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:

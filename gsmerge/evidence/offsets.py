@@ -7,6 +7,7 @@ one place stands out of all those tried, it says whether the photo was taken fro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -22,14 +23,34 @@ SAME = 1  # pixels to which a place is one: those of a correlation's peak
 NEAR_PIXELS = 3  # pixels to which parts moved alike: what different depths leave of a motion
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PhotoOffsets:
-    """How many parts of a photo that say where they are lie in their places, and how many elsewhere."""
+    """Where the parts of a photo that say where they are lie: in their places, or elsewhere."""
 
-    here: int
-    elsewhere: int
-    together: int  # the most of those elsewhere that moved alike
+    moves: np.ndarray  # [n,2] pixels down and right to where the parts that say it lie
     alike: float  # mean of Fisher's z of all parts in their places
+    same: float = SAME  # pixels of a move to which a place is one
+
+    @cached_property
+    def distances(self) -> np.ndarray:
+        """Pixels ``[n]`` that the parts moved, along the side along which they moved more."""
+        return np.abs(self.moves).max(1)
+
+    @property
+    def here(self) -> int:
+        """Number of parts in their places."""
+        return int((self.distances <= self.same).sum())
+
+    @property
+    def elsewhere(self) -> int:
+        """Number of parts elsewhere."""
+        return len(self.moves) - self.here
+
+    @property
+    def together(self) -> int:
+        """The most of the parts elsewhere that moved alike."""
+        far = self.moves[self.distances > self.same]
+        return int((np.abs(far[:, None] - far).max(2) <= NEAR_PIXELS).sum(1).max(initial=0))
 
     @property
     def verdict(self) -> bool | None:
@@ -73,10 +94,7 @@ def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffs
     noise = NORMAL * np.median(np.abs(scores - middle[:, None]), 1) + 1e-6
     decided = scores.max(1) - middle > MARGIN * noise
     moves = np.stack(np.divmod(scores[decided].argmax(1), 2 * REACH + 1), 1) - REACH
-    moves = moves[np.abs(moves).max(1) > SAME]
-    together = (np.abs(moves[:, None] - moves).max(2) <= NEAR_PIXELS).sum(1).max(initial=0)
-    alike = float(scores[:, scores.shape[1] // 2].mean())
-    return PhotoOffsets(int(decided.sum()) - len(moves), len(moves), int(together), alike)
+    return PhotoOffsets(moves, float(scores[:, scores.shape[1] // 2].mean()))
 
 
 def _look_up(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.ndarray:

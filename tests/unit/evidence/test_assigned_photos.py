@@ -123,3 +123,61 @@ def test_scores_are_kept(views: np.ndarray, photos: list[np.ndarray]) -> None:
     again = assigner.score([2, 0, 0])
     assert sorted(reads) == [0, 2]
     np.testing.assert_array_equal(first.values[:, ::-1], again.values)
+
+
+def displaced(photos: list[np.ndarray], pixels: Sequence[int]) -> Assigner:
+    """An assigner of photos whose parts lie some pixels beside what is shown."""
+    pool = [np.roll(photo, away, 1) for photo, away in zip(photos, pixels, strict=True)]
+    views = cut_views(VIEWS)
+    return Assigner(lambda side: show(views, side), Candidates(lambda photo: pool[photo], VIEWS, [0] * VIEWS))
+
+
+@pytest.mark.parametrize(
+    ("pixels", "elsewhere"),
+    [
+        ([3, -3, 2, 3, -2, 3], []),  # as wrong depth does in all views
+        ([0, 0, 3, 1, 0, 0], [2]),  # as far as that in one alone
+        ([3, -3, 9, 3, -2, 3], [2]),  # a neighbour's
+        ([9, 9, -9, 9, -9, 9], [0, 1, 2, 3, 4, 5]),  # photos that were all taken from elsewhere
+    ],
+)
+def test_parts_lie_elsewhere_where_others_do_not(
+    photos: list[np.ndarray], pixels: Sequence[int], elsewhere: list[int]
+) -> None:
+    assigner, given = displaced(photos, pixels), {view: Assignment(view, 0) for view in range(VIEWS)}
+    assert [view for view in given if assigner.lies_elsewhere(view, given)] == elsewhere
+
+
+def test_exchanged_photos_of_which_some_lie_on_their_side(views: np.ndarray, photos: list[np.ndarray]) -> None:
+    """A photo may be more like another view in another turn than that of its tag."""
+    pool, expected = in_order(photos)
+    turns = [0, 2, 0, 2, 2, 0]
+    pool = [np.ascontiguousarray(turn_back(photo, turn)) for photo, turn in zip(pool, turns, strict=True)]
+    turned = [Assignment(photo, turns[photo]) for photo, _ in expected]
+    assert assign(views, pool, range(VIEWS), exact=True, tags=turns) == turned
+    assert assign(views, pool, range(VIEWS), exact=True) == turned
+
+
+def test_a_photo_on_its_side_turns(views: np.ndarray, photos: list[np.ndarray]) -> None:
+    pool = [*photos[:4], np.ascontiguousarray(turn_back(photos[4], 2)), photos[5]]
+    assert assign(views, pool, range(VIEWS), exact=True)[4] == Assignment(4, 2)
+
+
+def test_one_right_photo_speaks_for_no_other(
+    views: np.ndarray, photos: list[np.ndarray], others: list[np.ndarray]
+) -> None:
+    """What a photo of another place reaches by chance is no name's worth, however clear a single photo is."""
+    pool = [photos[0], *others[1:]]
+    assert assign(views, pool, range(VIEWS), exact=True) == [Assignment(0, 0), *[None] * (VIEWS - 1)]
+
+
+def test_a_view_that_shows_nothing_contradicts_no_name(views: np.ndarray, photos: list[np.ndarray]) -> None:
+    """Its rows are NaN, say; a photo that stands where the views lie is none of it."""
+    weights = np.ones(views.shape[:3], np.float32)
+    weights[2] = 0
+    pool = [*photos, np.ascontiguousarray(turn_back(photos[2], 1))]
+    for photo, expected in ((2, Assignment(2, 0)), (VIEWS, None)):
+        candidates = Candidates(lambda photo: pool[photo], len(pool), [0] * len(pool))
+        named = [0, 1, photo, 3, 4, 5]
+        chosen = assign_photos(lambda side: show(views, side, weights), candidates, named, exact=True)
+        assert chosen == [Assignment(0, 0), Assignment(1, 0), expected, *(Assignment(view, 0) for view in (3, 4, 5))]
