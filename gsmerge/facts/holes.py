@@ -34,6 +34,7 @@ NOTHING, SPARSE = 0.5, 0.25
 LARGE, PART, RIM = 1 / 12, 0.12, 2  # of the longer side: squares in large parts that stay empty; their share
 # of the picture, at least; pixels beside them that do not
 GAP = 1 / 53  # of the longer side: beside large empty parts only narrower gaps in what is covered are filled
+MOST = 0.5  # share of empty pixels from which on the scene may be a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # of the depth of a view's farthest surface: depths that are tried
 FARTHEST = 0.99  # quantile of the depths that counts as the farthest
 FARTHER = 0.001  # difference of colours, sRGB, that each next depth must gain
@@ -48,9 +49,8 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers, or leave large parts empty; add notes.
 
     ``shown [v,h,w]``: pixels whose picture says what is there. The new Gaussians follow the others. None is added where
-    there would be more of them than pixels that show something: the scene may be a part of what the photos show. Large
-    connected parts of a view without Gaussians stay empty, unless ``everywhere``: the scene was cut out, or its model
-    left out the sky.
+    most of the pixels are empty: the scene may be a part of what the photos show. Large connected parts of a view
+    without Gaussians stay empty, unless ``everywhere``: the scene was cut out, or its model left out the sky.
     """
     assert scene.pixels is not None, "prepared scenes have pixels"
     fronts = scene.pixels.fronts
@@ -71,7 +71,8 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             usual = (opacity * opacity).sum() / max(float(opacity.sum()), 1e-6)  # mean where there is something to see
             sparse = blur(opacity, gap / 4) < SPARSE * usual  # single Gaussians at the edges of what was cut out
             empty[view] = large_parts((opacity < NOTHING * usual) & sparse)
-        holes[view] = free[view] & ~covered & ~empty[view]
+        bare[view] = ~covered & ~empty[view]
+        holes[view] = free[view] & bare[view]
         if empty[view].any():  # the edges of what was cut out are no holes
             around = np.ones((gap, gap), np.uint8)
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, around) > 0
@@ -81,7 +82,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
 
     tile_views(scene, find, gaps)
     filled = scene
-    if edges and np.count_nonzero(holes) < np.count_nonzero(fronts[shown.any((1, 2))] >= 0):
+    if edges and np.count_nonzero(bare[gaps]) < MOST * np.count_nonzero(~empty[gaps]):
         filled = _add_holes(scene, holes, edges)
     return _leave_empty(filled, empty)
 

@@ -27,20 +27,7 @@ SAME_DEPTH = 1.05  # times the depth of a cell's front up to which a centre in t
 
 def with_pixels(scene: SceneT) -> SceneT:
     """Return a canonical scene with its pixels, found by projection where they are not known."""
-    return scene if scene.pixels is not None else order_by_pixels(scene)[0]
-
-
-def order_by_pixels(scene: SceneT) -> tuple[SceneT, np.ndarray]:
-    """Find the pixels of a canonical scene, and sort its Gaussians by them; also return the rows ``[n]`` in that order.
-
-    What is near in a picture then is near in memory, which later stages read several times.
-    """
-    pixels = find_pixels(scene)
-    rows = np.argsort(pixels.homes, kind="stable")
-    places = np.empty(len(rows) + 1, np.int32)
-    places[rows], places[-1] = np.arange(len(rows), dtype=np.int32), -1
-    ordered = Pixels(pixels.homes[rows], places[pixels.fronts], own=False)
-    return replace(scene, gaussians=scene.gaussians[rows], pixels=ordered), rows
+    return scene if scene.pixels is not None else replace(scene, pixels=find_pixels(scene))
 
 
 def find_pixels(scene: Scene) -> Pixels:

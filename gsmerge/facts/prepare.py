@@ -13,7 +13,7 @@ from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.exposure import equalise_exposure
 from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.move_poses import move_poses
-from gsmerge.facts.pixels import order_by_pixels, with_pixels
+from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.place_cameras import (
     NO_VIEWS,
     add_judges,
@@ -133,10 +133,7 @@ def prepare(
         note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
         scene = subset(scene, views)
     scene, frame = canonicalise(add_views(scene), frame)
-    if scene.pixels is None:
-        scene, rows = order_by_pixels(scene)
-        given = replace(given, gaussians=given.gaussians[rows]) if len(given.gaussians) == len(rows) else given
-    prepared = _with_references(given, scene, frame, tuple(repeated), options)
+    prepared = _with_references(given, with_pixels(scene), frame, tuple(repeated), options)
     files = _photos_before(given, prepared)
     prepared = replace(prepared, reference=replace(prepared.reference, photo_files=files))
     agreement = confirm_depths(prepared.scene)
