@@ -27,7 +27,7 @@ from gsmerge.evidence.colors import (
     tone_blocks,
 )
 from gsmerge.evidence.pictures import SIDE, Pairs, ViewPictures, pair_photos, show_views
-from gsmerge.evidence.scores import MARGIN, signed_ranks
+from gsmerge.evidence.scores import MARGIN, signed_ranks, stands_out
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.facts.views import camera_kinds
@@ -108,14 +108,16 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
     """Find the tone curves ``[3,256]`` from photos to their Gaussians; None for a photo whose tone is right.
 
     Drawings have one curve for all photos. Where none is changed by a step, no curve counts, since models have a tone
-    of their own.
+    of their own; nor does one with which Gaussians do not become more like their photos in turn: noise flattens what
+    they show, and is no tone.
     """
     curves, clear = list[np.ndarray | None]([None] * len(pairs)), False
     stored, groups = cut_blocks(pairs), _group(pairs, views)
     groups = [group for group in groups if is_visible(stored.errors(group))]
-    toned = tone_blocks(pairs, groups)
+    toned, back = tone_blocks(pairs, groups), tone_blocks(pairs.exchange(), groups)
     for group in groups:
-        if explains(stored.errors(group), toned.errors(group)):
+        before = stored.errors(group)
+        if explains(before, toned.errors(group)) and stands_out(before - back.errors(group)):
             clear |= bool(np.nanmedian(stored.distances(toned.photos, group)) > STEP)
             colors, targets = (each[group].reshape(-1, 3) for each in (pairs.photos, pairs.shown.pictures))
             curve = fit_tones(colors, targets, pairs.shown.weights[group].reshape(-1))
