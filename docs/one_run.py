@@ -249,7 +249,7 @@ def align_section(run: Run) -> str:
                 int(made.pixel_ids[ROW]) == ROW and run.prepared.input_scene.has_own_pixels,
             ),
             say(
-                f"its own: row {ROW} is also the Gaussian in front of that pixel, and every pixel shows one.",
+                "its own, one in front of every pixel.",
                 bool(run.prepared.input_scene.pixels.shown.all())
                 and int(run.prepared.input_scene.pixels.fronts[VIEW, Y, X]) == ROW,
             ),

@@ -210,7 +210,7 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         "auto": _describe_auto(scene, agreement),
         "agreement": agreement and agreement.to_dict(),
     }
-    if is_result and len(scene):
+    if is_result and len(scene) and load.recovery is None:  # those of views hide each other where these overlap
         facts["num_unseen"] = int((count_views_in_world(scene.gaussians, scene.cameras) == 0).sum())
     if not is_result:
         is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)

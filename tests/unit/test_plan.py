@@ -217,8 +217,9 @@ def test_photos_of_another_scene_decide_no_count(scene: Scene) -> None:
     assert len(report.choices["search"]["tried"]) <= MAX_RUNS
 
 
-def test_photos_decide_the_count_where_rows_belong_to_no_pixels(scene: Scene) -> None:
-    rows = unaligned_scenes.without_order(scene)
+def test_photos_decide_the_count_where_rows_are_fewer_than_pixels(scene: Scene) -> None:
+    rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), 3))  # fewer than half of the pixels
+    rows = replace(rows, gaussians=replace(rows.gaussians, scales=2 * rows.gaussians.scales))
     prepared, plan = prepare(rows, options_of().prepare), plan_of(rows)
     assert (plan.keeps_input, plan.target_psnr, len(plan.scored_views)) == (True, None, len(rows))
     known = add_target(plan, prepared)
@@ -227,11 +228,12 @@ def test_photos_decide_the_count_where_rows_belong_to_no_pixels(scene: Scene) ->
     estimated = estimate(rows, options_of())
     assert (estimated["psnr_kept"], estimated["loss_kept"]) == (None, KEPT_LOSS)
     assert not plan_of(rows, budget="auto").keeps_input  # the photos' own curve decides
+    assert not plan_of(unaligned_scenes.without_order(scene)).keeps_input  # a share is enough of as many as pixels
 
 
 def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) -> None:
     """Elsewhere a worse result would be called better."""
-    rows = unaligned_scenes.without_order(scene)
+    rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), 2))
     x = rows.gaussians.means[:, 0]
     rows = replace(rows, gaussians=rows.gaussians[np.flatnonzero(x < np.quantile(x, 0.7))])
     prepared = prepare(rows, options_of().prepare)
