@@ -19,7 +19,7 @@ from gsmerge.types import Cameras, Gaussians, Scene, SceneT
 
 SAMPLE_GAUSSIANS = 65536  # Gaussians that the frame is measured on
 ROWS = 65536  # Gaussians per task
-MAX_VIEWS = 32  # of an unaligned scene, that the unit is taken from
+MAX_VIEWS = 32  # that the unit is taken from, where they have no Gaussians of their own
 
 
 @dataclass(frozen=True)

@@ -299,10 +299,8 @@ def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
 
 def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
     """List the reasons why a scene cannot be cut into blocks."""
-    return [
-        *_whole_needed(options),
-        *([] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]),
-    ]
+    shared = [] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]
+    return [*_whole_needed(options), *shared]
 
 
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:

@@ -129,10 +129,8 @@ def shows_nothing(scene: Scene) -> bool:
         return False
     low, high = np.percentile(sample.means.astype(np.float64), BOX_QUANTILES, axis=0)
     areas = np.sort(sample.scales.astype(np.float64), axis=1)[:, 1:].prod(1)
-    covered, num_views = (
-        len(gaussians) * float((sample.opacities * areas).mean()),
-        len(scene) if scene.has_own_pixels else 1,
-    )
+    covered = len(gaussians) * float((sample.opacities * areas).mean())
+    num_views = len(scene) if scene.has_own_pixels else 1
     if covered > COVERED * num_views * float(np.square(high - low).sum()):
         return False
     settings = CompactOptions().with_settings({"effort": "draft", "fit": "none"})

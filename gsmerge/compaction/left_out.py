@@ -39,7 +39,7 @@ class LeftOut:
     @property
     def rows(self) -> Gaussians:
         """The input's Gaussians of the other views."""
-        return file_rows(self.rest.scene)
+        return self.rest.scene.file_gaussians
 
     def score(self, gaussians: Gaussians) -> np.ndarray:
         """Return the PSNR (dB) ``[v]`` of canonical Gaussians on what each photo shows of the rest."""
@@ -61,7 +61,7 @@ class LeftOut:
 def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) -> LeftOut | None:
     """Leave views out of a canonical scene of photos; None if the others see nothing of what they show."""
     rest = subset(scene, [view for view in range(len(scene)) if view not in views])
-    if not views or len(file_rows(rest)) == 0:
+    if not views or len(rest.file_gaussians) == 0:
         return None
     every = tuple(range(len(rest)))
     part = replace(
@@ -88,16 +88,9 @@ def choose_views(views: Sequence[int]) -> tuple[list[int], list[int]]:
 
 def can_leave_out(prepared: Prepared) -> bool:
     """Return whether a scene has photos of so many views, with Gaussians of their own, that some can be left out."""
-    return (
-        prepared.scene.has_own_pixels
-        and prepared.reference.name == PHOTOS
-        and len(prepared.reference.score_views) >= LEAST_VIEWS
-    )
-
-
-def file_rows(scene: PicturedScene) -> Gaussians:
-    """Return the Gaussians that the file has, without those that fill holes."""
-    return scene.file_gaussians
+    reference = prepared.reference
+    of_photos = reference.name == PHOTOS and len(reference.score_views) >= LEAST_VIEWS
+    return of_photos and prepared.scene.has_own_pixels
 
 
 def cover(rest: PicturedScene, views: PicturedScene) -> np.ndarray:

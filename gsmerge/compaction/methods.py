@@ -87,7 +87,7 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
     if "photos" in method.needs and not scene.is_shown:
         raise UsageError(f"{place}: expected photos, found none; give --images, or another method")
     if "pixels" in method.needs and not scene.has_own_pixels:
-        raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another method")
+        raise UsageError(f"{place}: expected Gaussians of the views' own, one for each pixel; give another method")
     unused = [name for name in changed_settings(options, lambda one: not one.common) if name not in method.uses]
     return method, [f"{place} does not use {', '.join(unused)}"] if unused else []
 

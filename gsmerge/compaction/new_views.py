@@ -11,15 +11,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from gsmerge.compaction.left_out import (
-    LEAST_SEEN,
-    LeftOut,
-    can_leave_out,
-    choose_views,
-    file_rows,
-    leave_out,
-    mean_seen,
-)
+from gsmerge.compaction.left_out import LEAST_SEEN, LeftOut, can_leave_out, choose_views, leave_out, mean_seen
 from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.arrays import ExpectedScores
 from gsmerge.kernels.elementary import power
@@ -115,7 +107,7 @@ def _score_round(left_out: LeftOut, small: PicturedScene, plan: Plan, build: Bui
     short = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(STEPS, plan.fit.steps))
     inside = replace(short.fit, tuning=replace(short.fit.tuning, outside_from=1.0))  # no photo shows what is outside
     compacted = build(left_out.rest, replace(short, fit=inside), None).gaussians
-    drawn = file_rows(small), left_out.rows, compacted
+    drawn = small.file_gaussians, left_out.rows, compacted
     return np.stack([left_out.shares, *(left_out.score(gaussians) for gaussians in drawn)])
 
 

@@ -50,8 +50,8 @@ class Marks:
 def find_marks(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None, *, own: bool) -> Marks:
     """Find what is marked of canonical ``gaussians``; nothing where there are more than ``MOST``.
 
-    ``photos [v,h,w,3]`` of the ``cameras`` say where the sky is; None: no sky is found. Of those that are
-    each a view's ``own`` that is not worth a mark.
+    ``photos [v,h,w,3]`` of the ``cameras`` say where the sky is; None: no sky is found. Where views have
+    Gaussians of their ``own``, each is shown by one, which is not worth a mark.
     """
     if len(gaussians) > MOST:
         return Marks()

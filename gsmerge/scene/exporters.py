@@ -108,9 +108,9 @@ _ANY: tuple[FrameKind, ...] = ("same", "scaled", "shifted", "other")
 _NORMALS = ("nx", "ny", "nz")
 # What users have to add, or what is lost
 _NAME_CAMERAS = "read right with cameras, or with those that its grid shows"
-_NO_PIXELS = "unaligned: without pixels"
-_IF_GRID_SHOWS = "read right where the rows show their grid, else unaligned"
-_WITH_CAMERAS = "unaligned; photos are used where cameras are named"
+_NO_PIXELS = "read without pixels"
+_IF_GRID_SHOWS = "read right where the rows show their grid, else without pixels"
+_WITH_CAMERAS = "read without pixels; photos are used where cameras are named"
 # Place of a trained scene, and what brings its cameras
 _TRAINED = "iteration_*/point_cloud.ply", "cameras.json of the run has the cameras: give its folder, or name it"
 

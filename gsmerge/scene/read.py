@@ -88,7 +88,7 @@ class SceneViews:
 class Loaded:
     """A scene, and all facts about its files and how they were read."""
 
-    # the scene: one Gaussian per pixel, or an unaligned one where the rows belong to no pixels
+    # the scene, with its pixels where the rows show them
     scene: Scene
     info: FileInfo
     files: SceneFiles
@@ -97,10 +97,10 @@ class Loaded:
     views: SceneViews  # all views that there are cameras of, also those that the scene does not have
     exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
     notes: tuple[str, ...]  # what was adapted or looks odd, one sentence each, without a full stop
-    # how well every view's Gaussians project into their own pixels; None for an unaligned scene
+    # how well every view's Gaussians project into their own pixels; None where rows show no pixels
     alignment: Alignment | None = None
-    recovery: Recovery | None = None  # which reading of the rows won, and by how much; None for an unaligned scene
-    problem: str | None = None  # why the scene is unaligned, in one sentence; None where it is not
+    recovery: Recovery | None = None  # which reading of the rows won, and by how much; None without pixels
+    problem: str | None = None  # why the rows show no pixels, in one sentence; None where they do
     # how far each camera was moved to its Gaussians; empty where none was
     moves: Sequence[dict[str, Any]] = ()
     joined: Sequence[dict[str, Any]] = ()  # where each of several scenes lies; empty for one
@@ -278,9 +278,8 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO
         with suppress(SceneError):
             load = _align(ply, fewer, read_scene_cameras(ply, fewer), hints=hints, photos=photos)
             # without photos, cameras of another scene may see these Gaussians, too
-            is_sure = (
-                load.scene.has_own_pixels or of_photos or fewer.cameras != files.cameras or fewer.masks != files.masks
-            )
+            is_sure = load.scene.has_own_pixels or of_photos
+            is_sure |= fewer.cameras != files.cameras or fewer.masks != files.masks
             if is_sure and ("images" not in files.named or files.images is None or load.scene.images is not None):
                 return _leave_out(load, files, why)
     if "cameras" not in files.named:
@@ -464,8 +463,9 @@ def _make_load(
     exporters, alignment = choose_exporters(hints.exporter, ply.info, layout, frame, source), None
     if layout is None or frame is None:
         scene = read_rotations(scene, hints.quats)
-        is_known = files.is_state or RESULT_COMMENT in ply.info.comments  # which have no pixels
-        more += [] if camera_file is None or is_known else [_unaligned_note(hints)]
+        if camera_file is not None and hints.exporter != "auto":
+            tried = f"only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
+            more.append(f"the rows are the pixels of no views: {tried}")
     else:
         assert camera_file is not None, "pixels are those of cameras"
         scene, note = use_depths(scene, camera_file, layout, frame.scale)
@@ -492,14 +492,6 @@ def _make_load(
     )
 
 
-def _unaligned_note(hints: ReadHints) -> str:
-    """Note that rows have no pixels, and which searches were not made."""
-    note = "the Gaussians belong to no pixels that could be found: unaligned"
-    if hints.exporter == "auto":
-        return note
-    return f"{note}; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
-
-
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
     """Move a file's cameras into the frame of the Gaussians if pixels or colours show it; else keep them.
 
@@ -524,7 +516,5 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
             note = "the cameras do not fit the Gaussians and stay as their file has them"
             as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
             load = replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)
-        return (
-            load if load.scene.has_own_pixels else replace(load, notes=load.notes[:-1])
-        )  # without that there are no pixels
+        return load
     return align_scene(ply, files, hints=hints, photos=photos)  # without what cannot be read, if it was not named

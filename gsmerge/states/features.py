@@ -38,7 +38,7 @@ from gsmerge.stages.merge import merge
 from gsmerge.stages.segment import segment_scene
 from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.states.extend import BatchReport, number_names
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Scene
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
 
 SAMPLE_STEP = 8  # pixels between the samples of a view along each axis
 
@@ -104,9 +104,7 @@ class _JoinContext(NetworkContext):
         shown = Members(
             means=self.samples.means.reshape(-1, 3), quats=nothing, scales=nothing,
             opacities=self.samples.opacities.reshape(-1), sh0=self.samples.sh0.reshape(-1, 1, 3), shN=nothing,
-            footprints=nothing, pixels=nothing, fronts=np.arange(self.samples.opacities.size, dtype=np.int32).reshape(
-                self.samples.opacities.shape
-            ),
+            footprints=nothing, pixels=nothing, fronts=Pixels.of_grid(np.ones(self.samples.opacities.shape)).fronts,
         )  # fmt: skip
         grid = resize_cameras(self.cameras, width, height)
         stats = cross_view_stats(features.means, features.sh0, views, shown, grid)

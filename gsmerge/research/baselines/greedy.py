@@ -18,7 +18,6 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.kernels.elementary import log, power
 from gsmerge.plan import Plan
 from gsmerge.pooling import MAX_OPACITY
-from gsmerge.research.baselines.simple import own_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.stages.pair_merge import FLATNESS, MIN_OPACITY, Cloud, cloud_of, gaussians_of, merge_rows
@@ -130,7 +129,7 @@ def merge(gaussians: Gaussians, count: int) -> Gaussians:
 
 def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Merge to exactly ``count`` Gaussians; return the input if it has no more than that."""
-    gaussians = own_gaussians(prepared.scene)
+    gaussians = prepared.scene.file_gaussians
     if len(gaussians) <= count:
         return gaussians
     with stage("reduce"):

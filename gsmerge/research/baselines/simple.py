@@ -23,19 +23,14 @@ from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode
 from gsmerge.stages.encode import encode
 from gsmerge.stages.superpixels import superpixels
-from gsmerge.types import Cameras, Decoded, Gaussians, Groups, PicturedScene
+from gsmerge.types import Cameras, Decoded, Gaussians, Groups
 
 MAX_TILED = 2_000_000  # Gaussians in the tiled views under way: each is as large as they are
 
 
-def own_gaussians(scene: PicturedScene) -> Gaussians:
-    """Return the Gaussians of the file, without those that fill holes."""
-    return scene.file_gaussians
-
-
 def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Return all Gaussians, whatever the count."""
-    return own_gaussians(prepared.scene)
+    return prepared.scene.file_gaussians
 
 
 def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
@@ -43,7 +38,7 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
     Gaussians that no photo shows are replaced by others, so the number of Gaussians stays, whatever the count.
     """
-    gaussians = own_gaussians(prepared.scene)
+    gaussians = prepared.scene.file_gaussians
     start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")
     return fit_scene(start, prepared.scene, prepared.reference.fit_views, options, plan.seed).gaussians
 
@@ -53,7 +48,7 @@ def prune(importance: Callable[[Gaussians, Cameras], np.ndarray], prepared: Prep
 
     Importance is for instance opacity, or the contribution to the views (Mini-Splatting).
     """
-    gaussians = own_gaussians(prepared.scene)
+    gaussians = prepared.scene.file_gaussians
     with stage("reduce"):
         order = np.argsort(-importance(gaussians, prepared.scene.cameras), kind="stable")
         return gaussians[np.sort(order[:count])]
@@ -77,7 +72,7 @@ def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
 def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Keep ``count`` random Gaussians, unchanged and in order; the seed decides which."""
-    gaussians = own_gaussians(prepared.scene)
+    gaussians = prepared.scene.file_gaussians
     with stage("reduce"):
         rng = np.random.default_rng(plan.seed)
         return gaussians[np.sort(rng.choice(len(gaussians), min(count, len(gaussians)), replace=False))]
@@ -111,7 +106,7 @@ def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     The input is returned if it has at most ``count`` Gaussians. Nothing is downloaded. Only the run of the program
     counts as time, start-up included, not the transfer of Gaussians.
     """
-    gaussians = own_gaussians(prepared.scene)
+    gaussians = prepared.scene.file_gaussians
     if len(gaussians) <= count:
         return gaussians
     with tempfile.TemporaryDirectory(prefix="gsmerge-") as folder:

@@ -15,7 +15,6 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import eigh
 from gsmerge.plan import Plan
-from gsmerge.research.baselines.simple import own_gaussians
 from gsmerge.runtime.record import choose, stage
 from gsmerge.types import Gaussians
 
@@ -82,7 +81,7 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
 
 def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Merge the Gaussians of each voxel into one, with the smallest voxels that leave at most ``count``."""
-    gaussians = own_gaussians(prepared.scene)
+    gaussians = prepared.scene.file_gaussians
     with stage("reduce"):
         means = gaussians.means.astype(np.float64)
         size = voxel_size(means, count)

@@ -84,7 +84,7 @@ def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, Call
     load = load_scene(path)
     scene, ply = load.scene, load.files.ply
     if not scene.has_own_pixels:
-        raise SceneError(ply, "expected one Gaussian per pixel to learn from, found an unaligned scene")
+        raise SceneError(ply, "expected one Gaussian per pixel to learn from, found none")
     if scene.images is None:
         raise SceneError(ply, "expected photos to learn from, found none", "put them next to it in images/")
     targets = ply.parent / "targets"

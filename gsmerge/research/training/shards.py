@@ -41,7 +41,7 @@ from gsmerge.scene.files import find_scene_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 Report = Callable[[str, int, int], None]  # what is done, step, steps
-LAYOUT = 6  # version of the files and of what is in them
+LAYOUT = 7  # version of the files and of what is in them
 FORMAT = "gsmerge-example"
 REMEDY = "remove it; the next call makes it again"
 # Settings that an example depends on
