@@ -447,7 +447,8 @@ def _make_load(
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
     names = () if camera_file is None else camera_file.names
     gaussians, pixels = take_rows(ply, result)
-    more = list[str]()
+    num_faint = int(ply.valid.sum()) - len(gaussians)
+    more = [f"{num_faint:,} Gaussian(s) that nothing draws, fainter than 1/255, set aside"] if num_faint else []
     cameras, images = result.cameras, result.images
     if views != list(range(len(cameras))):
         cameras, images = cameras[views], images[views] if len(images) else images
