@@ -23,6 +23,7 @@ from gsmerge.evidence.colors import (
     is_visible,
     map_blocks,
     map_colors,
+    map_tones,
     plain_blocks,
     tone_blocks,
 )
@@ -31,6 +32,7 @@ from gsmerge.evidence.scores import MARGIN, signed_ranks, stands_out
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.facts.views import camera_kinds
+from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.pictures import convolve
 from gsmerge.raster import render
 from gsmerge.raster.photos import row_pictures
@@ -42,6 +44,7 @@ from gsmerge.types import PicturedScene
 # Differences of single pixels are averaged over 5, with their signs. A blur of 1.5 pixels, as models have, then makes
 # 0.5 % of the pixels differ by a step.
 WINDOW = np.full(5, 1 / 5, np.float32)
+TONE_SAMPLE = 1 << 16  # pixels and Gaussians whose colours are compared, about
 FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
 STRAY_PHOTOS = "photos do not show what the Gaussians show"  # in the note on photos that are not used
 
@@ -70,6 +73,8 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
         return scene, ()
     _note_orders(scene, order, right)
     tones = find_tones(pairs, right)
+    if pairs.shown.drawn and not have_other_tones(scene, images, right):
+        tones = [None] * len(pairs)
     changes = [PhotoChange(bool(wrong), curve) for wrong, curve in zip(order, tones, strict=True)]
     _note_tones(scene, changes, right)
     hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
@@ -124,6 +129,24 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
             for view in group:
                 curves[view] = curve
     return curves if clear else [None] * len(pairs)
+
+
+def have_other_tones(scene: PicturedScene, photos: Sequence[np.ndarray], views: Sequence[int]) -> bool:
+    """Return whether the colours of Gaussians, seen from nowhere, have another tone than the ``photos`` of some views.
+
+    Each has a colour of some photo, whatever hides it in drawings. So the tone of a drawing alone is that of what
+    stands in front where depth is wrong.
+    """
+    solid = np.flatnonzero(scene.gaussians.opacities > FAINT)
+    step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
+    counting = [np.full(photo.shape[:2], True) for photo in photos] if scene.masks is None else scene.masks
+    levels = np.concatenate([photos[view][counting[view]][::step] for view in views])
+    if not (len(solid) and len(levels)):
+        return True
+    rows = solid[np.linspace(0, len(solid) - 1, len(levels)).astype(np.int64)]
+    colors = sh0_to_rgb(scene.gaussians.sh0[rows, 0]).clip(0, 1)
+    curve = fit_tones(levels, colors, np.ones(len(levels), np.float32))
+    return bool(np.median(np.abs(map_tones(curve, levels) - levels).mean(1)) > STEP)
 
 
 def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:

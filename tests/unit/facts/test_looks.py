@@ -8,11 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+import unaligned_scenes
 from messages import noted
 
 from gsmerge import CompactResult, Scene, compact, render
+from gsmerge.facts.compare_photos import have_other_tones
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
+from gsmerge.types import PicturedScene
 
 Colors = np.ndarray
 FIT = {"superpixels": 200, "fit_steps": 30, "checkpoint": "none", "poses": "fixed", "new_views": False}
@@ -84,3 +87,18 @@ def test_a_mild_grade_is_followed(room: Scene) -> None:
     result = compact(with_look(room, mildly_graded), **FIT)
     assert result.report.psnr_reference == PHOTOS
     assert not [note for note in result.report.notes if "look" in note]
+
+
+@pytest.mark.parametrize("change", [None, lambda photo: 0.8 * photo, lambda photo: photo**1.5], ids=["none", "*", "^"])
+def test_the_tone_of_gaussians_does_not_depend_on_what_hides_them(change: Callable | None) -> None:
+    """A dark wall in front of every view darkens drawings; the colours of all Gaussians are those of the photos."""
+    scene = scenes.make_scene(scenes.room(), scenes.arc(4, 48, 36))
+    pictured = PicturedScene.of(unaligned_scenes.shuffled(scene), scene.images, None)
+    dark = np.flatnonzero(pictured.gaussians.sh0.mean((1, 2)) < np.quantile(pictured.gaussians.sh0.mean((1, 2)), 0.2))
+    means = pictured.gaussians.means.copy()
+    means[dark] = scene.cameras.centres.mean(0) + 0.5 * (means[dark] - scene.cameras.centres.mean(0))
+    near = replace(pictured, gaussians=replace(pictured.gaussians, means=means))
+    photos = list(scene.images if change is None else change(scene.images))
+    assert have_other_tones(near, photos, range(4)) == (change is not None)
+    nothing = replace(near, gaussians=near.gaussians[:0])
+    assert have_other_tones(nothing, photos, range(4))  # which says nothing against what drawings say
