@@ -76,7 +76,8 @@ def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
     actual = inspect(tiny_folder)
     assert (actual["num_nonfinite"], actual["num_zero_quats"], actual["num_clipped_scales"]) == (1, 1, 1)
     assert (actual["num_opaque"], actual["num_transparent"]) == (3, 5)
-    assert len(actual["notes"]) == 4
+    assert len(actual["notes"]) == 5
+    assert noted(actual["notes"], "5 Gaussian(s) that nothing draws")
     assert actual["alignment"] is not None
 
 
