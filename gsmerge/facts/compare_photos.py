@@ -28,6 +28,7 @@ from gsmerge.evidence.colors import (
     tone_blocks,
 )
 from gsmerge.evidence.pictures import SIDE, Pairs, ViewPictures, pair_photos, show_views
+from gsmerge.evidence.rays import find_on_rays
 from gsmerge.evidence.scores import MARGIN, signed_ranks, stands_out
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
@@ -171,10 +172,14 @@ def find_matching_views(
 
     assigner = Assigner(show, candidates)
     chosen, _ = assigner.confirm(range(len(ids)), exact=True)
-    if not assigner.stand_together(chosen):
+    sure, on_rays = np.array([each is not None for each in chosen]), np.zeros(len(ids), bool)
+    if not sure.all():
+        on_rays = find_on_rays(scene, ids, [photos[view] for view in ids])
+    if not (assigner.stand_together(chosen) or on_rays.any()):
         return []
-    decided = zip(ids, chosen, assigner.judged, strict=True)  # but for views that show nothing to go by
-    right = {kinds[view] for view, each, judged in decided if each is not None or not judged}
+    sure |= on_rays
+    decided = zip(ids, sure, assigner.judged, strict=True)  # but for views that show nothing to go by
+    right = {kinds[view] for view, stands, judged in decided if stands or not judged}
     return [view for view in views if kinds[view] in right]
 
 

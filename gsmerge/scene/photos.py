@@ -20,7 +20,9 @@ from gsmerge.errors import SceneError
 from gsmerge.evidence.assign import Assigner, Assignment, Candidates, assign_photos
 from gsmerge.evidence.offsets import SIDE, correlate_parts
 from gsmerge.evidence.pictures import ViewPictures, show_views
+from gsmerge.evidence.rays import find_on_rays
 from gsmerge.evidence.scores import stands_out
+from gsmerge.frame import canonicalise
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import CHUNK, read_cameras
@@ -299,7 +301,8 @@ def assign_to_views(
     """Assign files to the views of a scene, each with its camera; see :func:`gsmerge.evidence.assign.assign_photos`.
 
     ``read``: whether the scene has the photos that names propose; other files are read small, and brought to the pixels
-    of a grid by ``fit``. Cameras that no view has keep what names propose.
+    of a grid by ``fit``. A photo with Gaussians of its colours on its rays stays, whatever their depths make of
+    drawings. Cameras that no view has keep what names propose.
     """
     views = [list(cameras).index(camera) for camera in dict.fromkeys(cameras)]  # layers of a camera have one photo
     named = [proposal.named[cameras[view]] for view in views]
@@ -315,9 +318,19 @@ def assign_to_views(
         return show_views(replace(scene, masks=masks), side)[views]
 
     assigned = assign_photos(show, candidates, named, exact=proposal.exact, stored=stored)
-    chosen = proposal.choice
+    chosen, usual = proposal.choice, proposal.choice
     for view, each in zip(views, assigned, strict=True):
         chosen[cameras[view]] = each
+    left = [
+        view
+        for view, photo, each in zip(views, named, assigned, strict=True)
+        if photo is not None and (each is None or each.photo != photo)
+    ]
+    if left and read and images is not None:
+        given = [view for view, photo in zip(views, named, strict=True) if photo is not None]
+        right = find_on_rays(canonicalise(scene)[0], given, [images[view] for view in given])
+        for view in {*left} & {view for view, stands in zip(given, right, strict=True) if stands}:
+            chosen[cameras[view]] = usual[cameras[view]]
     return chosen
 
 
