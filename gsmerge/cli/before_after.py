@@ -78,7 +78,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
         scene = add_views(scene, shown=True)
     notes = [PLACED_VIEWS if note == NO_VIEWS and not args.after else note for note in record.notes]
     plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
-    if plys and all(len(ply.gaussians) > len(load.scene.gaussians) for ply in plys.values()):
+    if plys and all(ply.info.count > load.info.count for ply in plys.values()):
         notes.append(
             f"{files.ply.name} has fewer Gaussians than what is compared with it: are before and after exchanged?"
         )

@@ -45,4 +45,4 @@ def test_a_pruned_export_is_put_back(exports: ModuleType, root: Path, tmp_path: 
     assert loaded.recovery.best.frame.scale == pytest.approx(1 / 1.7, rel=1e-3)
     actual = loaded.pixel_scene()
     assert actual.num_gaussians == loaded.info.count
-    assert actual.valid.all()  # what was dropped is put back from the depth maps
+    assert actual.pixels.shown.all()  # what was dropped is put back from the depth maps

@@ -43,7 +43,7 @@ def test_objects_are_one_short_line(scene: gsmerge.Scene, result: gsmerge.Compac
     compactor = gsmerge.Compactor(superpixels="2%", checkpoint="none")
     compactor.extend(scene)
     shown = [
-        (scene, (f"{scene.num_gaussians:,} Gaussians", f"{views} views of {size}", "images", "aligned")),
+        (scene, (f"{scene.num_gaussians:,} Gaussians", f"{views} views of {size}", "images", "of pixels")),
         (scene.gaussians, (f"{len(scene.gaussians):,}", "degree 0")),
         (scene.cameras, (str(views), size)),
         (gsmerge.Views(scene.cameras, scene.images, scene.names), (str(views), size)),
