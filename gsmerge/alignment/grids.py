@@ -220,11 +220,11 @@ def patch_grids(size: Size) -> list[PhotoTransform]:
     return list(dict.fromkeys(transforms))
 
 
-def check_photo_size(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> None:
-    """Raise a SceneError for photos smaller than a pixel grid of the cameras' size."""
+def small_photos_error(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
+    """Return the error for photos smaller than a pixel grid of the cameras' size; None for other photos."""
     grid_size = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
     if size is None or grid_size is None or grid_size == size:
-        return
+        return None
     problem = f"expected images of the Gaussian grid's size {grid_size[0]} x {grid_size[1]} or larger"
     problem += f", found {size[0]} x {size[1]}"
-    raise SceneError(camera_file.path, problem, "give the images that the backbone saw, or their originals")
+    return SceneError(camera_file.path, problem, "give the images that the backbone saw, or their originals")

@@ -22,12 +22,12 @@ from gsmerge.alignment.frames import exporter_frames, scale_by
 from gsmerge.alignment.grids import (
     Grid,
     Place,
-    check_photo_size,
     file_grids,
     grids_of,
     network_sizes,
     photo_grid,
     shown_sizes,
+    small_photos_error,
     square_sizes,
     with_photo_size,
 )
@@ -341,8 +341,11 @@ def _choose_cameras(
     from gsmerge.alignment.upright import upright_rotation
 
     camera_file, inputs = source.camera_file, source.inputs(grid)
-    if source.order not in MAY_BE_UNALIGNED:
-        check_photo_size(source.ply.info, camera_file, source.size)
+    small = small_photos_error(source.ply.info, camera_file, source.size)
+    if small is not None:
+        alone, own = replace(source, photos=()), [photo_grid(camera_file, None)]
+        if isinstance(_read_in_order(alone, own) or _search(alone, own), Recovery):
+            raise small  # rows that are no pixels are seen by photos of any size
     rotation = upright_rotation(inputs) if place is None else None
     if rotation is not None:
         place = _place_upright(source, grid, rotation)

@@ -508,11 +508,14 @@ def _clear(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
 
 
 def _describe_end(valid: np.ndarray) -> tuple[str, ...]:
-    """Say where a file seems to have broken off: most rows, or its last ones alone, are no Gaussians."""
+    """Say where a file seems to have broken off: its last rows alone, or most of it, are no Gaussians."""
     good = np.flatnonzero(valid)
     last = len(valid) - 1 - int(good[-1])  # rows after the last Gaussian
-    gaps = len(valid) - len(good) - last
-    if len(good) > len(valid) / 2 and not (last > 1 and last > gaps):
+    empty = len(valid) - len(good)
+    if last > 1 and last > empty - last:
+        where, remedy = f"the last {last:,}", "the export may have broken off; export it again"
+    elif empty > len(good):
+        where, remedy = f"{empty:,}", "export the file again if no mask emptied them"
+    else:
         return ()
-    where = f"the last {last:,} of" if last > gaps else f"{len(valid) - len(good):,} of"
-    return (f"{where} {len(valid):,} rows are no Gaussians: the export may have broken off; export it again",)
+    return (f"{where} of {len(valid):,} rows are no Gaussians: {remedy}",)

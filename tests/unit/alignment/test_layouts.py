@@ -304,3 +304,13 @@ def test_previews_are_refused(tmp_path: Path) -> None:
         load_scene(tmp_path, cameras=tmp_path, images=tmp_path / "images")
     write_photos(tmp_path, SMOOTH, [cv2.resize(image, (44, 33)) for image in SMOOTH.images])
     assert load_scene(tmp_path).pixel_scene().images.shape == (3, 36, 48, 3)
+
+
+def test_previews_show_rows_in_any_order(tmp_path: Path) -> None:
+    """Rows that are no pixels in their order need no photos of a grid's size."""
+    order = np.random.default_rng(0).permutation(len(SMOOTH.gaussians))
+    replace(SMOOTH, gaussians=SMOOTH.gaussians[order]).save(tmp_path, images=False)
+    write_photos(tmp_path, SMOOTH, [cv2.resize(image, (24, 18)) for image in SMOOTH.images])
+    scene = load_scene(tmp_path).scene
+    assert (scene.cameras.width, scene.cameras.height, len(scene.images)) == (24, 18, 3)
+    assert scene.num_gaussians == len(SMOOTH.gaussians)
