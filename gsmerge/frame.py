@@ -75,8 +75,8 @@ def scene_depth(scene: Scene) -> float:
     """Measure the median depth of sampled Gaussians in their own views, or in all views that see them; 0 if unseen."""
     rows = sample_rows(scene)
     means = scene.gaussians.means[rows].astype(np.float64)
-    if scene.pixels is not None and scene.pixels.own:
-        homes = scene.pixels.homes[rows]
+    if scene.has_own_pixels:
+        homes = scene.get_pixels().homes[rows]
         viewmats = scene.cameras.viewmats[homes[homes >= 0] // scene.pixels_per_view]
         return float(lower_median(np.abs(camera_depths(means[homes >= 0], viewmats))))
     views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]

@@ -156,8 +156,7 @@ def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
 
     Higher harmonics are not rotated: poses are off by a degree or two, which hardly changes the colours.
     """
-    assert scene.pixels is not None, "views have Gaussians"
-    g, of_views = scene.gaussians, scene.pixels.rows_of_views
+    g, of_views = scene.gaussians, scene.get_pixels().rows_of_views
     motions = matmul(invert(viewmats), scene.cameras.viewmats.astype(np.float64))
     turns, (means, quats) = rotmat_to_quat(motions[:, :3, :3]), (a.copy() for a in (g.means, g.quats))
 

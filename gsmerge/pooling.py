@@ -11,7 +11,7 @@ from gsmerge.geometry import camera_depths
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.pool import decompose, pool
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Gaussians, Scene, to_float32
+from gsmerge.types import FeatureGaussians, Gaussians, Pixels, Scene, to_float32
 
 Rule = Literal["depth", "paper"]
 
@@ -42,8 +42,7 @@ def _array(values: np.ndarray) -> np.ndarray:
 
 def scene_members(scene: Scene) -> Members:
     """Return the Gaussians of a canonical scene with pixels as members, with footprints in the views of these."""
-    assert scene.pixels is not None, "stages have pixels"
-    g, cameras, homes = scene.gaussians, scene.cameras, scene.pixels.homes
+    g, cameras, homes = scene.gaussians, scene.cameras, scene.get_pixels().homes
     means, footprints = _array(g.means), np.empty(len(g), np.float32)
     viewmats, Ks = cameras.viewmats.astype(np.float32), cameras.Ks
     focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in Ks])
@@ -61,19 +60,18 @@ def scene_members(scene: Scene) -> Members:
         for centre, focal in zip(cameras.centres.astype(np.float64), focals, strict=True):
             np.minimum(nearest, np.linalg.norm(means[alone] - centre, axis=1) / focal, out=nearest)
         footprints[alone] = np.maximum(nearest, 1e-6)
-    columns = {name: _array(column) for name, column in vars(g).items()}
-    return Members(**columns, footprints=footprints, pixels=homes, fronts=scene.pixels.fronts)
+    return _make_members(g, footprints, scene.get_pixels())
 
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray) -> Members:
     """Return Gaussians that no view shows as members, with the given footprints ``[n]``."""
     nowhere = np.full(len(g), -1, np.int32), np.zeros((0, 1, 1), np.int32)
-    return Members(
-        **{name: _array(column) for name, column in vars(g).items()},
-        footprints=footprints,
-        pixels=nowhere[0],
-        fronts=nowhere[1],
-    )
+    return _make_members(g, footprints, Pixels(*nowhere, own=False))
+
+
+def _make_members(g: Gaussians, footprints: np.ndarray, pixels: Pixels) -> Members:
+    columns = {name: _array(column) for name, column in vars(g).items()}
+    return Members(**columns, footprints=footprints, pixels=pixels.homes, fronts=pixels.fronts)
 
 
 @dataclass(frozen=True)

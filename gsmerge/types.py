@@ -391,6 +391,11 @@ class Scene:
         """Whether it is known that each view has Gaussians of its own, with the colours of its photo."""
         return self.pixels is not None and self.pixels.own
 
+    def get_pixels(self) -> Pixels:
+        """Return the pixels of a scene that has them, as every prepared one does; AssertionError for others."""
+        assert self.pixels is not None, "pixels are known"
+        return self.pixels
+
     @property
     def covered(self) -> np.ndarray | None:
         """Mask ``[v,h,w]`` of pixels with a Gaussian of their view's own and of the file; None where these are all."""
@@ -437,12 +442,12 @@ class Scene:
 
 def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:
     """Add Gaussians to a scene, each in front of one of the pixels ``places [n]``, over all views, that show none."""
-    assert scene.pixels is not None, "pixels are known"
-    first, homes, fronts = len(scene.gaussians), scene.pixels.homes, scene.pixels.fronts.copy()
+    first, before = len(scene.gaussians), scene.get_pixels()
+    homes, fronts = before.homes, before.fronts.copy()
     fronts.reshape(-1)[places] = np.arange(first, first + len(added), dtype=np.int32)
-    pixels = replace(scene.pixels, homes=np.concatenate([homes, places.astype(homes.dtype)]), fronts=fronts)
-    before = np.zeros(first, bool) if scene.filled is None else scene.filled
-    filled = np.concatenate([before, np.ones(len(added), bool)])
+    pixels = replace(before, homes=np.concatenate([homes, places.astype(homes.dtype)]), fronts=fronts)
+    filled = np.zeros(first, bool) if scene.filled is None else scene.filled
+    filled = np.concatenate([filled, np.ones(len(added), bool)])
     return replace(scene, gaussians=Gaussians.concat([scene.gaussians, added]), pixels=pixels, filled=filled)
 
 

@@ -29,8 +29,7 @@ def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> tuple[Scene, i
     ``unit``: that of the maps in the scene's; if the maps are not confirmed in it, their median ratio to the Gaussians'
     depths is tried. Also returns how many were placed; the scene itself is returned where the Gaussians are as good.
     """
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    views, g, fronts = len(scene), scene.gaussians, scene.pixels.fronts.reshape(len(scene), -1)
+    views, g, fronts = len(scene), scene.gaussians, scene.get_pixels().fronts.reshape(len(scene), -1)
     viewmats, maps = scene.cameras.viewmats.astype(np.float64), maps.reshape(views, -1).astype(np.float64)
     centres, means = camera_centres(viewmats), g.means[fronts]
     depths = camera_depths(means, viewmats[:, None])
@@ -65,9 +64,9 @@ def _count_votes(scene: Scene, means: np.ndarray, placed: np.ndarray, differ: np
     """
     cameras, (views, pixels) = scene.cameras, differ.shape
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    there = scene.pixels.shown
-    shown = sh0_to_rgb(scene.gaussians.sh0[scene.pixels.fronts]) if scene.images is None else scene.images
+    shown_by = scene.get_pixels()
+    there = shown_by.shown
+    shown = sh0_to_rgb(scene.gaussians.sh0[shown_by.fronts]) if scene.images is None else scene.images
     colors, opaque = np.ascontiguousarray(shown, np.float32).reshape(-1, 3), np.ones(differ.size, np.float32)
     sources = [np.ascontiguousarray(points, np.float32).reshape(-1, 3) for points in (means, placed)]
     ids = np.where(there, np.arange(differ.size, dtype=np.int32).reshape(there.shape), -1)

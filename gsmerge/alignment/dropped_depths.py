@@ -18,8 +18,7 @@ def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scen
     of the photos ``images [v,h,w,3]``. Opacity, rotation and size in pixels are copied from the pixel before. The scene
     is returned unchanged if its Gaussians do not lie at the depths of the maps.
     """
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    g, V, fronts = scene.gaussians, scene.cameras.viewmats, scene.pixels.fronts.reshape(len(scene), -1)
+    g, V, fronts = scene.gaussians, scene.cameras.viewmats, scene.get_pixels().fronts.reshape(len(scene), -1)
     height, width = scene.cameras.height, scene.cameras.width
     y, x = np.mgrid[:height, :width].reshape(2, -1) + 0.5
     pixels = np.stack([x, y, np.ones(x.size)], 1)

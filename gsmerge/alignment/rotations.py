@@ -46,12 +46,12 @@ def read_rotations(scene: Scene, quats: QuatChoice, turn: np.ndarray | None = No
     if quats == "xyzw":
         read = from_xyzw(stored)
     elif quats == "xyzw-root":
-        normals, thinnest = _smooth_normals(scene)[_homes(scene)], scene.gaussians.scales.argmin(1)
+        normals, thinnest = _smooth_normals(scene)[scene.get_pixels().homes], scene.gaussians.scales.argmin(1)
         roots = square_roots(from_xyzw(stored))
         first, second = (_cosines(root, thinnest, normals) for root in roots)
         read = np.where((second > first)[:, None], roots[1], roots[0])
     else:
-        read = multiply_quats(_camera_quats(scene, turn)[_homes(scene) // scene.pixels_per_view], stored)
+        read = multiply_quats(_camera_quats(scene, turn)[scene.get_pixels().homes // scene.pixels_per_view], stored)
     return replace(scene, gaussians=replace(scene.gaussians, quats=read))
 
 
@@ -134,7 +134,7 @@ def _is_root(
     of_roots, *others = parallel_map(lambda pair: _better_of(pair, thinnest, normals, 0.0), [roots, *pairs])
     if of_roots <= max(others):
         return False
-    smooth = _smooth_normals(scene)[_homes(scene)[rows]]
+    smooth = _smooth_normals(scene)[scene.get_pixels().homes[rows]]
     best_other = max(_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in pairs)
     return 1 - _better_of(roots, thinnest, smooth, _FOLLOWS) <= _MAX_LEFT * (1 - best_other)
 
@@ -156,9 +156,9 @@ def _half_a_turn_more(quats: np.ndarray) -> np.ndarray:
 
 def _smooth_normals(scene: Scene) -> np.ndarray:
     """Compute surface normals ``[v·h·w,3]`` at all pixels from means averaged over neighbours; 0 on overflow."""
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    (_, h, w), shown = scene.pixels.fronts.shape, scene.pixels.shown
-    weights, means = shown[..., None].astype(np.float32), scene.gaussians.means[scene.pixels.fronts]
+    fronts = scene.get_pixels().fronts
+    (_, h, w), shown = fronts.shape, fronts >= 0
+    weights, means = shown[..., None].astype(np.float32), scene.gaussians.means[fronts]
     middle = means.mean((0, 1, 2), np.float64, where=weights > 0).astype(means.dtype)
     with np.errstate(over="ignore"):
         both = np.concatenate([np.where(weights > 0, means - middle, 0).astype(np.float32), weights], 3)
@@ -181,13 +181,12 @@ def _average_around(picture: np.ndarray) -> np.ndarray:
 
 def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute surface normals ``[t,3]`` at a sample of pixels; also return the rows and views of these."""
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    v, h, w = scene.pixels.fronts.shape
+    v, h, w = scene.get_pixels().fronts.shape
     inner = np.arange(h * w).reshape(h, w)[_STEP:-_STEP, _STEP:-_STEP].reshape(-1)
     step = spread_step(len(inner) // _SAMPLE_PIXELS, w - 2 * _STEP)
     views = np.arange(0, v, -(-v // _MOST_VIEWS))
     places = (h * w * views[:, None] + inner[::step]).reshape(-1)
-    fronts, means = scene.pixels.fronts.reshape(-1), scene.gaussians.means
+    fronts, means = scene.get_pixels().fronts.reshape(-1), scene.gaussians.means
     left, right, above, below = (fronts[places + away] for away in (-_STEP, _STEP, -_STEP * w, _STEP * w))
     good = np.minimum.reduce([fronts[places], left, right, above, below]) >= 0
     places, left, right, above, below = (each[good] for each in (places, left, right, above, below))
@@ -197,9 +196,3 @@ def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     finite = np.isfinite(normals).all(1)
     places = places[finite]
     return normals[finite], fronts[places], places // (h * w)
-
-
-def _homes(scene: Scene) -> np.ndarray:
-    """Return the pixel ``[n]`` of each Gaussian of a scene whose views have Gaussians of their own."""
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    return scene.pixels.homes

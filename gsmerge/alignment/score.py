@@ -208,12 +208,11 @@ def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> 
 
 def check_pixels(scene: Scene) -> Alignment:
     """Measure how far a sample of the Gaussians in front of every view projects from their pixels."""
-    assert scene.pixels is not None, "views have Gaussians of their own"
     free_pages(vars(scene.gaussians).values())
     width, views = scene.cameras.width, len(scene)
     step = spread_step(-(-scene.pixels_per_view // MAX_CHECKED), width)
     places = np.arange(0, scene.pixels_per_view, step)
-    fronts = scene.pixels.fronts.reshape(views, -1)[:, places]
+    fronts = scene.get_pixels().fronts.reshape(views, -1)[:, places]
     parts, columns = np.nonzero(fronts >= 0)
     y, x = np.divmod(places[columns], width)
     rows = fronts[parts, columns]

@@ -24,8 +24,9 @@ from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
 from gsmerge.io.photo_files import photo_array
-from gsmerge.measure.coverage import TRANSPARENT, coverage, extents
+from gsmerge.measure.coverage import coverage, extents
 from gsmerge.plan import describe_share
+from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.report import finite
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_part, report_progress
@@ -47,7 +48,7 @@ _FILE_KEYS = (
     "opacity_encoding", "num_nonfinite", "num_empty", "num_clipped_scales", "num_zero_quats",
 )  # fmt: skip
 _CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
-_REPEATED = ("read as: ", "the Gaussians belong to no pixels")  # notes that repeat a line of their own
+_REPEATED = "read as: "  # notes that repeat a line of their own
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}
 
 
@@ -116,7 +117,7 @@ def _describe_file(ply: GaussianFile) -> dict[str, Any]:
         "bytes": info.file_bytes,
         "extents": extents(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians),
         "num_opaque": int((opacities >= _OPAQUE).sum()),
-        "num_transparent": int((opacities < TRANSPARENT).sum()),
+        "num_transparent": int((opacities < LEAST_OPACITY).sum()),
         "num_saturated": int(((opacities <= _SATURATED) | (opacities >= 1 - _SATURATED)).sum()),
     }
 

@@ -122,8 +122,7 @@ def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
     masks, empty, importance = (
         None if values is None else values[middle] for values in (scene.masks, scene.empty, scene.importance)
     )
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    fronts = scene.pixels.fronts[middle]
+    fronts = scene.get_pixels().fronts[middle]
     rows, chosen = fronts[fronts >= 0], scene.gaussians[fronts[fronts >= 0]]
     return replace(
         scene, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=images, masks=masks,

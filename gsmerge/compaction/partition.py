@@ -69,8 +69,7 @@ def measure_covisibility(scene: Scene) -> Covisibility:
     cameras, step = scene.cameras, max(1, -(-max(scene.cameras.height, scene.cameras.width) // GRID))
     rows, columns = (np.arange(step // 2, side, step) for side in (cameras.height, cameras.width))
     picked = (rows[:, None] * cameras.width + columns).reshape(-1)
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    fronts = scene.pixels.fronts.reshape(len(scene), -1)[:, picked]
+    fronts = scene.get_pixels().fronts.reshape(len(scene), -1)[:, picked]
     means = scene.gaussians.means[fronts].astype(np.float64)
     free_pages([scene.gaussians.means])
     valid = fronts >= 0

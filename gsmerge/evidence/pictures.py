@@ -14,12 +14,11 @@ import numpy as np
 from gsmerge.frame import Frame, canonicalise
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.raster.images import thin_out
-from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, shrink_pictures
+from gsmerge.raster.photos import LEAST_OPACITY, blank_photos, photo_errors, photos_of, pixel_weights, shrink_pictures
 from gsmerge.types import Cameras, Gaussians, Scene
 
 SAMPLE_GAUSSIANS = 1 << 17  # Gaussians that are drawn
 SIDE = 96  # pixels of the longer side of pictures that photos are compared with
-LEAST = 1 / 255  # opacity below which a rasterizer draws nothing
 _CANONICAL = Frame(np.zeros(3), 1.0)  # of canonical scenes
 
 
@@ -85,7 +84,9 @@ def fit_size(size: Sequence[int], side: int) -> tuple[int, int]:
 def average(pictures: np.ndarray, weights: np.ndarray, small: np.ndarray) -> np.ndarray:
     """Average pictures ``[v,h,w,3]`` by ``weights [v,h,w]`` to the size of these when ``small [v,H,W]``."""
     sums = shrink_pictures((pictures * weights[..., None]).astype(np.float32), small.shape[2], small.shape[1])
-    return np.asarray(np.divide(sums, small[..., None], out=np.zeros_like(sums), where=small[..., None] > LEAST))
+    return np.asarray(
+        np.divide(sums, small[..., None], out=np.zeros_like(sums), where=small[..., None] > LEAST_OPACITY)
+    )
 
 
 def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
@@ -115,9 +116,8 @@ def show_views(
 
 def _show_rows(scene: Scene, side: int) -> ViewPictures:
     """Return the colours of the views' own Gaussians, every so many columns and lines."""
-    assert scene.pixels is not None, "views have Gaussians of their own"
     some = _every(scene.cameras, side)
-    rows = scene.pixels.fronts[some]
+    rows = scene.get_pixels().fronts[some]
     weights = np.where(rows >= 0, scene.gaussians.opacities[rows], 0)
     if scene.masks is not None:
         weights = weights * scene.masks[some]
@@ -137,5 +137,7 @@ def draw_views(gaussians: Gaussians, cameras: Cameras, side: int) -> ViewPicture
     blank = blank_photos(cameras, max(1.0, max(cameras.width, cameras.height) / side))
     drawn = photo_errors(gaussians, blank, lambda _, image, left: (image, 1 - left))
     images, opacities = map(np.stack, zip(*drawn, strict=True))
-    pictures = np.divide(images, opacities[..., None], out=np.zeros_like(images), where=opacities[..., None] > LEAST)
+    pictures = np.divide(
+        images, opacities[..., None], out=np.zeros_like(images), where=opacities[..., None] > LEAST_OPACITY
+    )
     return ViewPictures(pictures.clip(0, 1), opacities, drawn=True)

@@ -1,4 +1,4 @@
-"""Whether the pixels of photos have Gaussians of their colours on their rays, at whatever depth.
+"""Find photos whose pixels have Gaussians of their colours on their rays, at whatever depth.
 
 Models give the Gaussians of a pixel about its colour, and put them on its ray: a wrong depth moves them along it. So
 most pixels of a right photo have one of their colour there, and those of another photo as few as chance gives.

@@ -14,11 +14,11 @@ from functools import cached_property
 
 import numpy as np
 
-from gsmerge.evidence.pictures import LEAST, ViewPictures, fit_size
+from gsmerge.evidence.pictures import ViewPictures, fit_size
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import TURNS, blur, turn_back
-from gsmerge.raster.photos import shrink_pictures
+from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
 
 SIZES = (24, 64)  # pixels of the longer side at which pictures are compared
 AROUND = 6  # part of a side that is the standard deviation of the mean that contrast is taken from
@@ -42,7 +42,7 @@ def find_contrast(picture: np.ndarray, weight: np.ndarray | None = None, side: i
     weight = np.ones(picture.shape[:2], np.float32) if weight is None else weight
     sigma = (side or max(picture.shape[:2])) / AROUND
     sums = blur(np.dstack([picture * weight[..., None], weight]), sigma, round(REACH * 2 * sigma) | 1)
-    return np.asarray(picture - sums[..., :3] / np.maximum(sums[..., 3:], np.float32(LEAST)))
+    return np.asarray(picture - sums[..., :3] / np.maximum(sums[..., 3:], np.float32(LEAST_OPACITY)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Comparer:
         width, height = small[0].weights.shape[2:0:-1]
         self._portrait, self._square = height > width, height == width
         self.least_noise = 1 / np.sqrt(width * height)  # of Fisher's z of so many independent pixels
-        self._empty = small[0].weights.max((1, 2)) < LEAST  # with which nothing can be compared
+        self._empty = small[0].weights.max((1, 2)) < LEAST_OPACITY  # with which nothing can be compared
 
     @cached_property
     def _upright(self) -> list[_Filters]:
@@ -108,7 +108,7 @@ def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
     products, weights, lengths = [], [], []
     for picture, weight in zip(small.pictures, small.weights, strict=True):
         heavy = find_contrast(picture, weight) * weight[..., None]
-        size = float(np.sqrt((heavy * heavy / np.maximum(weight, LEAST)[..., None]).sum(dtype=np.float64)))
+        size = float(np.sqrt((heavy * heavy / np.maximum(weight, LEAST_OPACITY)[..., None]).sum(dtype=np.float64)))
         heavy = heavy / max(size, 1e-9)
         lengths.append(size)
         products += [turn_back(heavy, turn).reshape(-1) for turn in turns]

@@ -277,9 +277,9 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
             hidden[view] = differ(view, rows.picture, known) & differ(view, rows.drawing, known)
 
     inside = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    pictures, shown = row_pictures(scene), scene.pixels.shown
-    known = shown & (scene.gaussians.opacities[scene.pixels.fronts] > FAINT) & inside
+    pictures, pixels = row_pictures(scene), scene.get_pixels()
+    shown = pixels.shown
+    known = shown & (scene.gaussians.opacities[pixels.fronts] > FAINT) & inside
     hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
     picture_rows(scene, differ_drawn, np.asarray((hidden | ~inside).any((1, 2))))
     return hidden, pictures

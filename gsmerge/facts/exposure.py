@@ -166,9 +166,8 @@ class _Pixels:
 
 def _pixels_of(scene: Scene) -> _Pixels:
     """Collect the pixels of a scene and the Gaussians in front; those outside masks do not count."""
-    assert scene.pixels is not None, "views have Gaussians of their own"
     shape = len(scene), scene.pixels_per_view
-    fronts = scene.pixels.fronts.reshape(shape)
+    fronts = scene.get_pixels().fronts.reshape(shape)
     valid = fronts >= 0
     if scene.masks is not None:
         valid = valid & scene.masks.reshape(shape)
@@ -256,8 +255,7 @@ def _divide(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
         images[view] = (scene.images[view] * factors[view]).clip(0, 1)
 
     parallel_map(divide, range(len(scene)))
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    g, each = scene.gaussians, factors[scene.pixels.homes // scene.pixels_per_view][:, None]
+    g, each = scene.gaussians, factors[scene.get_pixels().homes // scene.pixels_per_view][:, None]
     gaussians = replace(g, sh0=rgb_to_sh0(sh0_to_rgb(g.sh0) * each).astype(np.float32), shN=g.shN * each)
     large = scene.large_photos
     large = None if large is None else change_large(large, changes)

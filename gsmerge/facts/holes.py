@@ -52,8 +52,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     most of the pixels are empty: the scene may be a part of what the photos show. Large connected parts of a view
     without Gaussians stay empty, unless ``everywhere``: the scene was cut out, or its model left out the sky.
     """
-    assert scene.pixels is not None, "prepared scenes have pixels"
-    fronts = scene.pixels.fronts
+    fronts = scene.get_pixels().fronts
     free, bare = shown & (fronts < 0), (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)
     gaps = [
         view for view in range(len(scene)) if free[view].any() or (not everywhere and large_parts(bare[view]).any())

@@ -99,8 +99,7 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
 
 def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
     """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours that see most of it."""
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    cameras, fronts = scene.cameras, scene.pixels.fronts.reshape(len(scene), -1)
+    cameras, fronts = scene.cameras, scene.get_pixels().fronts.reshape(len(scene), -1)
     step = max(1, scene.pixels_per_view // OVERLAP_PIXELS)
     pairs, chosen = set(), set(views)
     for view in views:
@@ -124,8 +123,7 @@ def _level_of(scene: PicturedScene, pairs: np.ndarray, level: float, samples: in
     shape = photos.height, photos.width
     rows, columns = ((np.arange(n) + 0.5) / n for n in shape)
     near = np.ix_((rows * scene.cameras.height).astype(int), (columns * scene.cameras.width).astype(int))
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    means, fronts = scene.gaussians.means, scene.pixels.fronts
+    means, fronts = scene.gaussians.means, scene.get_pixels().fronts
     spread = 0.5 + np.random.default_rng(0).random(shape)  # or all pixels would be those of one edge
     spread[:BORDER] = spread[-BORDER:] = spread[:, :BORDER] = spread[:, -BORDER:] = 0
 

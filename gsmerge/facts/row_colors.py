@@ -100,8 +100,7 @@ def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
 
 def _front(part: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Blend the layers of one camera, the nearest first: colours ``[h,w,3]`` and opacities ``[h,w]``."""
-    assert part.pixels is not None, "views have Gaussians of their own"
-    rows = part.pixels.fronts
+    rows = part.get_pixels().fronts
     opacities = np.where(rows >= 0, part.gaussians.opacities[rows], 0).astype(np.float32)
     layers = colors[rows].astype(np.float32)
     if len(part) == 1:

@@ -75,9 +75,9 @@ def _equal_views(scene: Scene, first: int, second: int) -> bool:
     for pictures in (scene.images, scene.masks, scene.importance):
         if pictures is not None and not np.array_equal(pictures[first], pictures[second]):
             return False
-    if scene.pixels is None or not scene.pixels.own:
+    if not scene.has_own_pixels:
         return True
-    a, b = (scene.pixels.rows_of_views[view] for view in (first, second))
+    a, b = (scene.get_pixels().rows_of_views[view] for view in (first, second))
     return all(np.array_equal(values[a], values[b]) for values in vars(scene.gaussians).values())
 
 
@@ -90,8 +90,8 @@ def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
     parts = {name: value[ids] for name, value in vars(scene).items() if name in BY_VIEW and value is not None}
     parts["names"] = tuple(scene.names[i] for i in ids)
     parts["pixels"] = None
-    if scene.pixels is not None and scene.pixels.own:
-        rows, parts["pixels"] = scene.pixels.select(ids)
+    if scene.has_own_pixels:
+        rows, parts["pixels"] = scene.get_pixels().select(ids)
         parts["gaussians"] = scene.gaussians[rows]
         parts["filled"] = None if scene.filled is None else scene.filled[rows]
     return replace(scene, **parts)
@@ -101,12 +101,12 @@ def take_rows(scene: SceneT, rows: np.ndarray) -> SceneT:
     """Return the scene with only the Gaussians ``rows [m]``, ascending; pixels that showed others show none."""
     filled = None if scene.filled is None else scene.filled[rows]
     part = replace(scene, gaussians=scene.gaussians[rows], filled=filled, pixels=None)
-    if scene.pixels is None or not scene.pixels.own:
+    if not scene.has_own_pixels:
         return part
-    numbers = np.full(len(scene.gaussians), -1, np.int32)
+    pixels, numbers = scene.get_pixels(), np.full(len(scene.gaussians), -1, np.int32)
     numbers[rows] = np.arange(len(rows), dtype=np.int32)
-    fronts = np.where(scene.pixels.shown, numbers[scene.pixels.fronts], np.int32(-1))
-    return replace(part, pixels=Pixels(scene.pixels.homes[rows], fronts, own=True))
+    fronts = np.where(pixels.shown, numbers[pixels.fronts], np.int32(-1))
+    return replace(part, pixels=Pixels(pixels.homes[rows], fronts, own=True))
 
 
 def in_float64(cameras: Cameras) -> Cameras:

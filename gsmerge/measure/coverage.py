@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from gsmerge.measure.visibility import MAX_SAMPLE_GAUSSIANS, inside_views
+from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.types import Gaussians, Scene
 
-TRANSPARENT = 1 / 255  # opacity: one step of an 8-bit image
 HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
 
 
@@ -48,9 +48,10 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
         return []
     shares = shares_inside(scene, MAX_SAMPLE_GAUSSIANS)
     pixels: list[float | None] = [None] * len(scene)
-    if scene.pixels is not None and scene.pixels.own:
-        visible = scene.pixels.shown if scene.covered is None else scene.covered
-        visible = visible & (scene.gaussians.opacities >= TRANSPARENT)[scene.pixels.fronts]
+    if scene.has_own_pixels:
+        own, covered = scene.get_pixels(), scene.covered
+        visible = own.shown if covered is None else covered
+        visible = visible & (scene.gaussians.opacities >= LEAST_OPACITY)[own.fronts]
         pixels = [float(view.mean()) for view in visible]
     keys = ("name", "share_of_pixels", "share_of_gaussians")
     return [dict(zip(keys, view, strict=True)) for view in zip(scene.names, pixels, shares, strict=True)]

@@ -344,8 +344,9 @@ def _pack(
     if light:
         return None, highest, highest
     homes = None
-    if scene.pixels is not None and scene.pixels.own:
-        homes = scene.pixels.homes if scene.filled is None else scene.pixels.homes[~scene.filled]
+    if scene.has_own_pixels:
+        homes = scene.get_pixels().homes
+        homes = homes if scene.filled is None else homes[~scene.filled]
     return *pack_splats(gaussians, cameras, homes), highest
 
 

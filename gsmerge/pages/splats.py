@@ -12,11 +12,11 @@ import numpy as np
 
 from gsmerge.io.formats import spz
 from gsmerge.kernels.page_rows import LOOKS, pack_looks, pack_pixels
+from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.types import SH_C0, Cameras, Gaussians
 
 MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
 MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
-MIN_OPACITY = 1 / 255  # what is fainter is not drawn
 FINE = 11  # bits of a position within the scene: the browser keeps 10 and the sign
 MANY = 300_000  # Gaussians that are as small as pixels, each of which may be less exact
 # Steps of the numbers of a .spz: opacity, colour, logarithm of the scale; and levels of half a turn's rotation. With
@@ -73,7 +73,7 @@ def pack_splats(
 
 def drawn_rows(gaussians: Gaussians) -> np.ndarray:
     """Return the ids of the rows that :func:`pack_splats` packs: finite and visible."""
-    drawn = gaussians.opacities >= MIN_OPACITY
+    drawn = gaussians.opacities >= LEAST_OPACITY
     for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
         finite = np.isfinite(values).reshape(len(values), prod(values.shape[1:])).T
         drawn &= reduce(np.logical_and, finite, True)  # type: ignore[arg-type]

@@ -21,6 +21,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 Score = TypeVar("Score")
 
+LEAST_OPACITY = 1 / 255  # below which no rasterizer draws anything
 NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
 ONE_AT_A_TIME = 400_000  # Gaussians; a tiled view is as large as they are, so threads share one view instead
 BLOCK = 2  # tiles per side of the blocks that scored_tiles chooses among
@@ -135,9 +136,8 @@ def scene_pictures(scene: Scene) -> np.ndarray:
 
 def row_pictures(scene: Scene) -> np.ndarray:
     """Return the base colours ``[v,h,w,3]`` of the Gaussians in front of a scene's pixels, 0 where there is none."""
-    assert scene.pixels is not None, "pixels show Gaussians"
-    colors = sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1)
-    return np.where(scene.pixels.shown[..., None], colors[scene.pixels.fronts], np.float32(0))
+    colors, pixels = sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1), scene.get_pixels()
+    return np.where(pixels.shown[..., None], colors[pixels.fronts], np.float32(0))
 
 
 def scene_photos(scene: Scene, level: float = 1) -> Photos:

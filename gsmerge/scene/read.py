@@ -63,7 +63,7 @@ from gsmerge.scene.photos import (
     stored_photos,
     without_photo,
 )
-from gsmerge.scene.rows import color_from_photos, set_rotations, take_rows, use_depths
+from gsmerge.scene.rows import color_from_photos, set_rotations, take_gaussians, use_depths
 from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, Cameras, LargePhotos, Scene, StrPath
@@ -446,7 +446,7 @@ def _make_load(
     """
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
     names = () if camera_file is None else camera_file.names
-    gaussians, pixels = take_rows(ply, result)
+    gaussians, pixels = take_gaussians(ply, result)
     num_faint = int(ply.valid.sum()) - len(gaussians)
     more = [f"{num_faint:,} Gaussian(s) that nothing draws, fainter than 1/255, set aside"] if num_faint else []
     cameras, images = result.cameras, result.images

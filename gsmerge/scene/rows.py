@@ -16,11 +16,11 @@ from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.read import holds_images, read_depths
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.formats.table import DEPTHS, find_format
+from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.scene.exporters import TURNED, Exporter, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.types import Gaussians, Pixels, Scene
 
-LEAST = 1 / 255  # opacity below which no rasterizer draws anything
 _PART = 1 << 20  # numbers that are compared at once
 
 
@@ -59,18 +59,17 @@ def use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: floa
     return full, [*notes, *[filled] * (count > 0)]
 
 
-def take_rows(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussians, Pixels | None]:
+def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussians, Pixels | None]:
     """Take the rows of a file that are Gaussians and that something draws, in the order of their pixels if known.
 
     If nothing draws any, all rows that are Gaussians are taken.
     """
-    there = ply.valid & (ply.gaussians.opacities >= LEAST)
+    there = ply.valid & (ply.gaussians.opacities >= LEAST_OPACITY)
     there = there if there.any() else ply.valid
-    if result.pixel_ids is None:
-        return ply.gaussians if there.all() else ply.gaussians[there], None
     grid, ids = (len(result.views), result.cameras.height, result.cameras.width), result.pixel_ids
-    if len(ids) == prod(grid) and _counts_up(ids):
-        return ply.gaussians if there.all() else ply.gaussians[there], Pixels.of_grid(there.reshape(grid))
+    if ids is None or (len(ids) == prod(grid) and _counts_up(ids)):
+        gaussians = ply.gaussians if there.all() else ply.gaussians[there]
+        return gaussians, None if ids is None else Pixels.of_grid(there.reshape(grid))
     rows = np.flatnonzero(there)
     rows = rows[np.argsort(ids[rows], kind="stable")]
     homes, gaussians = ids[rows], ply.gaussians[rows]

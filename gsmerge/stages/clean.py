@@ -10,6 +10,7 @@ from gsmerge.facts.crop import inside_crop
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.facts.support import count_views
 from gsmerge.kernels.gaussians.cross_view import make_tree, nearest_of_others
+from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.sky import sky
@@ -24,7 +25,6 @@ APART = 3.0  # times the median distance of nearest Gaussians: a floater's own i
 # Second and largest scale, as shares of half the diagonal of the scene's box, from which on a Gaussian hangs across the
 # scene if it is also so many times as large as the median one. Exports, and results without a fit, have none
 CURTAIN, WIDER = (0.1, 0.33), 8.0
-TRANSPARENT = 1 / 255  # opacity below which a Gaussian shows nothing
 MAX_SAMPLE_GAUSSIANS = 200_000  # Gaussians that a share is estimated from
 
 ToWorld = Callable[[Gaussians], Gaussians]
@@ -105,7 +105,7 @@ def clean(
         inside = inside_crop(to_world(gaussians).means, options.crop)
         gaussians, counts["cropped"] = gaussians[inside], int((~inside).sum())
     if "transparent" in options.drops:
-        faint = gaussians.opacities < TRANSPARENT
+        faint = gaussians.opacities < LEAST_OPACITY
         gaussians, counts["transparent"] = gaussians[~faint], int(faint.sum())
     if "sky" in options.drops:
         assert cameras is not None, "sky is dropped where there are photos"

@@ -88,9 +88,8 @@ def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimit
     leaves = max(limits.per_view, -(-count // len(scene)))
     stretched = pictures if important is None else pictures * np.sqrt(important)[..., None]
     leaves = leaves if important is None else int(leaves * important.max())
-    assert scene.pixels is not None, "stages have pixels"
     groups = segment(pictures, options, min(leaves, scene.pixels_per_view))
-    return region_tree(stretched, front_depths(scene), groups, scene.pixels.shown)
+    return region_tree(stretched, front_depths(scene), groups, scene.get_pixels().shown)
 
 
 def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
@@ -223,8 +222,7 @@ class RegionTree:
 
 def front_depths(scene: Scene) -> np.ndarray:
     """Return the depth of the Gaussian in front of every pixel, ``[v,h,w]`` float32, world units."""
-    assert scene.pixels is not None, "stages have pixels"
-    cameras, means, fronts = scene.cameras, scene.gaussians.means, scene.pixels.fronts
+    cameras, means, fronts = scene.cameras, scene.gaussians.means, scene.get_pixels().fronts
 
     def one_view(view: int) -> np.ndarray:
         depths = camera_depths(means[fronts[view]], cameras.viewmats[view].astype(means.dtype))

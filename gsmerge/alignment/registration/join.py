@@ -130,10 +130,11 @@ def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
     """Concatenate the pixels of scenes; None if views of some are not known to have Gaussians of their own."""
     homes, fronts, rows, views = list[np.ndarray](), list[np.ndarray](), 0, 0
     for scene in scenes:
-        if scene.pixels is None or not scene.pixels.own:
+        if not scene.has_own_pixels:
             return None
-        homes.append(np.where(scene.pixels.homes >= 0, scene.pixels.homes + views * scene.pixels_per_view, -1))
-        fronts.append(np.where(scene.pixels.shown, scene.pixels.fronts + np.int32(rows), np.int32(-1)))
+        pixels = scene.get_pixels()
+        homes.append(np.where(pixels.homes >= 0, pixels.homes + views * scene.pixels_per_view, -1))
+        fronts.append(np.where(pixels.shown, pixels.fronts + np.int32(rows), np.int32(-1)))
         rows, views = rows + len(scene.gaussians), views + len(scene)
     return Pixels(np.concatenate(homes), np.concatenate(fronts), own=True)
 

@@ -142,8 +142,7 @@ def _any_processor() -> Iterator[None]:
 def _surface(scene: Scene, layers: Sequence[int], viewmat: np.ndarray) -> np.ndarray:
     """Return depths ``[h,w]`` of the nearest opaque one of the views ``layers`` of a camera; infinite without any."""
     views = list(layers)
-    assert scene.pixels is not None, "views have Gaussians of their own"
-    rows = scene.pixels.fronts[views]
+    rows = scene.get_pixels().fronts[views]
     means = scene.gaussians.means[rows].astype(np.float64)
     opacities = scene.gaussians.opacities[rows] * (rows >= 0)
     depths = camera_depths(means, viewmat)

@@ -162,7 +162,7 @@ def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) 
 def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussians, scene: Scene) -> None:
     """What a view sees in the world it sees in the page's frame."""
     head, columns = unpacked(actual.sides[1].splats)
-    drawn = half.means[half.opacities >= splats.MIN_OPACITY]
+    drawn = half.means[half.opacities >= splats.LEAST_OPACITY]
     assert head["count"] == len(drawn)
     means = columns[:, :3] / 2.0 ** head["fraction"]
     view = next(view for view in actual.views if view.place == 1)

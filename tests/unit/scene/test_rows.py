@@ -18,7 +18,7 @@ from gsmerge.facts.prepare import prepare
 from gsmerge.io import write_ply
 from gsmerge.io.formats.read import GaussianFile, read_ply
 from gsmerge.scene.read import load_scene
-from gsmerge.scene.rows import take_rows
+from gsmerge.scene.rows import take_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def result_of(room: Scene, ids: np.ndarray | None) -> AlignmentResult:
 
 def test_rows_come_in_the_order_of_their_pixels(room: Scene, tmp_path: Path) -> None:
     order = np.random.default_rng(0).permutation(len(room.gaussians))[:1000]
-    gaussians, pixels = take_rows(file_of(room.gaussians[order], tmp_path), result_of(room, order))
+    gaussians, pixels = take_gaussians(file_of(room.gaussians[order], tmp_path), result_of(room, order))
     assert pixels is not None
     assert pixels.own
     assert np.array_equal(pixels.homes, np.sort(order))
@@ -51,7 +51,7 @@ def test_of_several_rows_of_a_pixel_the_nearest_is_in_front(room: Scene, tmp_pat
     near = replace(g, means=room.cameras.centres[0] + 0.5 * (g.means - room.cameras.centres[0]))
     ids = np.concatenate([np.arange(100), np.arange(100), [-1]])
     both = Gaussians.concat([g, near, g[:1]])
-    gaussians, pixels = take_rows(file_of(both, tmp_path), replace(result_of(room, ids), recovery=None))
+    gaussians, pixels = take_gaussians(file_of(both, tmp_path), replace(result_of(room, ids), recovery=None))
     assert pixels is not None
     assert len(gaussians) == 201
     assert (pixels.homes < 0).sum() == 1
@@ -64,14 +64,14 @@ def test_what_nothing_draws_is_not_there(room: Scene, tmp_path: Path) -> None:
     opacities[::7] = 1 / 300
     faint = replace(room.gaussians, opacities=opacities)
     file = file_of(faint, tmp_path)
-    gaussians, pixels = take_rows(file, result_of(room, np.arange(len(opacities))))
+    gaussians, pixels = take_gaussians(file, result_of(room, np.arange(len(opacities))))
     assert pixels is not None
     assert np.array_equal(np.flatnonzero(~pixels.shown.reshape(-1)), np.arange(0, len(opacities), 7))
     assert len(gaussians) == pixels.shown.sum()
-    assert len(take_rows(file, result_of(room, None))[0]) == len(gaussians)
+    assert len(take_gaussians(file, result_of(room, None))[0]) == len(gaussians)
     (tmp_path / "faint").mkdir()
     nothing = file_of(replace(room.gaussians, opacities=np.full_like(opacities, 1 / 300)), tmp_path / "faint")
-    assert len(take_rows(nothing, result_of(room, None))[0]) == len(opacities)  # or there would be no scene
+    assert len(take_gaussians(nothing, result_of(room, None))[0]) == len(opacities)  # or there would be no scene
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan])
