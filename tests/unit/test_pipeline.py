@@ -34,7 +34,7 @@ def test_report(scene: Scene) -> None:
     assert 0 < report.num_output == len(result.gaussians) < report.num_input
     assert list(report.seconds) == USUAL
     assert report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, scene), abs=0.1)
-    assert report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, scene), abs=0.1)
+    assert report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, scene), abs=0.15)
     assert report.choices["fit"]["method"] == "full"
     assert report.choices["clusters"] <= report.choices["groups"]
     assert report.options["superpixels"] == "10%"

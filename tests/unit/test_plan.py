@@ -94,9 +94,9 @@ def test_steps_grow_with_the_views() -> None:
 
 
 def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
-    assert not resolve_fit(options_of(effort="draft", fit="none")).needs_photos
-    assert resolve_fit(options_of(effort="draft")).needs_photos
-    assert resolve_fit(options_of(fit="none")).needs_photos
+    assert resolve_fit(options_of(effort="draft", fit="none")).min_contribution == 0
+    assert resolve_fit(options_of(effort="draft")).min_contribution > 0
+    assert resolve_fit(options_of(fit="none")).min_contribution > 0
 
 
 @pytest.mark.parametrize(
@@ -262,7 +262,6 @@ def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:
     assert not free.with_fixed_cameras().fit.move_cameras
     assert not plan_of(scene, poses="fixed").fit.move_cameras
     unfitted = plan_of(scene, poses="free", fit="none").fit
-    assert unfitted.needs_photos
     assert not unfitted.move_cameras
 
 

@@ -34,8 +34,8 @@ from gsmerge.runtime.record import record_run
 from gsmerge.settings.fit import Tuning
 
 Pair = tuple[Photos, Photos]
-QUICK = FitOptions(fit_steps=30, holdout=0.2)
-LONG = FitOptions(fit_steps=160, holdout=0.2)
+QUICK = FitOptions(fit_steps=30, holdout=0.2, beyond=True, fills=True)
+LONG = FitOptions(fit_steps=160, holdout=0.2, beyond=True, fills=True)
 
 
 # what it reaches
@@ -45,7 +45,7 @@ def test_perturbed_scene_comes_back(scene: Scene, truth: Gaussians, photos: Pair
     gains = []
     for seed in range(3):
         start = scenes.spoil(truth, seed=seed)
-        result, report = fit_full(start, scenes.run_for(photos, replace(LONG, dropout=0.0), seed=seed))
+        result, report = fit_full(start, scenes.run_for(photos, replace(LONG, dropout=0.0), len(start), seed=seed))
         assert (report.method, report.accepted, report.steps) == ("full", True, 160)
         assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 6
         assert len(result) == len(start)

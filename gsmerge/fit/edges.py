@@ -1,0 +1,72 @@
+"""Edges of the photos, at which a fit cuts its Gaussians: no photo says how far they reach beyond.
+
+What crosses the edges of all photos hangs around the scene as a soft rim, and as clouds, for whoever steps back.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmerge.fit.fit_state import FitState
+from gsmerge.geometry import camera_centres
+from gsmerge.kernels.elementary import exp, log
+from gsmerge.kernels.gaussians.edges import cut_at_edges
+from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
+from gsmerge.kernels.matrices import matmul
+from gsmerge.pooling import principal_axes
+from gsmerge.raster.photos import Photos
+from gsmerge.runtime.threads import parallel_map
+
+# Distances from one Gaussian to the next by which the edges are moved out, if Gaussians were spread evenly over all
+# photos: border pixels show those that are centred beside them, too
+MARGIN = 2.0
+ROWS = 16384  # Gaussians per piece of work
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Planes through the cameras of v photos and the four edges of each, moved out."""
+
+    normals: np.ndarray  # [v,4,3] outward, of unit length
+    offsets: np.ndarray  # [v,4] points x inside have normal @ x <= offset
+
+
+def photo_edges(photos: Photos, margin: float) -> Edges:
+    """Return the edges of photos, moved out by a ``margin`` in pixels."""
+    focals, middles, size = photos.Ks[:, [0, 1], [0, 1]], photos.Ks[:, :2, 2], np.array([photos.width, photos.height])
+    left, top = ((-margin - middles) / focals).T
+    right, bottom = ((size + margin - middles) / focals).T
+    zero, one = np.zeros(len(photos)), np.ones(len(photos))
+    sides = (-one, zero, left), (one, zero, -right), (zero, -one, top), (zero, one, -bottom)
+    seen = np.stack([np.stack(side, 1) for side in sides], 1)  # by the camera
+    seen /= np.sqrt((seen**2).sum(2, keepdims=True))
+    viewmats = photos.viewmats.astype(np.float64)
+    normals = np.stack([matmul(some, viewmat[:3, :3]) for some, viewmat in zip(seen, viewmats, strict=True)])
+    return Edges(normals, (normals * camera_centres(viewmats)[:, None]).sum(2))
+
+
+def cut_state(state: FitState, photos: Photos) -> None:
+    """Cut the Gaussians of a state at the edges of photos, in place, except those that are fixed.
+
+    The limits of their means and scales are about what is left.
+    """
+    splats, x = state.splats, state.x
+    pixels_each = len(photos) * photos.height * photos.width / max(1, len(x))
+    edges = photo_edges(photos, MARGIN * math.sqrt(pixels_each))
+    means, covars, is_cut = splats.means.copy(), np.empty((len(x), 3, 3)), np.zeros(len(x), np.uint8)
+
+    def cut(first: int) -> None:
+        last = min(first + ROWS, len(x))
+        cut_at_edges(splats.quats, splats.scales, edges.normals, edges.offsets, first, last, means, covars, is_cut)
+
+    parallel_map(cut, range(0, len(x), ROWS))
+    rows = np.flatnonzero(is_cut.astype(bool) & ~state.fixed)
+    scales, quats = principal_axes(covars[rows])
+    sizes = np.maximum(log(scales), state.min_sizes[rows, None])
+    x[rows, :SIZE], x[rows, SIZE:QUAT], x[rows, QUAT:LOGIT] = means[rows], sizes, quats
+    state.x0[rows, :LOGIT] = x[rows, :LOGIT]
+    state.m[rows, :LOGIT] = 0  # it was along other axes
+    splats.means[rows], splats.scales[rows], splats.quats[rows] = means[rows], exp(x[rows, SIZE:QUAT]), quats
