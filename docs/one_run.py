@@ -122,7 +122,6 @@ class Run:
         """The Gaussians of the result that come from it."""
         return np.flatnonzero(self.made["fit_scene"].report.origins == self.merged)
 
-
     @property
     def written(self) -> int:
         """The first of these in the result: others are left out."""
@@ -392,8 +391,8 @@ def build_section(run: Run) -> str:
         ),
         text(
             "**`fit_scene`** compares renders with the photos and changes all parameters. Half way it splits the",
-            f"Gaussians with the largest errors, and later drops those that fade: {len(fitted.gaussians):,} are left, of",
-            f"the pixel's Gaussian {len(children)}. Patches of photos stay out of the first steps, on a quarter of",
+            f"Gaussians with the largest errors, and drops those that fade: {len(fitted.gaussians):,} are left, of the",
+            f"pixel's Gaussian {len(children)}. Patches of photos stay out of the first steps, on a quarter of",
             "pixels, as a test:",
             f"their PSNR rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
             say(
@@ -402,8 +401,8 @@ def build_section(run: Run) -> str:
             ),
         ),
         text(
-            f"**`finish`** leaves out the {len(before - after)} Gaussians without which no photo changes by more than",
-            f"rounding, and puts {len(others)} others where cameras between photos see nothing.",
+            f"**`finish`** leaves out {len(before - after)} Gaussians that no photo shows, and puts {len(others)}",
+            "others where cameras between photos see nothing.",
         ),
     ])  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The arrows: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> filled."""
+"""The arrows: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> pruned -> filled."""
 
 from __future__ import annotations
 

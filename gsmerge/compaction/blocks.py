@@ -44,7 +44,8 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import piece_settings
 from gsmerge.settings.stages import AUTO_SHARE
 from gsmerge.stages.clean import faintest_dropped
-from gsmerge.types import Decoded, Gaussians, PicturedScene, Scene, SceneT
+from gsmerge.stages.prune import split_unseen
+from gsmerge.types import Cameras, Decoded, Gaussians, PicturedScene, Scene, SceneT
 
 T = TypeVar("T")
 # of a result on a block: PSNR (dB), and what is measured besides
@@ -105,7 +106,10 @@ def compact_in_blocks(
         fitted = list(adopt_records(work.run("fit", fit_part, count, each_part(parts, everything, growth))))
         joined = Gaussians.concat([gaussians for gaussians, _ in fitted])
         owners = np.repeat(np.arange(count), [len(gaussians) for gaussians, _ in fitted])
-        result = frame.leave(fit_seams(joined, owners, parts, options.seed))
+        joined = fit_seams(joined, owners, parts, options.seed)
+        if choices.fit.min_contribution > 0:
+            joined = prune_joined(joined, frame.enter_cameras(scene.cameras), options, most)
+        result = frame.leave(joined)
         if most is not None and most < len(result):
             result = faintest_dropped(result, most)
         if asked := file_size(options.budget):
@@ -246,6 +250,15 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[BlockStart]
     for name, column in columns.items():
         column[rows[moved]] = getattr(fitted.gaussians, name)[moved]
     return Gaussians(**columns)
+
+
+def prune_joined(joined: Gaussians, cameras: Cameras, options: CompactOptions, most: int | None) -> Gaussians:
+    """Leave out the Gaussians of all blocks that none of all ``cameras`` shows, unless ``most`` have to be written."""
+    seen, unseen = split_unseen(joined, cameras)
+    room = most - len(seen) if most is not None and options.budget.is_filled else 0
+    unseen = unseen[: max(0, room)]
+    choose(pruned=len(joined) - len(seen) - len(unseen))
+    return Gaussians.concat([seen, unseen])
 
 
 def find_seams(

@@ -303,11 +303,11 @@ def summary_line(document: Mapping[str, Any]) -> str:
         quality += f", {files['before']:.2f} -> {files['after']:.2f} dB on the photos as their files have them"
     if protected := document.get("psnr_protected"):
         quality += f", {protected['before']:.2f} -> {protected['after']:.2f} dB where they are protected"
-    if pruned := document["choices"].get("pruned"):
-        quality += f"; {pruned:,} that no photo shows left out"
+    ratio, pruned = human_share(document["ratio"]), document["choices"].get("pruned")
+    share = f"{ratio}; {pruned:,} that no photo shows are left out" if pruned else ratio
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
-        f" ({human_share(document['ratio'])}), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
+        f" ({share}), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
         f"{quality}; {seconds_line(document)}{cameras}"
     )
 

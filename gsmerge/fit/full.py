@@ -55,7 +55,7 @@ def fit_full(
             state = grow_to(state, half, job.count)
         if grows and job.fixed is None and begins(CLEARS, last, part):
             state = grow_to(state, half, job.count, FAINT) if options.fills else drop_faint(state, FAINT)
-        if not options.beyond and begins(CUTS, last, part):
+        if grows and not options.beyond and begins(CUTS, last, part):
             cut_state(state, half)
         drawn = schedule.draw(step + 1, part, len(state.x))
         looks = 1 if begins((run.half_part,), last, part) else min(looks + 1, 10)  # anew with photos of full size

@@ -20,7 +20,10 @@ from gsmerge.types import Cameras, Gaussians
 ROUNDING = 1 / (255 * math.sqrt(12))  # root mean square of what rounding to eight bits changes
 FIRST = 0.02  # largest blending weight below which Gaussians are left out in the first trial
 TRIALS, AIM, CLOSE = 4, 0.9, 0.75  # weights that are tried; shares of ROUNDING that are aimed at, and near enough
-COMPARED = 24  # views, at most, in which pictures with and without them are compared
+COMPARED = 8  # views, at most, in which pictures with and without them are compared
+# Times a photo's pixel is one in which weights are found, and one of pictures that are compared. Their pixels are
+# samples of the photo's, as the low-pass stays, and thus have the same root mean square
+LEVELS = 2, 4
 
 
 @stage("prune")
@@ -30,10 +33,10 @@ def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gau
     Unseen are as many as can go, least blending weight first, while the pictures of no camera change by more than
     ``ROUNDING`` (root mean square). What lies outside of all pictures stays.
     """
-    peaks, inside = peak_weights(gaussians, blank_photos(cameras))
+    peaks, inside = peak_weights(gaussians, blank_photos(cameras, LEVELS[0]))
     peaks[~inside] = np.inf
     views = pick_views(len(cameras), COMPARED)
-    least = _least_weight(gaussians, peaks, blank_photos(cameras[views], 2)) if views else 0.0
+    least = _least_weight(gaussians, peaks, blank_photos(cameras[views], LEVELS[1])) if views else 0.0
     unseen = np.flatnonzero(peaks < least)
     return gaussians[np.flatnonzero(peaks >= least)], gaussians[unseen[np.argsort(-peaks[unseen], kind="stable")]]
 

@@ -74,7 +74,7 @@ def test_what_crosses_the_edges_ends_there(truth: Gaussians, photos: Pair) -> No
     moved = (state.splats.means != wide.means).any(1)
     assert 5 < moved.sum() < len(wide)
     after = replace(wide, means=state.splats.means, quats=state.splats.quats, scales=state.splats.scales)
-    assert reach_beyond(after, photos[0]) < 0.5 * reach_beyond(wide, photos[0])
+    assert reach_beyond(after, photos[0]) < 0.6 * reach_beyond(wide, photos[0])
     np.testing.assert_array_equal(state.x[:, :3], state.splats.means)
     np.testing.assert_array_equal(state.x0[moved, :10], state.x[moved, :10])
     np.testing.assert_array_equal(state.x[~moved], start_state(wide).x[~moved])
@@ -83,11 +83,12 @@ def test_what_crosses_the_edges_ends_there(truth: Gaussians, photos: Pair) -> No
 def test_fixed_gaussians_and_least_sizes_stay(truth: Gaussians, photos: Pair) -> None:
     state = start_state(with_wide(truth))
     state.fixed[::2] = True
+    state.fixed[20] = False  # a wide one
     state.min_sizes[:] = state.x[:, 3:6].max(1)
-    before = state.x.copy()
+    before, free = state.x.copy(), ~state.fixed
     cut_state(state, photos[1])
-    np.testing.assert_array_equal(state.x[::2], before[::2])
-    assert not np.array_equal(state.x, before)
+    np.testing.assert_array_equal(state.x[~free], before[~free])
+    assert not np.array_equal(state.x[free], before[free])
     assert (state.x[:, 3:6].max(1) >= state.min_sizes).all()
 
 
