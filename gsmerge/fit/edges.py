@@ -20,8 +20,8 @@ from gsmerge.pooling import principal_axes
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import parallel_map
 
-# Distances from one Gaussian to the next by which the edges are moved out, if Gaussians were spread evenly over all
-# photos: border pixels show those that are centred beside them, too
+# Distances from one Gaussian to the next by which the edges are moved out, if the Gaussians of the result were spread
+# evenly over all photos: border pixels show those that are centred beside them, too
 MARGIN = 2.0
 ROWS = 16384  # Gaussians per piece of work
 
@@ -48,13 +48,13 @@ def photo_edges(photos: Photos, margin: float) -> Edges:
     return Edges(normals, (normals * camera_centres(viewmats)[:, None]).sum(2))
 
 
-def cut_state(state: FitState, photos: Photos) -> None:
+def cut_state(state: FitState, photos: Photos, count: int) -> None:
     """Cut the Gaussians of a state at the edges of photos, in place, except those that are fixed.
 
-    The limits of their means and scales are about what is left.
+    The limits of their means are about what is left, those of their scales stay. ``count``: of the Gaussians in the end.
     """
     splats, x = state.splats, state.x
-    pixels_each = len(photos) * photos.height * photos.width / max(1, len(x))
+    pixels_each = len(photos) * photos.height * photos.width / max(1, count)
     edges = photo_edges(photos, MARGIN * math.sqrt(pixels_each))
     means, covars, is_cut = splats.means.copy(), np.empty((len(x), 3, 3)), np.zeros(len(x), np.uint8)
 
@@ -67,6 +67,7 @@ def cut_state(state: FitState, photos: Photos) -> None:
     scales, quats = principal_axes(covars[rows])
     sizes = np.maximum(log(scales), state.min_sizes[rows, None])
     x[rows, :SIZE], x[rows, SIZE:QUAT], x[rows, QUAT:LOGIT] = means[rows], sizes, quats
-    state.x0[rows, :LOGIT] = x[rows, :LOGIT]
+    state.x0[rows, :SIZE] = means[rows]
+    state.x0[rows, SIZE:QUAT] = np.sort(state.x0[rows, SIZE:QUAT], 1)  # as those of the new axes, which rise
     state.m[rows, :LOGIT] = 0  # it was along other axes
     splats.means[rows], splats.scales[rows], splats.quats[rows] = means[rows], exp(x[rows, SIZE:QUAT]), quats

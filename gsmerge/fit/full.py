@@ -56,7 +56,7 @@ def fit_full(
         if grows and job.fixed is None and begins(CLEARS, last, part):
             state = grow_to(state, half, job.count, FAINT) if options.fills else drop_faint(state, FAINT)
         if grows and not options.beyond and begins(CUTS, last, part):
-            cut_state(state, half)
+            cut_state(state, half, job.count)
         drawn = schedule.draw(step + 1, part, len(state.x))
         looks = 1 if begins((run.half_part,), last, part) else min(looks + 1, 10)  # anew with photos of full size
         error += (optimiser.step(state, drawn) - error) / looks

@@ -111,6 +111,15 @@ class Seen:
         return np.bincount(point[wrong], minlength=len(points)) > 0
 
 
+def lies_between(known: np.ndarray) -> np.ndarray:
+    """Mark the pixels with something ``known [h,w]`` both to the left and to the right, or both above and below."""
+    sides = []
+    for mask in (known, known.T):
+        before, after = (np.logical_or.accumulate(some, axis=1) for some in (mask, mask[:, ::-1]))
+        sides.append(before & after[:, ::-1])
+    return np.asarray(sides[0] | sides[1].T)
+
+
 def _small_cameras(cameras: Cameras) -> Cameras:
     """Return the cameras with pixels ``LEVEL`` times as large."""
     width, height = (max(LEVEL, round(side / LEVEL)) for side in (cameras.width, cameras.height))
@@ -161,6 +170,7 @@ def _continue_surfaces(
     around = np.ones((2 * round(WINDOW * camera.width) + 1,) * 2, np.uint8)
     known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), around))
     clear &= cv2.dilate(known.astype(np.uint8), around) > 0
+    clear &= beyond | lies_between(known)
     image = image / np.maximum(1 - left, 1e-6)[..., None]
     values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
     sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]

@@ -9,7 +9,7 @@ import pytest
 
 from gsmerge.geometry import is_inside, project, rgb_to_sh0
 from gsmerge.raster import render
-from gsmerge.stages.fill import MOST_VIEWS, fill_between
+from gsmerge.stages.fill import MOST_VIEWS, fill_between, lies_between
 from gsmerge.types import Cameras, Gaussians
 
 
@@ -67,6 +67,23 @@ def test_what_lies_beyond_all_photos_is_filled_only_where_asked() -> None:
     assert shown(inside).all()
     assert len(everywhere) > len(inside) > 50
     assert not shown(everywhere).all()
+
+
+def test_only_what_is_enclosed_is_filled() -> None:
+    """A wall that ends behind a post has nothing on its other side that it could go on to."""
+    whole, cameras = slit(-0.6, 0.6)
+    right_of_it = whole[whole.means[:, 0] < 0.2]  # neither the right post nor the wall behind and beside it
+    assert len(fill(whole, cameras)) > 50
+    new = fill(right_of_it, cameras)
+    assert not (new.means[:, 0] > 0.2).any()
+
+
+def test_between_is_a_line_from_one_to_another() -> None:
+    known = np.zeros((5, 7), bool)
+    known[2, 1] = known[2, 4] = known[0, 6] = known[3, 6] = True
+    expected = np.zeros((5, 7), bool)
+    expected[2, 1:5] = expected[:4, 6] = True
+    np.testing.assert_array_equal(lies_between(known), expected)
 
 
 def test_views_that_look_elsewhere_have_nothing_between_them() -> None:
