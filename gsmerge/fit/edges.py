@@ -51,7 +51,7 @@ def photo_edges(photos: Photos, margin: float) -> Edges:
 def cut_state(state: FitState, photos: Photos, count: int) -> None:
     """Cut the Gaussians of a state at the edges of photos, in place, except those that are fixed.
 
-    The limits of their means are about what is left, those of their scales stay. ``count``: of the Gaussians in the end.
+    The limits of their means are about what is left, those of their scales stay. ``count``: Gaussians in the end.
     """
     splats, x = state.splats, state.x
     pixels_each = len(photos) * photos.height * photos.width / max(1, count)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmerge.fit.edges import cut_state
-from gsmerge.fit.fit_state import gaussians_of, start_state
+from gsmerge.fit.fit_state import FitState, gaussians_of, start_state
 from gsmerge.fit.growth import FAINT, drop_faint, grow_to
 from gsmerge.fit.report import TIME_SPENT, FitReport, FitResult
 from gsmerge.fit.schedule import CLEARS, CUTS, GROWTH, PROBE, FitRun, Schedule, affordable_steps, begins
@@ -22,6 +22,7 @@ from gsmerge.fit.survey import Survey, score_state, survey_photos
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.raster.metrics import decibels
+from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import Tuning
 from gsmerge.types import Gaussians
 
@@ -51,12 +52,8 @@ def fit_full(
             after, judged = score_state(state, run, half), True
             if after <= before:
                 break
-        if grows and begins((GROWTH,), last, part):
-            state = grow_to(state, half, job.count)
-        if grows and job.fixed is None and begins(CLEARS, last, part):
-            state = grow_to(state, half, job.count, FAINT) if options.fills else drop_faint(state, FAINT)
-        if grows and not options.beyond and begins(CUTS, last, part):
-            cut_state(state, half, job.count)
+        if grows and begins((*CLEARS, *CUTS, GROWTH), last, part):
+            state, tail = renew_state(state, run, half, last, part), TailMean()
         drawn = schedule.draw(step + 1, part, len(state.x))
         looks = 1 if begins((run.half_part,), last, part) else min(looks + 1, 10)  # anew with photos of full size
         error += (optimiser.step(state, drawn) - error) / looks
@@ -80,6 +77,21 @@ def fit_full(
     why = TIME_SPENT if options.time_budget is not None else "all steps done"
     fitted = gaussians_of(tail.of(state.x), state.splats.shN)
     return fitted, FitReport("full", True, step, before, after, why, optimiser.viewmats, origins=state.origins)
+
+
+def renew_state(state: FitState, run: FitRun, half: Photos, before: float, now: float) -> FitState:
+    """Grow a state, drop its faint Gaussians and cut it at the photos' edges, as is due between two parts of a run.
+
+    Rows and axes then mean others than before.
+    """
+    job, options = run.job, run.job.options
+    if begins((GROWTH,), before, now):
+        state = grow_to(state, half, job.count)
+    if job.fixed is None and begins(CLEARS, before, now):
+        state = grow_to(state, half, job.count, FAINT) if options.fills else drop_faint(state, FAINT)
+    if not options.beyond and begins(CUTS, before, now):
+        cut_state(state, half, job.count)
+    return state
 
 
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
 GROWTH = 0.5  # part of the run after which Gaussians are added
 # Parts of the run after which Gaussians are cut at the photos' edges: early, so that the photos are fitted without what
 # lies beyond, and until the mean of the last steps begins, as what is cut grows again
-CUTS = (0.0, 0.15, 0.3, 0.5, 0.65, 0.8)
+CUTS = (0.0, 0.15, 0.3, 0.5, 0.7)
 CLEARS = (0.6, 0.7, 0.8)  # and those after which faint Gaussians are dropped from runs that grow
 FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
 MANY_STEPS = 150

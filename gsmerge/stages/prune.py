@@ -19,7 +19,8 @@ from gsmerge.types import Cameras, Gaussians
 
 ROUNDING = 1 / (255 * math.sqrt(12))  # root mean square of what rounding to eight bits changes
 FIRST = 0.02  # largest blending weight below which Gaussians are left out in the first trial
-TRIALS, AIM, CLOSE = 4, 0.9, 0.75  # weights that are tried; shares of ROUNDING that are aimed at, and near enough
+TRIALS, AIM, CLOSE = 6, 0.9, 0.75  # weights that are tried; shares of ROUNDING that are aimed at, and near enough
+LESS = 0.8  # times a weight that is too large is the next one, at most
 COMPARED = 8  # views, at most, in which pictures with and without them are compared
 # Times a photo's pixel is one in which weights are found, and one of pictures that are compared. Their pixels are
 # samples of the photo's, as the low-pass stays, and thus have the same root mean square
@@ -61,14 +62,10 @@ def _least_weight(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> fl
 
     for _ in range(TRIALS):
         changed = measure_change(weight)
-        if changed > ROUNDING:
-            most = weight
-        else:
-            least = weight
-            if changed > CLOSE * ROUNDING:
-                break
+        least, most = (least, weight) if changed > ROUNDING else (weight, most)
         # what goes changes pictures about as the square of the limit
-        weight = min(1.0, 2 * weight, weight * math.sqrt(AIM * ROUNDING / max(changed, 1e-9)))
-        if not least < weight < most:
+        by = math.sqrt(AIM * ROUNDING / max(changed, 1e-9))
+        weight *= min(by, LESS) if changed > ROUNDING else min(by, 2.0)
+        if least and (changed > CLOSE * ROUNDING or not least < weight < most):
             break
     return least

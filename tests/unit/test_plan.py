@@ -281,8 +281,9 @@ def test_reports_say_what_was_settled(scene: Scene) -> None:
     assert (settled["match"], settled["checkpoint"]) == ("none", "none")
 
 
-SETTLED = [{}, {"budget": 200, "effort": "fast"}, {"budget": "30kB", "effort": "draft"}]
-OPEN = [  # merging across views decides how many there are, of at most as many
+SETTLED = [{"budget": 200, "effort": "fast"}, {"budget": "30kB", "fill": True, "effort": "draft"}]
+OPEN = [  # merging across views, and what photos show, decide how many there are, of at most as many
+    {}, {"budget": "30kB", "effort": "draft"},
     {"effort": "draft"}, {"effort": "fast", "k": 2}, {"superpixels": 40, "fit": "none"}, {"recipe": "paper"},
     {"blocks": 2, "effort": "draft"},
 ]  # fmt: skip
@@ -311,6 +312,7 @@ def test_the_estimate_is_what_the_run_does(
     count = len(result.gaussians)
     assert run["num_gaussians"] == count if settings in SETTLED else 0.5 * run["num_gaussians"] < count
     assert count <= run["num_gaussians"]
+    assert run["exact"] == (settings in SETTLED)
     for plan in plans:  # none of a scene in blocks
         assert (plan.limits, plan.decode, plan.match.match) == (choices.limits, choices.decode, choices.match)
         assert (plan.fit.fit, plan.fit.steps, plan.fit.share) == (choices.fit.fit, choices.fit.steps, choices.fit.share)
