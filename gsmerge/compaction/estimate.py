@@ -55,9 +55,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """Estimate size, time and memory of a run without running it.
 
     Returns:
-        ``num_gaussians``: the most that the result can have or, where ``psnr_kept`` or ``loss_kept`` is a
-        number, the fewest: more are taken until the result is so many dB from the input, or shows the photos at most so
-        much worse, or until ``quality`` is met; ``ratio`` to the input, ``bytes`` as a ``.ply``;
+        ``num_gaussians``: the most that the result can have, its number if ``exact``, or, where ``psnr_kept`` or
+        ``loss_kept`` is a number, the fewest: more are taken until the result is so many dB from the input, or shows
+        the photos at most so much worse, or until ``quality`` is met; ``ratio`` to the input, ``bytes`` as a ``.ply``;
         ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where neighbours are
         merged), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
         ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
