@@ -1,6 +1,6 @@
-"""Edges of the photos, at which a fit cuts its Gaussians: no photo says how far they reach beyond.
+"""Edges of the views, at which a fit cuts its Gaussians: nothing says how far they reach beyond.
 
-What crosses the edges of all photos hangs around the scene as a soft rim, and as clouds, for whoever steps back.
+What crosses the edges of all views hangs around the scene as a soft rim, and as clouds, for whoever steps back.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from gsmerge.kernels.gaussians.edges import cut_at_edges
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
 from gsmerge.kernels.matrices import matmul
 from gsmerge.pooling import principal_axes
-from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras
 
 # Distances from one Gaussian to the next by which the edges are moved out, if the Gaussians of the result were spread
 # evenly over all photos: border pixels show those that are centred beside them, too
@@ -28,34 +28,34 @@ ROWS = 16384  # Gaussians per piece of work
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Planes through the cameras of v photos and the four edges of each, moved out."""
+    """Planes through the cameras of v views and the four edges of each, moved out."""
 
     normals: np.ndarray  # [v,4,3] outward, of unit length
     offsets: np.ndarray  # [v,4] points x inside have normal @ x <= offset
 
 
-def photo_edges(photos: Photos, margin: float) -> Edges:
-    """Return the edges of photos, moved out by a ``margin`` in pixels."""
-    focals, middles, size = photos.Ks[:, [0, 1], [0, 1]], photos.Ks[:, :2, 2], np.array([photos.width, photos.height])
+def find_edges(cameras: Cameras, count: int) -> Edges:
+    """Return the edges of the pictures of cameras, moved out by ``MARGIN`` for a result of ``count`` Gaussians."""
+    size, num = np.array([cameras.width, cameras.height]), len(cameras)
+    margin = MARGIN * math.sqrt(num * cameras.width * cameras.height / max(1, count))
+    Ks, viewmats = cameras.Ks.astype(np.float64), cameras.viewmats.astype(np.float64)
+    focals, middles = Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2]
     left, top = ((-margin - middles) / focals).T
     right, bottom = ((size + margin - middles) / focals).T
-    zero, one = np.zeros(len(photos)), np.ones(len(photos))
+    zero, one = np.zeros(num), np.ones(num)
     sides = (-one, zero, left), (one, zero, -right), (zero, -one, top), (zero, one, -bottom)
     seen = np.stack([np.stack(side, 1) for side in sides], 1)  # by the camera
     seen /= np.sqrt((seen**2).sum(2, keepdims=True))
-    viewmats = photos.viewmats.astype(np.float64)
     normals = np.stack([matmul(some, viewmat[:3, :3]) for some, viewmat in zip(seen, viewmats, strict=True)])
     return Edges(normals, (normals * camera_centres(viewmats)[:, None]).sum(2))
 
 
-def cut_state(state: FitState, photos: Photos, count: int) -> None:
-    """Cut the Gaussians of a state at the edges of photos, in place, except those that are fixed.
+def cut_state(state: FitState, edges: Edges) -> None:
+    """Cut the Gaussians of a state at the edges of all views, in place, except those that are fixed.
 
-    The limits of their means are about what is left, those of their scales stay. ``count``: Gaussians in the end.
+    The limits of their means are about what is left, those of their scales stay.
     """
     splats, x = state.splats, state.x
-    pixels_each = len(photos) * photos.height * photos.width / max(1, count)
-    edges = photo_edges(photos, MARGIN * math.sqrt(pixels_each))
     means, covars, is_cut = splats.means.copy(), np.empty((len(x), 3, 3)), np.zeros(len(x), np.uint8)
 
     def cut(first: int) -> None:

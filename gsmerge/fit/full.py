@@ -80,7 +80,7 @@ def fit_full(
 
 
 def renew_state(state: FitState, run: FitRun, half: Photos, before: float, now: float) -> FitState:
-    """Grow a state, drop its faint Gaussians and cut it at the photos' edges, as is due between two parts of a run.
+    """Grow a state, drop its faint Gaussians and cut it at the views' edges, as is due between two parts of a run.
 
     Rows and axes then mean others than before.
     """
@@ -89,8 +89,8 @@ def renew_state(state: FitState, run: FitRun, half: Photos, before: float, now: 
         state = grow_to(state, half, job.count)
     if job.fixed is None and begins(CLEARS, before, now):
         state = grow_to(state, half, job.count, FAINT) if options.fills else drop_faint(state, FAINT)
-    if not options.beyond and begins(CUTS, before, now):
-        cut_state(state, half, job.count)
+    if job.edges is not None and begins(CUTS, before, now):
+        cut_state(state, job.edges)
     return state
 
 

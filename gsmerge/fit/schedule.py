@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.fit.edges import Edges
 from gsmerge.fit.outside import Outside
 from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weights
 from gsmerge.kernels.elementary import power
@@ -14,7 +15,7 @@ from gsmerge.raster.photos import WHOLE_PHOTO, Photos, Sample
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
 
 GROWTH = 0.5  # part of the run after which Gaussians are added
-# Parts of the run after which Gaussians are cut at the photos' edges: early, so that the photos are fitted without what
+# Parts of the run after which Gaussians are cut at the views' edges: early, so that the photos are fitted without what
 # lies beyond, and until the mean of the last steps begins, as what is cut grows again
 CUTS = (0.0, 0.15, 0.3, 0.5, 0.7)
 CLEARS = (0.6, 0.7, 0.8)  # and those after which faint Gaussians are dropped from runs that grow
@@ -59,6 +60,7 @@ class FitJob:
     # Where renders stand for photos, how many of them, the first ones, a result has to show better; None: photos, all
     num_judged: int | None = None
     outside: Outside | None = None  # Views in which some steps clear fog and veils; None: none
+    edges: Edges | None = None  # At which Gaussians are cut; None: they may reach anywhere
 
     def judges(self, size: int) -> Photos:
         """Return the photos that a result has to show better, at a size as of :class:`DrawMode`."""

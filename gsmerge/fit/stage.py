@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.fit.edges import find_edges
 from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.growth import grow_to
@@ -48,7 +49,9 @@ def fit_scene(
         if decoded.exact and not options.grows:  # then nothing is left out either
             options = replace(options, min_contribution=0.0)
         job = FitJob(photos, options, decoded.count, seed, report_steps, decoded.fixed, num_judged)
-        job = replace(job, outside=look_outside(scene, decoded.gaussians, job.judges(1), options))
+        outside = look_outside(scene, decoded.gaussians, job.judges(1), options)
+        edges = None if options.beyond else find_edges(scene.cameras, decoded.count)
+        job = replace(job, outside=outside, edges=edges)
         gaussians, report = fit(decoded.gaussians, job)
         record_fit(report, options.steps)
     cameras = scene.cameras

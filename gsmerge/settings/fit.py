@@ -99,7 +99,7 @@ class FitOptions(Settings):
         "start has seen them.", internal=True)  # fmt: skip
     move_cameras: bool = setting(False, "Whether the full fit moves the cameras on; a plan decides it by `poses`.",
         internal=True)  # fmt: skip
-    beyond: bool = setting(False, "Whether Gaussians may reach beyond the photos; a plan decides it by `extent`.",
+    beyond: bool = setting(False, "Whether Gaussians may reach beyond all views; a plan decides it by `extent`.",
         internal=True)  # fmt: skip
     fills: bool = setting(False, "Whether others take the places of Gaussians that nobody sees; a plan decides it by "
         "`budget`.", internal=True)  # fmt: skip

@@ -34,8 +34,8 @@ from gsmerge.runtime.record import record_run
 from gsmerge.settings.fit import Tuning
 
 Pair = tuple[Photos, Photos]
-QUICK = FitOptions(fit_steps=30, holdout=0.2, beyond=True, fills=True)
-LONG = FitOptions(fit_steps=160, holdout=0.2, beyond=True, fills=True)
+QUICK = FitOptions(fit_steps=30, holdout=0.2, fills=True)
+LONG = FitOptions(fit_steps=160, holdout=0.2, fills=True)
 
 
 # what it reaches
