@@ -40,13 +40,15 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     if decoded.kept and (plan.fit.fit == "none" or prepared.reference.name == RENDERS):  # whose pictures they show
         return Fitted(decoded.gaussians, prepared.scene.cameras, None)
     fitted = fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
-    return finish(fitted, prepared, plan) if plan.fit.min_contribution > 0 else fitted
+    most = decoded.count if plan.fit.grows else len(decoded.gaussians)
+    return finish(fitted, prepared, plan, most) if plan.fit.min_contribution > 0 else fitted
 
 
-def finish(fitted: Fitted, prepared: Prepared, plan: Plan) -> Fitted:
+def finish(fitted: Fitted, prepared: Prepared, plan: Plan, most: int) -> Fitted:
     """Leave out the Gaussians that nobody sees, and fill what lies between the views with others in their places.
 
-    It is filled after a long fit that was accepted, and where all that the views show is wanted.
+    It is filled after a long fit that was accepted, and where all that the views show is wanted. ``most``: Gaussians
+    that there could be.
     """
     seen, unseen = split_unseen(fitted.gaussians, fitted.cameras)
     is_long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
@@ -56,8 +58,9 @@ def finish(fitted: Fitted, prepared: Prepared, plan: Plan) -> Fitted:
         others = fill_between(seen, fitted.cameras, fitted.outside, len(unseen), beyond=plan.fit.beyond)
     if plan.fit.fills:
         others = Gaussians.concat([unseen[: len(unseen) - len(others)], others])
-    choose(pruned=len(fitted.gaussians) - len(seen) - (len(others) if plan.fit.fills else 0))
-    return replace(fitted, gaussians=Gaussians.concat([seen, others]))
+    written = Gaussians.concat([seen, others])
+    choose(pruned=max(0, most - len(written)))
+    return replace(fitted, gaussians=written)
 
 
 def build_from_pairs(prepared: Prepared, plan: Plan, count: int) -> Fitted:

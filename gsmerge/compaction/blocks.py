@@ -102,6 +102,8 @@ def compact_in_blocks(
             joined = Gaussians.concat([part.gaussians for part in parts])
             owners = np.repeat(np.arange(count), [len(part.gaussians) for part in parts])
             growth = sum(part.count for part in parts) / max(1, len(joined))
+            if most is not None and options.budget.is_filled:  # what views of other blocks show better is left to them
+                growth = max(growth, SURPLUS * most / max(1, len(joined)))
         everything = work.share((joined, owners))
         fitted = list(adopt_records(work.run("fit", fit_part, count, each_part(parts, everything, growth))))
         joined = Gaussians.concat([gaussians for gaussians, _ in fitted])
@@ -112,7 +114,9 @@ def compact_in_blocks(
         result = frame.leave(joined)
         if most is not None and most < len(result):
             result = faintest_dropped(result, most)
-        if asked := file_size(options.budget):
+        if most is not None and options.budget.is_filled and len(result) < most:
+            note(f"budget: {most:,} Gaussians were asked for, {len(result):,} are left of those of all blocks")
+        if (asked := file_size(options.budget)) and asked.packed:
             page = asked.num_bytes, asked.file, scene.cameras
             result = drop_to_bytes(result, *page, measure_rest(result, *page))
         everything = work.share(result)
@@ -255,8 +259,8 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[BlockStart]
 def prune_joined(joined: Gaussians, cameras: Cameras, options: CompactOptions, most: int | None) -> Gaussians:
     """Leave out the Gaussians of all blocks that none of all ``cameras`` shows, unless ``most`` have to be written."""
     seen, unseen = split_unseen(joined, cameras)
-    room = most - len(seen) if most is not None and options.budget.is_filled else 0
-    unseen = unseen[: max(0, room)]
+    room = len(unseen) if most is None else most - len(seen)
+    unseen = unseen[: max(0, room) if options.budget.is_filled else 0]
     choose(pruned=len(joined) - len(seen) - len(unseen))
     return Gaussians.concat([seen, unseen])
 

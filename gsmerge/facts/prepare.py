@@ -165,7 +165,7 @@ def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
     shown = np.zeros(scene.images.shape[:3], bool)
     by_rows = prepared.reference.name == ROW_COLORS  # the gaps in their pictures have the colours beside
     shown[list(views)] = True if by_rows or scene.masks is None else scene.masks[list(views)]
-    filled = fill_holes(scene, shown, everywhere=options.extent != "auto")
+    filled = fill_holes(scene, shown, everywhere=options.extent == "photos")
     reference = prepared.reference
     if filled.empty is not None and filled.masks is not None:
         seen = tuple(view for view in views if filled.masks[view].any())

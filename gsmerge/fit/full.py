@@ -87,7 +87,7 @@ def renew_state(state: FitState, run: FitRun, half: Photos, before: float, now: 
     job, options = run.job, run.job.options
     if begins((GROWTH,), before, now):
         state = grow_to(state, half, job.count)
-    if job.fixed is None and begins(CLEARS, before, now):
+    if job.fixed is None and options.min_contribution > 0 and begins(CLEARS, before, now):
         state = grow_to(state, half, job.count, FAINT) if options.fills else drop_faint(state, FAINT)
     if job.edges is not None and begins(CUTS, before, now):
         cut_state(state, job.edges)

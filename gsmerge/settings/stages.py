@@ -48,9 +48,9 @@ class PrepareOptions(Settings):
         "others.")  # fmt: skip
     look: Look = setting("auto", "Whose colours count: auto: those of the photos, but its own of a scene with another "
         "look; scene: its own; photos: theirs as they are.")  # fmt: skip
-    extent: Extent = setting("auto", "Where the result may show more than the scene: auto: nowhere beyond the photos, "
-        "nor in large parts of them where the scene shows nothing, as one that was cut out or has no sky; photos: "
-        "everywhere in them; beyond: beside them, too.")  # fmt: skip
+    extent: Extent = setting("auto", "Where the result may show more than the scene: auto: nowhere; photos: in large "
+        "parts of the photos where the scene shows nothing, as one that was cut out or has no sky; beyond: beside the "
+        "photos, after a long fit.")  # fmt: skip
 
 
 @dataclass(frozen=True)
