@@ -39,7 +39,7 @@ LINE = 120  # characters of a line of the page
 WATCHED = {
     "gsmerge.scene.read": ("align",),
     "gsmerge.compaction.compact": ("make_plan", "make_result"),
-    "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene", "fill"),
+    "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene", "finish"),
 }
 ZOOM, STRIP, GAP = 4, 22, 6  # of the picture: its pixels for each of a photo, for a title, between panels
 DARK, BORDER = 0.45, (255, 255, 255)  # how much of the photo is left under ellipses; colours are RGB
@@ -121,6 +121,13 @@ class Run:
     def fitted(self) -> np.ndarray:
         """The Gaussians of the result that come from it."""
         return np.flatnonzero(self.made["fit_scene"].report.origins == self.merged)
+
+    @property
+    def written(self) -> int:
+        """The first of these in the result: others are left out."""
+        means = self.made["fit_scene"].gaussians.means[self.fitted]
+        of_result = [mean.tobytes() for mean in self.made["finish"].gaussians.means]
+        return next(of_result.index(mean.tobytes()) for mean in means if mean.tobytes() in of_result)
 
 
 def holder(features: Any) -> int:
@@ -339,9 +346,9 @@ def build_section(run: Run) -> str:
     size = int(np.diff(features.starts)[at])
     own = np.flatnonzero(matches.clusters == matches.clusters[at])
     faint = int((features.gains < 1).sum())
-    report, filled = fitted.report, made["fill"]
-    before = {mean.tobytes() for mean in fitted.gaussians.means}
-    replaced = [row for row, mean in enumerate(filled.gaussians.means) if mean.tobytes() not in before]
+    report, written = fitted.report, made["finish"].gaussians
+    before, after = ({mean.tobytes() for mean in some.means} for some in (fitted.gaussians, written))
+    others = [row for row, mean in enumerate(written.means) if mean.tobytes() not in before]
     return "\n\n".join([
         "## 4. build: the arrows",
         text(
@@ -358,7 +365,7 @@ def build_section(run: Run) -> str:
             entry("merge: features.means", merged.means, run.merged),
             entry("decode_merged: gaussians.scales", decoded.gaussians.scales, run.merged, 4),
             entry("fit_scene: gaussians.scales", fitted.gaussians.scales, children[0], 4),
-            *[entry("fill: gaussians.means", filled.gaussians.means, row) + " (a new one)" for row in replaced[:1]],
+            *[entry("finish: gaussians.means", written.means, row) + " (a new one)" for row in others[:1]],
         ]),
         text(
             "**Superpixels** follow colour borders in the photo, because a Gaussian has one colour.",
@@ -384,8 +391,8 @@ def build_section(run: Run) -> str:
         ),
         text(
             "**`fit_scene`** compares renders with the photos and changes all parameters. Half way it splits the",
-            f"Gaussians with the largest errors, until there are {len(fitted.gaussians):,}; of the pixel's Gaussian",
-            f"{len(children)} are made. Patches of photos stay out of the first steps, on a quarter of",
+            f"Gaussians with the largest errors, and drops those that fade: {len(fitted.gaussians):,} are left, of the",
+            f"pixel's Gaussian {len(children)}. Patches of photos stay out of the first steps, on a quarter of",
             "pixels, as a test:",
             f"their PSNR rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
             say(
@@ -394,7 +401,8 @@ def build_section(run: Run) -> str:
             ),
         ),
         text(
-            f"**`fill`** moves faint Gaussians, here {len(replaced)}, to where cameras between photos see nothing.",
+            f"**`finish`** leaves out {len(before - after)} Gaussians that no photo shows, and puts {len(others)}",
+            "others where cameras between photos see nothing.",
         ),
     ])  # fmt: skip
 
@@ -402,7 +410,7 @@ def build_section(run: Run) -> str:
 def result_section(run: Run) -> str:
     """Say what comes out, and how good it is."""
     result, new = run.result, run.result.report.new_views
-    gaussians, report, child = result.gaussians, result.report, run.fitted[0]
+    gaussians, report, child = result.gaussians, result.report, run.written
     return "\n\n".join([
         "## 5. make_result: what comes out",
         text(

@@ -1,4 +1,4 @@
-"""The arrows: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> filled."""
+"""The arrows: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> pruned -> filled."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from gsmerge.stages.fill import fill_between
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge
 from gsmerge.stages.pair_merge import POWERS, merge_neighbors
+from gsmerge.stages.prune import split_unseen
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded, Gaussians
 
@@ -36,19 +37,30 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     if plan.merges_pairs:
         return build_from_pairs(prepared, plan, plan.limits.default if count is None else count)
     decoded = start(prepared, plan, count)
-    if decoded.kept and prepared.reference.name == RENDERS:  # they show these pictures as they are
+    if decoded.kept and (plan.fit.fit == "none" or prepared.reference.name == RENDERS):  # whose pictures they show
         return Fitted(decoded.gaussians, prepared.scene.cameras, None)
     fitted = fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
-    return fill(fitted, prepared, plan)
+    most = decoded.count if plan.fit.grows else len(decoded.gaussians)
+    return finish(fitted, prepared, plan, most) if plan.fit.min_contribution > 0 else fitted
 
 
-def fill(fitted: Fitted, prepared: Prepared, plan: Plan) -> Fitted:
-    """Fill what lies between the views, after a long fit that was accepted and where all that they show is wanted."""
+def finish(fitted: Fitted, prepared: Prepared, plan: Plan, most: int) -> Fitted:
+    """Leave out the Gaussians that nobody sees, and fill what lies between the views with others in their places.
+
+    It is filled after a long fit that was accepted, and where all that the views show is wanted. ``most``: Gaussians
+    that there could be.
+    """
+    seen, unseen = split_unseen(fitted.gaussians, fitted.cameras)
     is_long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
     is_whole = prepared.scene.empty is None and prepared.reference.of_views  # what placed views see is all there is
-    if not (is_long and is_whole):
-        return fitted
-    return replace(fitted, gaussians=fill_between(fitted.gaussians, fitted.cameras, fitted.outside))
+    others = seen[:0]
+    if is_long and is_whole:
+        others = fill_between(seen, fitted.cameras, fitted.outside, len(unseen), beyond=plan.fit.beyond)
+    if plan.fit.fills:
+        others = Gaussians.concat([unseen[: len(unseen) - len(others)], others])
+    written = Gaussians.concat([seen, others])
+    choose(pruned=max(0, most - len(written)))
+    return replace(fitted, gaussians=written)
 
 
 def build_from_pairs(prepared: Prepared, plan: Plan, count: int) -> Fitted:

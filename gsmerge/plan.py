@@ -513,9 +513,10 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
 
 
 def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
-    """Fill in the size of the photos for the fit, and whether it moves cameras."""
+    """Fill in the size of the photos for the fit, and whether it moves cameras, and what it may write."""
     scene = prepared.scene
-    if not fit.needs_photos:
+    fit = replace(fit, beyond=options.prepare.extent == "beyond", fills=options.budget.is_filled)
+    if fit.fit == "none":
         return replace(fit, photo_scale=1.0)
     scale, problem = photo_scale(scene, fit, auto=EFFORTS[options.effort].large_photos)
     if problem is not None:
@@ -528,13 +529,13 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) ->
 def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
     """Fill in small steps for a fit to renders: these show no more than the merged Gaussians are made of.
 
-    Nothing is there to judge it by, and strokes of the input are wanted.
+    Nothing is there to judge it by, and strokes of the input are wanted. What lies beyond these views is of the scene.
     """
     placed = prepared.reference.placed
     if placed and fit.fit == "none" != options.fit.fit:
         note(NO_FIT)
     tuning = replace(fit.tuning.scaled(PLACED_STEPS if placed else RENDERS_STEPS), max_ratio=math.inf)
-    return replace(fit, judged=False, tuning=tuning)
+    return replace(fit, judged=False, beyond=True, tuning=tuning)
 
 
 def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:

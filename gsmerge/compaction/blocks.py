@@ -44,7 +44,8 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import piece_settings
 from gsmerge.settings.stages import AUTO_SHARE
 from gsmerge.stages.clean import faintest_dropped
-from gsmerge.types import Decoded, Gaussians, PicturedScene, Scene, SceneT
+from gsmerge.stages.prune import split_unseen
+from gsmerge.types import Cameras, Decoded, Gaussians, PicturedScene, Scene, SceneT
 
 T = TypeVar("T")
 # of a result on a block: PSNR (dB), and what is measured besides
@@ -101,14 +102,21 @@ def compact_in_blocks(
             joined = Gaussians.concat([part.gaussians for part in parts])
             owners = np.repeat(np.arange(count), [len(part.gaussians) for part in parts])
             growth = sum(part.count for part in parts) / max(1, len(joined))
+            if most is not None and options.budget.is_filled:  # what views of other blocks show better is left to them
+                growth = max(growth, SURPLUS * most / max(1, len(joined)))
         everything = work.share((joined, owners))
         fitted = list(adopt_records(work.run("fit", fit_part, count, each_part(parts, everything, growth))))
         joined = Gaussians.concat([gaussians for gaussians, _ in fitted])
         owners = np.repeat(np.arange(count), [len(gaussians) for gaussians, _ in fitted])
-        result = frame.leave(fit_seams(joined, owners, parts, options.seed))
+        joined = fit_seams(joined, owners, parts, options.seed)
+        if choices.fit.min_contribution > 0:
+            joined = prune_joined(joined, frame.enter_cameras(scene.cameras), options, most)
+        result = frame.leave(joined)
         if most is not None and most < len(result):
             result = faintest_dropped(result, most)
-        if asked := file_size(options.budget):
+        if most is not None and options.budget.is_filled and len(result) < most:
+            note(f"budget: {most:,} Gaussians were asked for, {len(result):,} are left of those of all blocks")
+        if (asked := file_size(options.budget)) and asked.packed:
             page = asked.num_bytes, asked.file, scene.cameras
             result = drop_to_bytes(result, *page, measure_rest(result, *page))
         everything = work.share(result)
@@ -234,7 +242,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[BlockStart]
     looks = SEAM_LOOKS if at_seam.mean() < MOSTLY_SEAMS else ROOM_LOOKS
     options = replace(
         plan.fit, fit_steps=max(SEAM_STEPS, looks * len(scene)), photo_scale=1.0, judged=False, dropout=0.0,
-        half_res_share=0.0, min_contribution=0.0, tuning=tuning,
+        half_res_share=0.0, min_contribution=0.0, beyond=True, tuning=tuning,
     )  # fmt: skip
     decoded = Decoded(joined[rows], len(rows), exact=True, fixed=~at_seam[rows])
     with record_part(title="seams") as record:
@@ -246,6 +254,15 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[BlockStart]
     for name, column in columns.items():
         column[rows[moved]] = getattr(fitted.gaussians, name)[moved]
     return Gaussians(**columns)
+
+
+def prune_joined(joined: Gaussians, cameras: Cameras, options: CompactOptions, most: int | None) -> Gaussians:
+    """Leave out the Gaussians of all blocks that none of all ``cameras`` shows, unless ``most`` have to be written."""
+    seen, unseen = split_unseen(joined, cameras)
+    room = len(unseen) if most is None else most - len(seen)
+    unseen = unseen[: max(0, room) if options.budget.is_filled else 0]
+    choose(pruned=len(joined) - len(seen) - len(unseen))
+    return Gaussians.concat([seen, unseen])
 
 
 def find_seams(

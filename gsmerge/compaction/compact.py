@@ -62,9 +62,9 @@ def compact(
     Doubts are warned of as :class:`gsmerge.DoubtWarning`, notes go to the logger ``gsmerge``.
 
     Example:
-        >>> result = gsmerge.compact("demo", effort="draft", budget="5%")
+        >>> result = gsmerge.compact("demo", effort="draft", budget=400)
         >>> len(result.gaussians)
-        384
+        400
     """
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):

@@ -55,9 +55,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """Estimate size, time and memory of a run without running it.
 
     Returns:
-        ``num_gaussians``: the most that the result can have or, where ``psnr_kept`` or ``loss_kept`` is a
-        number, the fewest: more are taken until the result is so many dB from the input, or shows the photos at most so
-        much worse, or until ``quality`` is met; ``ratio`` to the input, ``bytes`` as a ``.ply``;
+        ``num_gaussians``: the most that the result can have, its number if ``exact``, or, where ``psnr_kept`` or
+        ``loss_kept`` is a number, the fewest: more are taken until the result is so many dB from the input, or shows
+        the photos at most so much worse, or until ``quality`` is met; ``ratio`` to the input, ``bytes`` as a ``.ply``;
         ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where neighbours are
         merged), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
         ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
@@ -89,6 +89,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,
+        "exact": options.budget.is_filled,
         "psnr_kept": KEPT_PSNR if choices.keeps_input and size.rendered else None,
         "quality": options.budget.quality,
         "loss_kept": KEPT_LOSS if choices.keeps_input and not size.rendered else None,
@@ -129,7 +130,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     if per_view == 0:
         method = "neighbours merged pair by pair, because no photo shows them"
     count, kept = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %)", run["psnr_kept"]
-    number = count if per_view is None else f"at most {count}"
+    number = count if run["exact"] else f"at most {count}"
     if kept is not None:
         number = f"{count}, or more until {kept:g} dB from the input are kept"
     if run["quality"] is not None:

@@ -57,9 +57,10 @@ class CompactReport:
         new_views: What new views are expected to have, from photos that a short fit left out; None with fewer than four
             photos, in drafts, and in blocks.
         psnr_after: The same from the result; where a file is written and rounds positions visibly, from the file.
-        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit). Where there are no photos
-            and the rows belong to no pixels, ``fidelity`` is the ``psnr`` (dB) against renders of the input, in so many
-            ``views``: of the scene, or ``held_out`` ones that were placed for lack of cameras.
+        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit), and ``pruned``: how many
+            Gaussians were left out because no photo shows them. Where there are no photos and the rows belong to no
+            pixels, ``fidelity`` is the ``psnr`` (dB) against renders of the input, in so many ``views``: of the scene,
+            or ``held_out`` ones that were placed for lack of cameras.
         notes: Warnings about the input and adaptations to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
@@ -238,6 +239,8 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     judged = document["choices"].get("fidelity")
     if judged:
         rows += [("PSNR", "", f"{judged['psnr']:.1f} dB", _judged_by(judged))]
+    if pruned := document["choices"].get("pruned"):
+        rows += [("left out", "", f"{pruned:,}", "Gaussians that no photo shows")]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]
@@ -300,9 +303,11 @@ def summary_line(document: Mapping[str, Any]) -> str:
         quality += f", {files['before']:.2f} -> {files['after']:.2f} dB on the photos as their files have them"
     if protected := document.get("psnr_protected"):
         quality += f", {protected['before']:.2f} -> {protected['after']:.2f} dB where they are protected"
+    ratio, pruned = human_share(document["ratio"]), document["choices"].get("pruned")
+    share = f"{ratio}; {pruned:,} that no photo shows are left out" if pruned else ratio
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
-        f" ({human_share(document['ratio'])}), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
+        f" ({share}), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
         f"{quality}; {seconds_line(document)}{cameras}"
     )
 

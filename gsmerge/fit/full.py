@@ -12,15 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.fit.fit_state import gaussians_of, start_state
-from gsmerge.fit.growth import grow_to
+from gsmerge.fit.edges import cut_state
+from gsmerge.fit.fit_state import FitState, gaussians_of, start_state
+from gsmerge.fit.growth import FAINT, drop_faint, grow_to
 from gsmerge.fit.report import TIME_SPENT, FitReport, FitResult
-from gsmerge.fit.schedule import GROWTH, PROBE, FitRun, Schedule, affordable_steps
+from gsmerge.fit.schedule import CLEARS, CUTS, GROWTH, PROBE, FitRun, Schedule, affordable_steps, begins
 from gsmerge.fit.steps import make_optimiser
 from gsmerge.fit.survey import Survey, score_state, survey_photos
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.raster.metrics import decibels
+from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import Tuning
 from gsmerge.types import Gaussians
 
@@ -42,7 +44,7 @@ def fit_full(
     state.box_shares[:], state.min_sizes[:] = limit_moves(survey, options.tuning)
     half, judged = optimiser.photos[1], not options.judged
     before = after = survey.score
-    step, steps, error, grows, looks = 0, options.steps, 0.0, options.grows, 0
+    step, steps, last, error, grows, looks = 0, options.steps, -1.0, 0.0, options.grows, 0
     started = time.perf_counter()
     while step < steps:
         part = step / steps
@@ -50,12 +52,12 @@ def fit_full(
             after, judged = score_state(state, run, half), True
             if after <= before:
                 break
-        if grows and part >= GROWTH and len(state.x) < job.count:
-            state = grow_to(state, half, job.count)
+        if grows and begins((*CLEARS, *CUTS, GROWTH), last, part):
+            state, tail = renew_state(state, run, half, last, part), TailMean()
         drawn = schedule.draw(step + 1, part, len(state.x))
-        looks = 1 if part >= run.half_part > (step - 1) / steps else min(looks + 1, 10)  # anew with photos of full size
+        looks = 1 if begins((run.half_part,), last, part) else min(looks + 1, 10)  # anew with photos of full size
         error += (optimiser.step(state, drawn) - error) / looks
-        step += 1
+        step, last = step + 1, part
         outside_view = run.outside_view(step, part)
         if outside_view is not None:
             optimiser.clear_veils(state, drawn, outside_view)
@@ -70,11 +72,26 @@ def fit_full(
     if options.judged and after <= before:
         why = f"held-out patches of the photos were no better after {step} steps"
         return gaussians, FitReport("none", False, step, before, after, why, origins=np.arange(len(gaussians)))
-    if grows and len(state.x) < job.count:  # a time budget may end before the growth
+    if grows and last < GROWTH:  # a time budget may end before the growth
         state = grow_to(state, half, job.count)
     why = TIME_SPENT if options.time_budget is not None else "all steps done"
     fitted = gaussians_of(tail.of(state.x), state.splats.shN)
     return fitted, FitReport("full", True, step, before, after, why, optimiser.viewmats, origins=state.origins)
+
+
+def renew_state(state: FitState, run: FitRun, half: Photos, before: float, now: float) -> FitState:
+    """Grow a state, drop its faint Gaussians and cut it at the views' edges, as is due between two parts of a run.
+
+    Rows and axes then mean others than before.
+    """
+    job, options = run.job, run.job.options
+    if begins((GROWTH,), before, now):
+        state = grow_to(state, half, job.count)
+    if job.fixed is None and options.min_contribution > 0 and begins(CLEARS, before, now):
+        state = grow_to(state, half, job.count, FAINT) if options.fills else drop_faint(state, FAINT)
+    if job.edges is not None and begins(CUTS, before, now):
+        cut_state(state, job.edges)
+    return state
 
 
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:

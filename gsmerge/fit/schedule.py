@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.fit.edges import Edges
 from gsmerge.fit.outside import Outside
 from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weights
 from gsmerge.kernels.elementary import power
@@ -14,6 +15,10 @@ from gsmerge.raster.photos import WHOLE_PHOTO, Photos, Sample
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
 
 GROWTH = 0.5  # part of the run after which Gaussians are added
+# Parts of the run after which Gaussians are cut at the views' edges: early, so that the photos are fitted without what
+# lies beyond, and until the mean of the last steps begins, as what is cut grows again
+CUTS = (0.0, 0.15, 0.3, 0.5, 0.7)
+CLEARS = (0.6, 0.7, 0.8)  # and those after which faint Gaussians are dropped from runs that grow
 FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
 MANY_STEPS = 150
 # The first steps draw a sample of each photo's pixels, another one each time that they come back to it. It costs as
@@ -55,6 +60,7 @@ class FitJob:
     # Where renders stand for photos, how many of them, the first ones, a result has to show better; None: photos, all
     num_judged: int | None = None
     outside: Outside | None = None  # Views in which some steps clear fog and veils; None: none
+    edges: Edges | None = None  # At which Gaussians are cut; None: they may reach anywhere
 
     def judges(self, size: int) -> Photos:
         """Return the photos that a result has to show better, at a size as of :class:`DrawMode`."""
@@ -120,6 +126,11 @@ class FitRun:
         if not self.job.options.grows or (len(photos) > 2 and step % 3):
             size = 0
         return DrawMode(size, share * photos[0].eps2d, antialiased)
+
+
+def begins(parts: Sequence[float], before: float, now: float) -> bool:
+    """Return whether one of the ``parts`` of a run begins after the part ``before``, and not after ``now``."""
+    return any(before < part <= now for part in parts)
 
 
 def prepare_fit(job: FitJob) -> FitRun:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.fit.edges import find_edges
 from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.growth import grow_to
@@ -14,7 +15,7 @@ from gsmerge.fit.outside import look_outside, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob, prepare_fit
-from gsmerge.fit.survey import photo_error, survey_photos, visible_mask
+from gsmerge.fit.survey import photo_error, survey_photos
 from gsmerge.raster import make_splats
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.record import choose, stage
@@ -40,7 +41,7 @@ def fit_scene(
     ``num_judged``: where renders stand for photos, how many of the views, the first ones, the result has to show
     better; None: photos, all.
     """
-    if not options.needs_photos:
+    if options.fit == "none":
         return Fitted(decoded.gaussians, scene.cameras, None)
     with stage("fit"):
         photos = fit_photos(scene, options, views)
@@ -48,37 +49,33 @@ def fit_scene(
         if decoded.exact and not options.grows:  # then nothing is left out either
             options = replace(options, min_contribution=0.0)
         job = FitJob(photos, options, decoded.count, seed, report_steps, decoded.fixed, num_judged)
-        if options.fit != "none":
-            job = replace(job, outside=look_outside(scene, decoded.gaussians, job.judges(1), options))
+        outside = look_outside(scene, decoded.gaussians, job.judges(1), options)
+        edges = None if options.beyond else find_edges(scene.cameras, decoded.count)
+        job = replace(job, outside=outside, edges=edges)
         gaussians, report = fit(decoded.gaussians, job)
         record_fit(report, options.steps)
     cameras = scene.cameras
-    if report is not None and report.viewmats is not None:
+    if report.viewmats is not None:
         viewmats = cameras.viewmats.astype(np.float64)
         viewmats[list(views)] = report.viewmats
         cameras = replace(cameras, viewmats=viewmats)
     return Fitted(gaussians, cameras, report, job.outside)
 
 
-def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
+def fit(gaussians: Gaussians, job: FitJob) -> FitResult:
     """Drop Gaussians that no photo shows, and fit the rest to the photos.
 
-    If the full fit does not improve held-out patches of the photos, the colour fit is tried. If the options need no
-    photos, as in drafts without a fit, all Gaussians are returned and the report is None.
+    If the full fit does not improve held-out patches of the photos, the colour fit is tried.
     """
-    if not job.options.needs_photos:  # it costs as much as all that was done before
-        return gaussians, None
     fitted, report = _choose_fit(gaussians, job)
-    if report is not None and job.outside is not None:
+    if job.outside is not None:
         report = replace(report, fog=score_fog(make_splats(fitted), job.outside))
     return fitted, report
 
 
-def _choose_fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
+def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
     """Run :func:`fit` on a job with its views from outside."""
     options = job.options
-    if options.fit == "none":  # as a state does, which has no photos
-        return gaussians[visible_mask(gaussians, job.photos[1], options.min_contribution)], None
     run, judges = prepare_fit(job), job.judges(0)
     survey = survey_photos(gaussians, run)
     keep = survey.visible(options.min_contribution)

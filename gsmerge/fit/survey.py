@@ -94,12 +94,6 @@ def spread_views(count: int) -> list[int]:
     return sorted(range(count), key=lambda view: f"{view:032b}"[::-1])
 
 
-def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
-    """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or outside all frustums."""
-    peaks, inside = peak_weights(gaussians, photos)
-    return ~inside | (peaks >= min_weight)
-
-
 def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.ndarray]:
     """Return each Gaussian's largest blending weight ``[n]`` over photos, and whether it is in some frustum ``[n]``."""
     splats = make_splats(gaussians)

@@ -22,7 +22,7 @@ NAMED = 4  # items that a note lists
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 STAGES = (
     "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
-    "cover", "decode", "join", "fit", "fill", "score", "input",
+    "cover", "decode", "join", "fit", "prune", "fill", "score", "input",
 )  # fmt: skip
 
 

@@ -76,6 +76,11 @@ class BudgetOptions(Settings):
         return not self.fill and not self.auto and self.budget is not None and self.number is None
 
     @property
+    def is_filled(self) -> bool:
+        """Whether as many Gaussians are written as the budget names or allows, even where nobody sees them."""
+        return self.number is not None or self.fill
+
+    @property
     def number(self) -> int | None:
         """The number of Gaussians that the budget names; None where it is a share, a size, a device, or left out."""
         if self.budget is None or self.auto or self.in_bytes or self.budget in DEVICES or "%" in str(self.budget):

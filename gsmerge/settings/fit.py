@@ -92,12 +92,17 @@ class FitOptions(Settings):
         "Gaussians.", least=0, most=1)  # fmt: skip
     holdout: float = setting(0.05, "Share of the photos' patches that decides whether a fit is accepted.", above=0,
         below=1)  # fmt: skip
-    min_contribution: float = setting(1 / 255, "Least blending weight at some pixel of some photo; Gaussians below it "
-        "in all photos that they lie in are left out.", least=0, most=1)  # fmt: skip
+    min_contribution: float = setting(1 / 255, "Least blending weight at some pixel of some photo; a fit leaves out "
+        "Gaussians below it in all photos that they lie in. 0: all Gaussians are written, also those that change no "
+        "photo by more than rounding.", least=0, most=1)  # fmt: skip
     judged: bool = setting(True, "Whether the result has to show held-out patches better than its start; not where the "
         "start has seen them.", internal=True)  # fmt: skip
     move_cameras: bool = setting(False, "Whether the full fit moves the cameras on; a plan decides it by `poses`.",
         internal=True)  # fmt: skip
+    beyond: bool = setting(False, "Whether Gaussians may reach beyond all views; a plan decides it by `extent`.",
+        internal=True)  # fmt: skip
+    fills: bool = setting(False, "Whether others take the places of Gaussians that nobody sees; a plan decides it by "
+        "`budget`.", internal=True)  # fmt: skip
     share: float | None = setting(None, "Gaussians of the result for each pixel; a plan knows it.",
         "By default 0.044.", internal=True)  # fmt: skip
     tuning: Tuning = setting(Tuning(), "Constants.", internal=True)
@@ -117,11 +122,6 @@ class FitOptions(Settings):
         most = 0.5 if self.steps >= LONG_STEPS else 1.0  # details come last, and long runs have time for them
         share = 1.0 if self.share is None or not self.grows else self.share / USUAL_SHARE
         return min(most, 0.7 / math.sqrt(max(share, 1.0)))
-
-    @property
-    def needs_photos(self) -> bool:
-        """Whether photos are needed: to fit, or to drop Gaussians that none of them shows."""
-        return self.fit != "none" or self.min_contribution > 0
 
     @property
     def grows(self) -> bool:

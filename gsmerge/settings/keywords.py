@@ -12,7 +12,7 @@ class CompactKeywords(TypedDict, total=False):
     exposure: Literal["auto", "fixed", "per-photo"]
     unseen: Literal["drop", "keep"]
     look: Literal["auto", "scene", "photos"]
-    extent: Literal["auto", "photos"]
+    extent: Literal["auto", "photos", "beyond"]
     superpixels: int | str
     segmentation: Literal["rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid"]
     rectangles: float | None

@@ -15,7 +15,7 @@ Poses = Literal["auto", "fixed", "free"]
 Exposure = Literal["auto", "fixed", "per-photo"]
 Unseen = Literal["drop", "keep"]
 Look = Literal["auto", "scene", "photos"]
-Extent = Literal["auto", "photos"]
+Extent = Literal["auto", "photos", "beyond"]
 MatchMethod = Literal["overlap", "aabb", "none"]
 KRule = Literal["saliency", "distortion"]
 
@@ -48,8 +48,9 @@ class PrepareOptions(Settings):
         "others.")  # fmt: skip
     look: Look = setting("auto", "Whose colours count: auto: those of the photos, but its own of a scene with another "
         "look; scene: its own; photos: theirs as they are.")  # fmt: skip
-    extent: Extent = setting("auto", "Large parts of photos in which the scene shows nothing, as one that was cut out "
-        "or has no sky: auto: they stay empty; photos: they are filled.")  # fmt: skip
+    extent: Extent = setting("auto", "Where the result may show more than the scene: auto: nowhere; photos: in large "
+        "parts of the photos where the scene shows nothing, as one that was cut out or has no sky; beyond: beside the "
+        "photos, after a long fit.")  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from gsmerge.facts.holes import SIZE, make_gaussians
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.facts.row_colors import fill_gaps
 from gsmerge.fit.outside import Outside
-from gsmerge.geometry import project
+from gsmerge.geometry import is_inside, project
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
 from gsmerge.raster import Splats, TiledView, make_splats, tile_view
@@ -27,7 +27,6 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
 
 # Chosen on seven training captures
-FAINT = 0.02  # opacity of Gaussians that make room: a fit leaves every tenth like that
 SHARE = 0.03  # of the Gaussians, at most, that fill what no view shows
 LEVEL = 8  # times a view's pixel is theirs: what no photo shows is blurred anyway
 BESIDE = -0.1  # of the way to the nearest view: a camera just outside
@@ -42,34 +41,35 @@ FRONT = 0.98  # of the depth of a surface, in front of which a camera would see 
 
 
 @stage("fill")
-def fill_between(fitted: Gaussians, cameras: Cameras, outside: Outside | None) -> Gaussians:
-    """Put Gaussians where cameras between and just beside those of the photos see nothing; faint ones make room.
+def fill_between(
+    fitted: Gaussians, cameras: Cameras, outside: Outside | None, most: int, *, beyond: bool = False
+) -> Gaussians:
+    """Make Gaussians for what cameras between and just beside those of the photos see empty.
 
-    At most ``SHARE`` of the Gaussians are replaced, for what half-way cameras see first. The new ones continue the
-    farther side of the surfaces around, and stand where no camera sees into, so no photo says anything against them,
-    nor does a view from ``outside``.
-    Scenes of more than ``MOST_VIEWS`` views stay as they are: photos show nearly all that lies between them.
+    There are at most ``most`` and ``SHARE`` times the fitted ones, for what half-way cameras see first. They continue
+    the farther side of the surfaces around, and stand where no camera sees into, so no photo says anything against
+    them, nor does a view from ``outside``. All are in the view of some photo, unless what lies ``beyond`` the photos
+    is wanted, too.
+    For scenes of more than ``MOST_VIEWS`` views there are none: photos show nearly all that lies between them.
     """
-    if not 1 < len(cameras) <= MOST_VIEWS:
-        return fitted
+    added, most = fitted[:0], min(most, int(SHARE * len(fitted)))
+    if most == 0 or not 1 < len(cameras) <= MOST_VIEWS:
+        return added
     cameras = _small_cameras(cameras)
-    between, order = _wider(between_cameras(cameras, BESIDE)), np.argsort(fitted.opacities, kind="stable")
+    between, splats = _wider(between_cameras(cameras, BESIDE)), make_splats(fitted)
     if len(between) == 0:  # all look elsewhere
-        return fitted
-    splats = make_splats(fitted)
-    most = min(int((fitted.opacities < FAINT).sum()), int(SHARE * len(fitted)))
+        return added
     looks = parallel_map(lambda view: _look(splats, between, view), range(len(between)))
     depths = parallel_map(lambda view: blend_depths(_tile(splats, cameras, view)), range(len(cameras)))
     seen = _see(cameras, depths), _see(between, [look[:2] for look in looks]).where_seen()
 
     def continue_surfaces(view: int) -> Gaussians:
-        return _continue_surfaces(looks[view], between[[view]], seen, outside, fitted.shN.shape[1])
+        return _continue_surfaces(looks[view], between[[view]], seen, outside, fitted.shN.shape[1], beyond=beyond)
 
-    added = fitted[:0]
-    for view, more in enumerate(parallel_map(continue_surfaces, range(len(between) if most else 0))):
+    for view, more in enumerate(parallel_map(continue_surfaces, range(len(between)))):
         more = more[~_on_same_pixels(more, added, between[[view]])]
         added = Gaussians.concat([added, more[: most - len(added)]])
-    return Gaussians.concat([fitted[np.sort(order[len(added) :])], added])
+    return added
 
 
 def _on_same_pixels(some: Gaussians, others: Gaussians, camera: Cameras) -> np.ndarray:
@@ -96,6 +96,11 @@ class Seen:
         """Return a copy that says nothing where it is clear, as what a camera between photos sees."""
         return Seen(self.cameras, np.where(self.clear, np.float32(0), self.farthest), np.zeros_like(self.clear))
 
+    def show(self, points: np.ndarray) -> np.ndarray:
+        """Return a mask ``[n]`` of the points ``[n,3]`` that some picture would hold if nothing stood before them."""
+        pixels, z = project(points, self.cameras)
+        return ((z > 0) & is_inside(pixels, self.cameras)).any(0)
+
     def contradict(self, points: np.ndarray) -> np.ndarray:
         """Return a mask ``[n]`` of the points ``[n,3]`` that stand before a surface, or where a camera sees nothing."""
         (pixels, z), size = project(points, self.cameras), np.array([self.cameras.width, self.cameras.height])
@@ -104,6 +109,15 @@ class Seen:
         column, row = np.clip(pixels[inside].astype(np.int64), 0, size - 1).T
         wrong = self.clear[camera, row, column] | (z[inside] < FRONT * self.farthest[camera, row, column])
         return np.bincount(point[wrong], minlength=len(points)) > 0
+
+
+def lies_between(known: np.ndarray) -> np.ndarray:
+    """Mark the pixels with something ``known [h,w]`` both to the left and to the right, or both above and below."""
+    sides = []
+    for mask in (known, known.T):
+        before, after = (np.logical_or.accumulate(some, axis=1) for some in (mask, mask[:, ::-1]))
+        sides.append(before & after[:, ::-1])
+    return np.asarray(sides[0] | sides[1].T)
 
 
 def _small_cameras(cameras: Cameras) -> Cameras:
@@ -144,6 +158,8 @@ def _continue_surfaces(
     seen: tuple[Seen, Seen],
     outside: Outside | None,
     num_higher: int,
+    *,
+    beyond: bool,
 ) -> Gaussians:
     """Make Gaussians for the clear pixels of a ``camera`` that continue the farther side of the surfaces beside.
 
@@ -154,6 +170,7 @@ def _continue_surfaces(
     around = np.ones((2 * round(WINDOW * camera.width) + 1,) * 2, np.uint8)
     known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), around))
     clear &= cv2.dilate(known.astype(np.uint8), around) > 0
+    clear &= beyond | lies_between(known)
     image = image / np.maximum(1 - left, 1e-6)[..., None]
     values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
     sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]
@@ -163,6 +180,8 @@ def _continue_surfaces(
     tried = np.array(DEEPER)[:, None] * (sums[:, 4] / sums[:, 0]).astype(np.float64)
     points = (eye + tried[..., None] * rays).reshape(-1, 3)
     wrong = np.logical_or(*(some.contradict(points) for some in seen))
+    if not beyond:
+        wrong |= ~seen[0].show(points)
     if outside is not None:
         wrong[~wrong] = outside.contradict(points[~wrong], FRONT)
     hidden = ~wrong.reshape(tried.shape)

@@ -38,7 +38,7 @@ def compacted(
     [(256, {}), (256, {"fit_steps": 300}), (256, {"k": 2}), (64, {})],
     ids=["default", "best", "K2", "1%"],
 )
-def test_full_fit_reaches_the_floor_with_exactly_the_count(
+def test_full_fit_reaches_the_floor_with_no_more_than_the_count(
     superpixels: int,
     settings: dict[str, Any],
     compacted: Callable[..., tuple[CompactResult, float]],
@@ -46,7 +46,8 @@ def test_full_fit_reaches_the_floor_with_exactly_the_count(
 ) -> None:
     result, actual = compacted(superpixels=superpixels, **settings)
     assert result.report.choices["fit"]["method"] == "full"
-    assert len(result.gaussians) == NUM_VIEWS * superpixels * settings.get("k", 1)
+    most = NUM_VIEWS * superpixels * settings.get("k", 1)
+    assert 0.8 * most < len(result.gaussians) <= most
     floor(actual)
 
 

@@ -50,7 +50,9 @@ def test_three_levels_in_a_folder_of_their_own(small_scene: Path, index: Path, r
     levels = read_index(index).levels
     counts = [document["output"]["num_gaussians"], *(level["num_gaussians"] for level in document["levels"])]
     assert read_index(index).counts == counts
-    assert counts[1:] == [counts[0] // 4, counts[0] // 16]
+    assert all(
+        0.9 * most <= count <= most for count, most in zip(counts[1:], (counts[0] // 4, counts[0] // 16), strict=True)
+    )
     assert [level["path"] for level in document["levels"]] == [str(next(iter(level))) for level in levels[1:]]
     written = listing(index.parent)
     assert written.pop("lod-meta.cameras.json") > 0

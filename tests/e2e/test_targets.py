@@ -31,7 +31,9 @@ def test_levels_are_a_chain(small_scene: Path, tmp_path: Path, run: Run) -> None
     document = json.loads(said.out)
     paths = [out, tmp_path / "chain.level1.ply", tmp_path / "chain.level2.ply"]
     counts = [len(read_ply(path).gaussians) for path in paths]
-    assert counts[1:] == [counts[0] // 4, counts[0] // 16]
+    assert all(
+        0.9 * most <= count <= most for count, most in zip(counts[1:], (counts[0] // 4, counts[0] // 16), strict=True)
+    )
     assert [level["num_gaussians"] for level in document["levels"]] == counts[1:]
     assert [level["path"] for level in document["levels"]] == [str(path) for path in paths[1:]]
     assert all(level["choices"]["fit"]["method"] == "full" for level in document["levels"])

@@ -80,14 +80,18 @@ def page(written: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tu
 
 
 def with_one_from_outside(gaussians: gsmerge.Gaussians, camera: gsmerge.Cameras) -> gsmerge.Gaussians:
-    """With a long Gaussian that reaches into the camera's picture from three half pictures to its right."""
+    """With a long Gaussian that reaches into the camera's picture from three half pictures to its right.
+
+    Another one is far behind the camera, where no view sees it.
+    """
     rotation, shift = camera.viewmats[0, :3, :3], camera.viewmats[0, :3, 3]
     depth = 0.5 * middle_depth(gaussians.means, camera)
     side = depth * WIDTH / 2 / camera.Ks[0, 0, 0]  # of half a picture
     place = rotation.T @ ((3 * side, 0, depth) - shift)
     new = {"means": place, "scales": (2 * side, side / 2, side / 2), "quats": rotmat_to_quat(rotation.T[None])[0]}
     new |= {"opacities": 0.7, "sh0": [(1.5, -1.0, -1.0)], "shN": 0 * gaussians.shN[0]}
-    columns = {name: np.asarray(value, np.float32)[None] for name, value in new.items()}
+    behind = new | {"means": rotation.T @ ((0, 0, -20 * depth) - shift), "scales": (side, side, side)}
+    columns = {name: np.asarray([new[name], behind[name]], np.float32) for name in new}
     return replace(gaussians, **{name: np.concatenate([getattr(gaussians, name), c]) for name, c in columns.items()})
 
 

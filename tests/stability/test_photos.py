@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,17 @@ def room() -> Scene:
 @pytest.fixture(scope="module")
 def sound(room: Scene) -> CompactResult:
     return compact(room, **FIT)
+
+
+def over_seeds(scene: Scene, *, aligned: bool = False, **settings: Any) -> float:
+    """Mean PSNR of the view between the photos over four seeds, between which results of so few pixels differ by .5."""
+    results = (compact(scene, **FIT, **settings, seed=seed) for seed in range(4))
+    return float(np.mean([novel_psnr(result.gaussians, aligned=aligned) for result in results]))
+
+
+@pytest.fixture(scope="module")
+def usual(room: Scene) -> float:
+    return over_seeds(room)
 
 
 def novel_psnr(gaussians: Gaussians, *, aligned: bool = False) -> float:
@@ -98,16 +110,11 @@ CASES = [
 
 
 @sweep(("change", "loss", "note"), CASES, ids=lambda case: getattr(case, "__name__", None), often=2)
-def test_photos_are_mended(
-    room: Scene, sound: CompactResult, change: Change, loss: float, note: tuple[str, ...]
-) -> None:
-    """Over two seeds, between which results of so few pixels differ by .5 dB."""
+def test_photos_are_mended(room: Scene, usual: float, change: Change, loss: float, note: tuple[str, ...]) -> None:
     changed = replace(room, images=change(room.images))
-    result, others = compact(changed, **FIT), [compact(scene, **FIT, seed=1) for scene in (room, changed)]
+    result = compact(changed, **FIT)
     assert noted(result.report.notes, *note)
-    before, after = ((novel_psnr(one.gaussians) + novel_psnr(other.gaussians)) / 2
-                     for one, other in zip((sound, result), others, strict=True))  # fmt: skip
-    assert after > before - loss
+    assert over_seeds(changed) > usual - loss
     assert {"photos_changed", "photos_left_out"} & result.report.choices.keys()
 
 
@@ -180,13 +187,13 @@ def random_gains(channels: int) -> np.ndarray:
 
 
 @sweep("channels", [3, 1], ids=["white balance", "exposure"])
-def test_exposures_are_brought_to_their_mean(room: Scene, sound: CompactResult, channels: int) -> None:
+def test_exposures_are_brought_to_their_mean(room: Scene, channels: int) -> None:
     scene = exposed(room, random_gains(channels))
     result, fixed = compact(scene, **FIT), compact(scene, **FIT, exposure="fixed")
-    best = novel_psnr(sound.gaussians, aligned=True)
-    assert novel_psnr(result.gaussians, aligned=True) > best - 1
+    after = over_seeds(scene, aligned=True)
+    assert after > over_seeds(room, aligned=True) - 1
     # the loss of edges bears other exposures: uncompensated ones cost 0.6 to 1.1 dB of structure, 1.0 to 1.4 without it
-    assert novel_psnr(result.gaussians, aligned=True) > novel_psnr(fixed.gaussians, aligned=True) + 0.4
+    assert after > over_seeds(scene, aligned=True, exposure="fixed") + 0.4
     assert noted(result.report.notes, "exposure", "factors")
     assert "exposure" not in fixed.report.choices
     given = np.array(result.report.choices["exposure"])

@@ -16,6 +16,7 @@ from gsmerge.kernels import elementary
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS
+from gsmerge.stages.prune import ROUNDING
 
 UNUSUAL = ("partition", "curve", "reduce", "refine", "cover", "choose", "join")
 USUAL = [stage for stage in STAGES if stage not in UNUSUAL]
@@ -34,7 +35,7 @@ def test_report(scene: Scene) -> None:
     assert 0 < report.num_output == len(result.gaussians) < report.num_input
     assert list(report.seconds) == USUAL
     assert report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, scene), abs=0.1)
-    assert report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, scene), abs=0.1)
+    assert report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, scene), abs=0.15)
     assert report.choices["fit"]["method"] == "full"
     assert report.choices["clusters"] <= report.choices["groups"]
     assert report.options["superpixels"] == "10%"
@@ -87,6 +88,26 @@ def test_more_gaussians_are_fitted_in_more_steps(scene: Scene) -> None:
     assert (many.options["fit_steps"], many.choices["fit"]["steps"]) == (54, 54)
 
 
+def test_what_no_photo_shows_is_not_written(scene: Scene) -> None:
+    pruned, whole = (scenes.compacted(scene, fit_steps=160, min_contribution=least) for least in (1 / 255, 0))
+    count = pruned.report.choices["pruned"]
+    assert 0 < count == len(whole.gaussians) - len(pruned.gaussians)
+    assert "pruned" not in whole.report.choices
+    images = [scenes.images_of(result.gaussians, scene.cameras)[0].clip(0, 1) for result in (pruned, whole)]
+    assert 0 < np.sqrt(np.square(images[0] - images[1]).mean()) < 2 * ROUNDING
+
+
+@pytest.mark.parametrize("steps", [20, 160])
+def test_numbers_are_met_and_limits_kept(scene: Scene, steps: int) -> None:
+    count = 230  # a tenth
+    exact, share, filled = (
+        scenes.compacted(scene, fit_steps=steps, **budget).gaussians
+        for budget in ({"budget": count}, {"budget": "10%"}, {"budget": "10%", "fill": True})
+    )
+    assert len(exact) == len(filled) == count
+    assert 0.6 * count < len(share) <= count
+
+
 def test_progress_tells_every_step_of_the_full_fit(scene: Scene) -> None:
     calls: list[tuple[str, int, int]] = []
     compact(scene, fit_steps=12, checkpoint="none", progress=lambda *call: calls.append(call))
@@ -130,7 +151,7 @@ def test_count_is_what_was_asked_for(scene: Scene, match: str, k: int) -> None:
     actual = scenes.compacted(scene, superpixels=40, match=match, k=k, **UNFITTED)
     assert len(actual.gaussians) <= 3 * 40 * k
     if match == "none":
-        assert len(actual.gaussians) >= 0.95 * 3 * 40 * k
+        assert len(actual.gaussians) + actual.report.choices["pruned"] >= 0.95 * 3 * 40 * k
 
 
 @pytest.mark.parametrize("superpixels", [1, 2, 768])

@@ -94,9 +94,9 @@ def test_steps_grow_with_the_views() -> None:
 
 
 def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
-    assert not resolve_fit(options_of(effort="draft", fit="none")).needs_photos
-    assert resolve_fit(options_of(effort="draft")).needs_photos
-    assert resolve_fit(options_of(fit="none")).needs_photos
+    assert resolve_fit(options_of(effort="draft", fit="none")).min_contribution == 0
+    assert resolve_fit(options_of(effort="draft")).min_contribution > 0
+    assert resolve_fit(options_of(fit="none")).min_contribution > 0
 
 
 @pytest.mark.parametrize(
@@ -262,7 +262,6 @@ def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:
     assert not free.with_fixed_cameras().fit.move_cameras
     assert not plan_of(scene, poses="fixed").fit.move_cameras
     unfitted = plan_of(scene, poses="free", fit="none").fit
-    assert unfitted.needs_photos
     assert not unfitted.move_cameras
 
 
@@ -282,8 +281,9 @@ def test_reports_say_what_was_settled(scene: Scene) -> None:
     assert (settled["match"], settled["checkpoint"]) == ("none", "none")
 
 
-SETTLED = [{}, {"budget": 200, "effort": "fast"}, {"budget": "30kB", "effort": "draft"}]
-OPEN = [  # merging across views decides how many there are, of at most as many
+SETTLED = [{"budget": 200, "effort": "fast"}, {"budget": "30kB", "fill": True, "effort": "draft"}]
+OPEN = [  # merging across views, and what photos show, decide how many there are, of at most as many
+    {}, {"budget": "30kB", "effort": "draft"},
     {"effort": "draft"}, {"effort": "fast", "k": 2}, {"superpixels": 40, "fit": "none"}, {"recipe": "paper"},
     {"blocks": 2, "effort": "draft"},
 ]  # fmt: skip
@@ -312,6 +312,7 @@ def test_the_estimate_is_what_the_run_does(
     count = len(result.gaussians)
     assert run["num_gaussians"] == count if settings in SETTLED else 0.5 * run["num_gaussians"] < count
     assert count <= run["num_gaussians"]
+    assert run["exact"] == (settings in SETTLED)
     for plan in plans:  # none of a scene in blocks
         assert (plan.limits, plan.decode, plan.match.match) == (choices.limits, choices.decode, choices.match)
         assert (plan.fit.fit, plan.fit.steps, plan.fit.share) == (choices.fit.fit, choices.fit.steps, choices.fit.share)

@@ -36,7 +36,7 @@ def test_results_have_harmonics_of_three_degrees(folder: Path, name: str, degree
 
 
 def test_a_result_s_size_is_that_of_three_degrees(folder: Path) -> None:
-    settings = PLAIN.with_settings({"budget": "30kB"})
+    settings = PLAIN.with_settings({"budget": "30kB", "fill": True})
     document = compact_files(find_scene_files(folder), settings, Outputs(folder / "x.ply"))
     size = (folder / "x.ply").stat().st_size
     assert (

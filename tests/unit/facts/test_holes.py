@@ -189,4 +189,4 @@ def test_shares_of_a_budget_are_of_the_file() -> None:
     """Not of the file and the Gaussians that were added."""
     scene = without_pixels(scene_of())
     count = len(scene.gaussians)
-    assert len(compact(scene, budget="10%", effort="draft").gaussians) == round(0.1 * count)
+    assert len(compact(scene, budget="10%", fill=True, effort="draft").gaussians) == round(0.1 * count)

@@ -34,8 +34,8 @@ from gsmerge.runtime.record import record_run
 from gsmerge.settings.fit import Tuning
 
 Pair = tuple[Photos, Photos]
-QUICK = FitOptions(fit_steps=30, holdout=0.2)
-LONG = FitOptions(fit_steps=160, holdout=0.2)
+QUICK = FitOptions(fit_steps=30, holdout=0.2, fills=True)
+LONG = FitOptions(fit_steps=160, holdout=0.2, fills=True)
 
 
 # what it reaches
@@ -45,7 +45,7 @@ def test_perturbed_scene_comes_back(scene: Scene, truth: Gaussians, photos: Pair
     gains = []
     for seed in range(3):
         start = scenes.spoil(truth, seed=seed)
-        result, report = fit_full(start, scenes.run_for(photos, replace(LONG, dropout=0.0), seed=seed))
+        result, report = fit_full(start, scenes.run_for(photos, replace(LONG, dropout=0.0), len(start), seed=seed))
         assert (report.method, report.accepted, report.steps) == ("full", True, 160)
         assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 6
         assert len(result) == len(start)
@@ -402,3 +402,17 @@ def test_longer_runs_end_with_smaller_steps() -> None:
     np.testing.assert_allclose(long, usual / 3, rtol=1e-6)
     np.testing.assert_array_equal(step_sizes(rates, 0.0, 300), step_sizes(rates, 0.0, 900))
     np.testing.assert_array_equal(step_sizes(rates, 1.0, 12), usual)
+
+
+def test_rows_that_change_late_are_not_averaged_with_others(
+    truth: Gaussians, photos: Pair, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others take the places of faint Gaussians just after the last fifth of the steps has begun."""
+    monkeypatch.setattr("gsmerge.fit.full.CLEARS", (0.8,))
+    monkeypatch.setattr("gsmerge.fit.full.FAINT", 0.3)
+    start, scores = scenes.spoil(truth), []
+    for count in (160, 163):  # the mean begins with the step after, and with that before
+        result, _ = fit_full(start, scenes.run_for(photos, replace(LONG, fit_steps=count), len(start)))
+        assert len(result) == len(start)
+        scores.append(scenes.psnr_of(result, scene))
+    assert scores[1] > scores[0] - 1

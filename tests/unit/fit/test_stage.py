@@ -14,7 +14,7 @@ from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import look_outside, score_fog
-from gsmerge.fit.survey import JUDGES, choose_looks, judging_views, score_images, survey_photos, visible_mask
+from gsmerge.fit.survey import JUDGES, choose_looks, judging_views, peak_weights, score_images, survey_photos
 from gsmerge.raster import composite, contributions, make_splats, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.types import SH_C0
@@ -22,6 +22,12 @@ from gsmerge.types import SH_C0
 Pair = tuple[Photos, Photos]
 QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)
+
+
+def visible(gaussians: Gaussians, photos: Photos) -> np.ndarray:
+    """Those with a weight of 1/255 in some photo, or outside all of them."""
+    peaks, inside = peak_weights(gaussians, photos)
+    return ~inside | (peaks >= 1 / 255)
 
 
 def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
@@ -42,7 +48,7 @@ def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair, monkeypatch
     result, report = fit(start, FitJob(photos, QUICK))
     assert (report.method, report.accepted) == ("color", True)
     colored, _ = fit_colors(start, draw(start, photos[1]), photos[1], QUICK)
-    assert scenes.identical(result, colored[visible_mask(start, photos[1], QUICK.min_contribution)])
+    assert scenes.identical(result, colored[visible(start, photos[1])])
     assert np.array_equal(result.means, start.means)
     assert not np.array_equal(result.sh0, start.sh0)
 
@@ -67,21 +73,6 @@ def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
     assert scenes.identical(result, grey)
 
 
-def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None:
-    """Hidden ones go, those outside all photos stay, nothing else changes."""
-    opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
-    hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
-    behind = replace(truth[:3], means=truth.means[:3] - 100)
-    start = Gaussians.concat([opaque, hidden, behind])
-    result, report = fit(start, FitJob(photos, replace(QUICK, fit="none")))
-    assert report is None
-    keep = visible_mask(start, photos[1], QUICK.min_contribution)
-    assert scenes.identical(result, start[keep])
-    assert not keep[-6:-3].any()
-    assert keep[-3:].all()
-    assert scenes.identical(fit(start, FitJob(photos, replace(QUICK, fit="none", min_contribution=0.0)))[0], start)
-
-
 def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
     opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
     hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
@@ -89,9 +80,8 @@ def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
     assert len(both) == len(alone)
 
 
-@pytest.mark.parametrize("method", ["none", "full"])
-def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
-    result, _ = fit(truth[:0], FitJob(photos, replace(QUICK, fit=method)))
+def test_nothing_to_fit(truth: Gaussians, photos: Pair) -> None:
+    result, _ = fit(truth[:0], FitJob(photos, QUICK))
     assert len(result) == 0
 
 
@@ -99,7 +89,7 @@ def test_a_survey_is_what_its_parts_are(truth: Gaussians, photos: Pair) -> None:
     run, pictures = scenes.run_for(photos, QUICK), list[np.ndarray]()
     survey = survey_photos(truth, run)
     half, state = photos[1], start_state(truth)
-    np.testing.assert_array_equal(survey.visible(1 / 255), visible_mask(truth, half, 1 / 255))
+    np.testing.assert_array_equal(survey.visible(1 / 255), visible(truth, half))
     sums = np.zeros((len(half), len(truth)))
     for view in range(len(half)):
         drawn = tile_view(state.splats, **half.camera(view))
@@ -122,7 +112,7 @@ def test_shown(photos: Pair) -> None:
         np.full(n, 0.99, np.float32), np.zeros((n, 1, 3), np.float32), np.zeros((n, 0, 3), np.float32),
     )  # fmt: skip
     made.scales[-3:] = 0.02
-    assert visible_mask(made, photos[1], 1 / 255)[-3:].tolist() == [False, True, True]
+    assert visible(made, photos[1])[-3:].tolist() == [False, True, True]
 
 
 def test_many_photos_are_surveyed_by_some_that_look_everywhere(truth: Gaussians) -> None:

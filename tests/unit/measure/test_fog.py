@@ -10,6 +10,8 @@ import scenes
 from messages import says
 from tiny_scene import rotation
 
+from gsmerge.fit.outside import HIGH, LOW, PLACES
+from gsmerge.fit.outside import outside_cameras as place_views
 from gsmerge.geometry import camera_centres
 from gsmerge.kernels import elementary
 from gsmerge.measure.fog import (
@@ -207,3 +209,15 @@ def test_long_thin_gaussians_are_spikes(length: float, width: float, spikes: boo
     assert (fog.spikes > 0, fog.strokes > 0) == (spikes, strokes)
     assert max(fog.spikes, fog.strokes) < 0.05
     assert fog_of(wall(), wall())[ALL].strokes == 0
+
+
+@pytest.mark.parametrize("views", [2, 7, 12])
+def test_no_fit_looks_from_where_it_is_measured(views: int) -> None:
+    """Cameras outside are a fiftieth of the depth apart, or look elsewhere by a degree."""
+    scene = scenes.make_scene(scenes.room(), scenes.arc(views, 32, 24))
+    points = scene.gaussians.means
+    fitted = place_views(points, scene.cameras, max(PLACES, views), LOW, HIGH)
+    for _, camera, depth in outside_cameras(scene.gaussians, scene.cameras):
+        apart = np.linalg.norm(fitted.centres - camera.centres, axis=1) / depth
+        cosines = (fitted.viewmats[:, 2, :3] * camera.viewmats[0, 2, :3]).sum(1)
+        assert ((apart > 0.02) | (cosines < np.cos(np.radians(1)))).all()

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsmerge.geometry import rgb_to_sh0
+from gsmerge.geometry import is_inside, project, rgb_to_sh0
 from gsmerge.raster import render
-from gsmerge.stages.fill import MOST_VIEWS, fill_between
+from gsmerge.stages.fill import MOST_VIEWS, fill_between, lies_between
 from gsmerge.types import Cameras, Gaussians
 
 
@@ -38,25 +38,52 @@ def slit(*centres: float) -> tuple[Gaussians, Cameras]:
     return Gaussians.concat(parts), Cameras(viewmats, Ks, 320, 240)
 
 
-def with_faint(gaussians: Gaussians) -> Gaussians:
-    """The same beside a tenth as many that nobody sees."""
-    rows = np.arange(0, len(gaussians), 10)
-    faint = replace(gaussians[rows], opacities=np.full(len(rows), 0.001, np.float32))
-    return Gaussians.concat([gaussians, faint])
+def fill(gaussians: Gaussians, cameras: Cameras, **settings: bool) -> Gaussians:
+    """What is added where there is room for a tenth as many."""
+    return fill_between(gaussians, cameras, None, len(gaussians) // 10, **settings)
 
 
 def test_what_a_camera_between_views_uncovers_is_filled_behind_what_they_see() -> None:
-    gaussians, cameras = slit(-0.6, 0.6)
+    before, cameras = slit(-0.6, 0.6)
     between = slit(0.0)[1]
-    before = with_faint(gaussians)
-    after = fill_between(before, cameras, None)
+    added = fill(before, cameras)
+    after = Gaussians.concat([before, added])
     middle = np.s_[0, 60:180, 150:170, 0]
     assert render(before, between).alphas[middle].mean() < 0.1
     assert render(after, between).alphas[middle].mean() > 0.9
-    assert len(after) == len(before)
     np.testing.assert_allclose(render(after, cameras).images, render(before, cameras).images, atol=0.06)
-    new = after.means[len(gaussians) :][after.opacities[len(gaussians) :] > 0.5]
-    assert (new[:, 2] > 3).all()
+    assert (added.means[:, 2] > 3).all()
+
+
+def test_what_lies_beyond_all_photos_is_filled_only_where_asked() -> None:
+    """A wall that ends beside what the outer photos show: a camera beside them sees further."""
+    gaussians, cameras = slit(-0.6, 0.6)
+    inside, everywhere = fill(gaussians, cameras), fill(gaussians, cameras, beyond=True)
+
+    def shown(some: Gaussians) -> np.ndarray:
+        pixels, depths = project(some.means, cameras)
+        return ((depths > 0) & is_inside(pixels, cameras)).any(0)
+
+    assert shown(inside).all()
+    assert len(everywhere) > len(inside) > 50
+    assert not shown(everywhere).all()
+
+
+def test_only_what_is_enclosed_is_filled() -> None:
+    """A wall that ends behind a post has nothing on its other side that it could go on to."""
+    whole, cameras = slit(-0.6, 0.6)
+    right_of_it = whole[whole.means[:, 0] < 0.2]  # neither the right post nor the wall behind and beside it
+    assert len(fill(whole, cameras)) > 50
+    new = fill(right_of_it, cameras)
+    assert not (new.means[:, 0] > 0.2).any()
+
+
+def test_between_is_a_line_from_one_to_another() -> None:
+    known = np.zeros((5, 7), bool)
+    known[2, 1] = known[2, 4] = known[0, 6] = known[3, 6] = True
+    expected = np.zeros((5, 7), bool)
+    expected[2, 1:5] = expected[:4, 6] = True
+    np.testing.assert_array_equal(lies_between(known), expected)
 
 
 def test_views_that_look_elsewhere_have_nothing_between_them() -> None:
@@ -64,32 +91,25 @@ def test_views_that_look_elsewhere_have_nothing_between_them() -> None:
     gaussians, cameras = slit(-0.6, 0.6)
     turn = np.array([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
     apart = replace(cameras, viewmats=np.stack([cameras.viewmats[0], turn @ cameras.viewmats[1]]))
-    before = with_faint(gaussians)
-    assert fill_between(before, apart, None) is before
+    assert len(fill(gaussians, apart)) == 0
 
 
 def test_cameras_between_do_not_fill_the_same_twice() -> None:
-    gaussians, cameras = slit(-0.6, -0.2, 0.2, 0.6)
-    new = fill_between(with_faint(gaussians), cameras, None)[len(gaussians) :]
-    new = new[new.opacities > 0.5]
+    new = fill(*slit(-0.6, -0.2, 0.2, 0.6))
     apart = np.linalg.norm(new.means[:, None] - new.means, axis=2) + np.diag(np.full(len(new), np.inf))
     assert len(new) > 50
     assert np.median(apart.min(1) / new.scales[:, 0]) > 1
 
 
-def test_only_faint_gaussians_make_room() -> None:
-    gaussians, cameras = slit(-0.6, 0.6)
-    np.testing.assert_array_equal(fill_between(gaussians, cameras, None).means, gaussians.means)
+@pytest.mark.parametrize("most", [0, 7])
+def test_no_more_than_there_is_room_for(most: int) -> None:
+    assert len(fill_between(*slit(-0.6, 0.6), None, most)) == most
 
 
 def test_what_each_view_shows_as_empty_stays_empty() -> None:
-    post = with_faint(sheet(-0.4, 0.4, 3, 0.8))
-    filled = fill_between(post, slit(-0.6, 0.0, 0.6)[1], None)
-    np.testing.assert_array_equal(np.sort(filled.opacities), np.sort(post.opacities))
+    assert len(fill(sheet(-0.4, 0.4, 3, 0.8), slit(-0.6, 0.0, 0.6)[1])) == 0
 
 
 @pytest.mark.parametrize("count", [1, MOST_VIEWS + 1])
 def test_one_view_and_very_many_are_not_filled(count: int) -> None:
-    gaussians, cameras = slit(*np.linspace(-0.6, 0.6, count))
-    before = with_faint(gaussians)
-    assert fill_between(before, cameras, None) is before
+    assert len(fill(*slit(*np.linspace(-0.6, 0.6, count)))) == 0

@@ -1,0 +1,73 @@
+"""Edges of the views, at which a fit cuts its Gaussians: nothing says how far they reach beyond.
+
+What crosses the edges of all views hangs around the scene as a soft rim, and as clouds, for whoever steps back.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmerge.fit.fit_state import FitState
+from gsmerge.geometry import camera_centres
+from gsmerge.kernels.elementary import exp, log
+from gsmerge.kernels.gaussians.edges import cut_at_edges
+from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
+from gsmerge.kernels.matrices import matmul
+from gsmerge.pooling import principal_axes
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras
+
+# Distances from one Gaussian to the next by which the edges are moved out, if the Gaussians of the result were spread
+# evenly over all photos: border pixels show those that are centred beside them, too
+MARGIN = 2.0
+ROWS = 16384  # Gaussians per piece of work
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Planes through the cameras of v views and the four edges of each, moved out."""
+
+    normals: np.ndarray  # [v,4,3] outward, of unit length
+    offsets: np.ndarray  # [v,4] points x inside have normal @ x <= offset
+
+
+def find_edges(cameras: Cameras, count: int) -> Edges:
+    """Return the edges of the pictures of cameras, moved out by ``MARGIN`` for a result of ``count`` Gaussians."""
+    size, num = np.array([cameras.width, cameras.height]), len(cameras)
+    margin = MARGIN * math.sqrt(num * cameras.width * cameras.height / max(1, count))
+    Ks, viewmats = cameras.Ks.astype(np.float64), cameras.viewmats.astype(np.float64)
+    focals, middles = Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2]
+    left, top = ((-margin - middles) / focals).T
+    right, bottom = ((size + margin - middles) / focals).T
+    zero, one = np.zeros(num), np.ones(num)
+    sides = (-one, zero, left), (one, zero, -right), (zero, -one, top), (zero, one, -bottom)
+    seen = np.stack([np.stack(side, 1) for side in sides], 1)  # by the camera
+    seen /= np.sqrt((seen**2).sum(2, keepdims=True))
+    normals = np.stack([matmul(some, viewmat[:3, :3]) for some, viewmat in zip(seen, viewmats, strict=True)])
+    return Edges(normals, (normals * camera_centres(viewmats)[:, None]).sum(2))
+
+
+def cut_state(state: FitState, edges: Edges) -> None:
+    """Cut the Gaussians of a state at the edges of all views, in place, except those that are fixed.
+
+    The limits of their means are about what is left, those of their scales stay.
+    """
+    splats, x = state.splats, state.x
+    means, covars, is_cut = splats.means.copy(), np.empty((len(x), 3, 3)), np.zeros(len(x), np.uint8)
+
+    def cut(first: int) -> None:
+        last = min(first + ROWS, len(x))
+        cut_at_edges(splats.quats, splats.scales, edges.normals, edges.offsets, first, last, means, covars, is_cut)
+
+    parallel_map(cut, range(0, len(x), ROWS))
+    rows = np.flatnonzero(is_cut.astype(bool) & ~state.fixed)
+    scales, quats = principal_axes(covars[rows])
+    sizes = np.maximum(log(scales), state.min_sizes[rows, None])
+    x[rows, :SIZE], x[rows, SIZE:QUAT], x[rows, QUAT:LOGIT] = means[rows], sizes, quats
+    state.x0[rows, :SIZE] = means[rows]
+    state.x0[rows, SIZE:QUAT] = np.sort(state.x0[rows, SIZE:QUAT], 1)  # as those of the new axes, which rise
+    state.m[rows, :LOGIT] = 0  # it was along other axes
+    splats.means[rows], splats.scales[rows], splats.quats[rows] = means[rows], exp(x[rows, SIZE:QUAT]), quats

@@ -1,0 +1,104 @@
+"""Cutting the Gaussians of a fit at the edges of its photos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Gaussians
+from gsmerge.fit.edges import Edges, cut_state, find_edges
+from gsmerge.fit.fit_state import FitState, start_state
+from gsmerge.fit.full import fit_full
+from gsmerge.geometry import project
+from gsmerge.kernels.gaussians.edges import cut_at_edges
+from gsmerge.raster.photos import Photos
+from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.fit import FitOptions
+from gsmerge.types import Cameras
+
+Pair = tuple[Photos, Photos]
+
+
+def with_wide(truth: Gaussians) -> Gaussians:
+    """The same, with every twentieth Gaussian eight times as large."""
+    wide = np.arange(0, len(truth), 20)
+    scales = truth.scales.copy()
+    scales[wide] *= 8
+    return replace(truth, scales=scales)
+
+
+def edges_of(photos: Photos, margin: float) -> Edges:
+    """Edges that are moved out by a margin in pixels."""
+    cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
+    return find_edges(cameras, round(4 * len(photos) * photos.width * photos.height / margin**2))
+
+
+def reach_beyond(gaussians: Gaussians, edges: Edges) -> float:
+    """Sum of the squared scales that a cut at edges takes away."""
+    means, is_cut, covars = gaussians.means.copy(), np.zeros(len(gaussians), np.uint8), np.zeros((len(gaussians), 3, 3))
+    planes = edges.normals, edges.offsets
+    cut_at_edges(gaussians.quats, gaussians.scales, *planes, 0, len(gaussians), means, covars, is_cut)
+    lost = (gaussians.scales.astype(np.float64) ** 2).sum(1) - np.trace(covars, axis1=1, axis2=2)
+    return float(lost[is_cut > 0].sum())
+
+
+def test_edges_bound_what_photos_show(photos: Pair) -> None:
+    margin, half = 1.5, photos[1]
+    edges = edges_of(half, margin)
+    points = np.random.default_rng(1).normal(0, 3, (500, 3))
+    cameras = Cameras(half.viewmats, half.Ks, half.width, half.height)
+    pixels, depths = project(points, cameras)
+    size = np.array([half.width, half.height])
+    shown = ((pixels > -margin) & (pixels < size + margin)).all(2) & (depths > 0)
+    inside = (edges.offsets[:, None] - np.einsum("vpi,ni->vnp", edges.normals, points) > 0).all(2)
+    np.testing.assert_array_equal(inside, shown)
+    assert 0.02 < shown.mean() < 0.9
+
+
+def test_what_crosses_the_edges_ends_there(truth: Gaussians, photos: Pair) -> None:
+    wide, edges = with_wide(truth), edges_of(photos[1], 4.0)
+    state = start_state(wide)
+    cut_state(state, edges)
+    moved = (state.splats.means != wide.means).any(1)
+    assert 5 < moved.sum() < len(wide)
+    after = replace(wide, means=state.splats.means, quats=state.splats.quats, scales=state.splats.scales)
+    assert 3 * reach_beyond(after, edges) < reach_beyond(wide, edges)
+    np.testing.assert_array_equal(state.x[:, :3], state.splats.means)
+    np.testing.assert_array_equal(state.x0[moved, :3], state.x[moved, :3])
+    np.testing.assert_array_equal(state.x0[moved, 3:6], np.sort(start_state(wide).x[moved, 3:6], 1))
+    np.testing.assert_array_equal(state.x[~moved], start_state(wide).x[~moved])
+
+
+def test_fixed_gaussians_and_least_sizes_stay(truth: Gaussians, photos: Pair) -> None:
+    state = start_state(with_wide(truth))
+    state.fixed[::2] = True
+    state.fixed[20] = False  # a wide one
+    state.min_sizes[:] = state.x[:, 3:6].max(1)
+    before, free = state.x.copy(), ~state.fixed
+    cut_state(state, edges_of(photos[1], 4.0))
+    np.testing.assert_array_equal(state.x[~free], before[~free])
+    assert not np.array_equal(state.x[free], before[free])
+    assert (state.x[:, 3:6].max(1) >= state.min_sizes).all()
+
+
+def test_threads_write_the_same(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsmerge.fit.edges.ROWS", 7)
+
+    def cut(threads: int) -> FitState:
+        state = start_state(with_wide(truth))
+        with use_threads(threads):
+            cut_state(state, edges_of(photos[1], 4.0))
+        return state
+
+    np.testing.assert_array_equal(cut(1).x, cut(3).x)
+
+
+def test_a_long_fit_reaches_beyond_its_photos_only_where_it_may(truth: Gaussians, photos: Pair) -> None:
+    start, edges, reach = scenes.spoil(with_wide(truth)), edges_of(photos[1], 2.0), []
+    for some in (edges, None):
+        run = scenes.run_for(photos, FitOptions(fit_steps=150), len(start), edges=some)
+        reach.append(reach_beyond(fit_full(start, run)[0], edges))
+    assert 1.5 * reach[0] < reach[1]
