@@ -276,10 +276,12 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
     if not points:
         return []
     head = f"{'Gaussians':>12}  {'PSNR':>5}  {'SSIM':>5}"
-    nearest = min(points, key=lambda p: abs(math.log(p["count"] / max(count, 1))))
+    asked = count + document["choices"].get("pruned", 0)
+    result = f"{count:,}" if asked == count else f"{count:,} of {asked:,}"
+    nearest = min(points, key=lambda p: abs(math.log(p["count"] / max(asked, 1))))
     rows = [
         f"{p['count']:>12,}  {p['psnr']:5.2f}  {p['ssim']:5.3f}"
-        + (f"  <- the result has {count:,}" if p is nearest else "")
+        + (f"  <- the result has {result}" if p is nearest else "")
         for p in points
     ]
     return ["after short fits, on photos that they left out, or patches of them:", head, *rows]
