@@ -44,6 +44,21 @@ def as_array(values: Array) -> np.ndarray:
     return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
 
 
+def as_pictures(images: Array) -> np.ndarray:
+    """Return pictures ``[...,3]`` as sRGB in [0, 1], those of uint8 divided by 255.
+
+    Raises ValueError for numbers that are more than one level of 255 beyond.
+    """
+    pictures = as_array(images)
+    if pictures.dtype == np.uint8:
+        return np.multiply(pictures, np.float32(1 / 255), dtype=np.float32)
+    low, high = (float(pictures.min()), float(pictures.max())) if pictures.size else (0.0, 0.0)
+    if not (low >= -1 / 255 and high <= 1 + 1 / 255):
+        remedy = "divide them by 255" if low >= 0 and 1.5 < high <= 255 else "clip them"
+        raise ValueError(f"images: expected sRGB in [0, 1], or uint8, got {low:.4g} to {high:.4g}; {remedy}")
+    return pictures
+
+
 def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor:
     """Return an array or a tensor as a tensor on a device; on the CPU it shares the array's memory."""
     with refuse_without_torch():
@@ -332,7 +347,7 @@ class Scene:
     Args:
         gaussians: n Gaussians, in the frame of the cameras.
         cameras: The V views; none where none are known.
-        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None.
+        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None; runs take uint8, too, and refuse others.
         pixels: The pixel of each Gaussian, and the Gaussian in front of each pixel; None: not known yet.
         names: The views' names (image file names where known).
         large_photos: The photos with more pixels than the views, or None.
@@ -381,9 +396,11 @@ class Scene:
         return f"Scene({len(self.gaussians):,} Gaussians, {views}{images}{own})"
 
     def numpy(self) -> Scene:
-        """Return the same scene with NumPy arrays in place of tensors."""
+        """Return the same scene with NumPy arrays in place of tensors, images in [0, 1]; ValueError for others."""
         names = [name for name in PER_PIXEL if getattr(self, name) is not None]
         arrays: dict[str, Any] = {name: as_array(getattr(self, name)) for name in names}
+        if self.images is not None:
+            arrays["images"] = as_pictures(self.images)
         return replace(self, gaussians=self.gaussians.numpy(), cameras=self.cameras.numpy(), **arrays)
 
     @property

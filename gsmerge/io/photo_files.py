@@ -50,6 +50,7 @@ _BITS_TAG, _SAMPLES_TAG = 258, 277
 _MAX_TAGS = 1 << 16  # that are looked at; decoders read fewer
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 _FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100  # bytes of a scene's decoded photos; 0.03 bytes a pixel are few
+_WHITES = 1, 255, 65535  # of pictures of 0 and 1 or of fractions, of eight bits, of sixteen
 _BAND = 256  # rows of a mask that are converted at once
 _PARTS = {  # of each side of a photo that is decoded
     1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
@@ -222,9 +223,10 @@ def same_shape(size: Size, other: Size) -> bool:
 
 
 def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
-    """Decode the brightness ``[h,w]`` uint8 of a mask, of which 255 is its maximum.
+    """Decode the brightness ``[h,w]`` uint8 of a mask, times its opacity; 255 is white.
 
-    The memory limit is that of its bytes and of its ``photo`` together, since masks compress to almost nothing.
+    White is 1 in a picture of 0 and 1 alone, and in one of fractions. The memory limit is that of its bytes and of its
+    ``photo`` together, since masks compress to almost nothing.
     """
     budget = _photo_budget(path, *([] if photo is None else [photo]))
 
@@ -232,25 +234,25 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
         _check_channels(budget, image)
         if image.mode[0] in "IF":  # more than 8 bits
             return np.asarray(image)
-        has_alpha = "A" in image.getbands()
-        grey = np.empty(image.size[::-1], np.uint16 if has_alpha else np.uint8)
+        grey = np.empty(image.size[::-1], np.uint8)
         for top in range(0, image.height, _BAND):  # whose copies take little memory
             band = image.crop((0, top, image.width, min(top + _BAND, image.height)))
             rows = grey[top : top + _BAND]
             rows[:] = band.convert("L")
-            if has_alpha:
-                rows *= np.asarray(band.getchannel("A"))
+            if "A" in image.getbands():
+                rows[:] = np.round(rows * np.asarray(band.getchannel("A"), np.float32) / 255)
         return grey
 
     grey = _decode_channel(path, brightness)
     assert grey is not None
     most = float(grey.max(initial=0))
-    if grey.dtype == np.uint8 and most in (0, 255):
+    white = next((white for white in _WHITES if most <= white), most)
+    if grey.dtype == np.uint8 and white == 255:
         return grey
     levels = np.zeros(grey.shape, np.uint8)
-    for top in range(0, len(grey) if most > 0 else 0, _BAND):
+    for top in range(0, len(grey), _BAND):
         rows = slice(top, top + _BAND)
-        levels[rows] = np.round(np.clip(grey[rows] * (255 / most), 0, 255))
+        levels[rows] = np.round(np.clip(grey[rows] * (255 / white), 0, 255))
     return levels
 
 

@@ -27,7 +27,7 @@ from gsmerge.report import html_table
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.evaluate import EvaluateOptions
-from gsmerge.types import Cameras, Gaussians, Scene, Views, as_array
+from gsmerge.types import Cameras, Gaussians, Scene, Views, as_pictures
 
 MENDED = (
     "the photos of the input views differ from their Gaussians or each other in tone, exposure or by what covers them,"
@@ -222,11 +222,11 @@ def evaluate(
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
-    given = scene
+    given = scene if scene.images is None else replace(scene, images=as_pictures(scene.images))
     scene, mended = judged_pictures(given)
     inputs, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
     if targets is not None:
-        targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
+        targets = replace(targets, cameras=targets.cameras.numpy(), images=as_pictures(targets.images))
         targets = shrink_views(targets, options.photo_side)
     cameras = {name: shrink_cameras(moved.numpy(), options.photo_side) for name, moved in cameras.items()}
     with use_threads(options.threads):

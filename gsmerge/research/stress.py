@@ -34,7 +34,8 @@ UTM = (4.0e5, 5.0e6, 100.0)  # metres, as in map coordinates
 
 PROPERTIES: dict[Check, str] = {
     "better": "not below its own input by more than {worse:g} dB",
-    "same": "as many Gaussians within 0.5 %, not more than {same:g} dB below the unchanged scene",
+    "same": "as many Gaussians within 0.5 %, with those that no photo shows, not more than {same:g} dB below the "
+    "unchanged scene",
     "near": "not more than {near:g} dB below the unchanged scene",
     "once": "at most 1.05 times the Gaussians, not more than {same:g} dB below the unchanged scene",
     "bits": "the same result, bit for bit",
@@ -188,6 +189,7 @@ class _Result:
     """A compact result with its figures."""
 
     gaussians: Gaussians
+    count: int  # of the Gaussians, with those that no photo shows
     before: float
     after: float
 
@@ -250,7 +252,8 @@ def _check_case(case: Case, setup: StressScene, base: _Result, options: CompactO
 
 def _run(setup: StressScene, options: CompactOptions) -> _Result:
     result = compact(setup.scene, options)
-    return _Result(result.gaussians, *_quality(setup, result.gaussians))
+    count = len(result.gaussians) + result.report.choices.get("pruned", 0)
+    return _Result(result.gaussians, count, *_quality(setup, result.gaussians))
 
 
 def _quality(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
@@ -266,9 +269,9 @@ def _slack(options: CompactOptions) -> float:
 
 
 def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> tuple[bool, str]:
-    count, former = len(result.gaussians), len(base.gaussians)
-    figures = f"{count:,} Gaussians, {result.after:.2f} dB"
-    both = f"{figures}; unchanged {former:,}, {base.after:.2f} dB"
+    count, former = result.count, base.count
+    figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
+    both = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
     if case.check == "better":
         if math.isinf(result.before):
             return True, f"{figures} against renders of the input"

@@ -133,11 +133,14 @@ def _stack(values: Sequence[np.ndarray | None], usual: bool | np.float32, shape:
 def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | None]) -> str:
     """Describe how many photos have a picture of what is to be protected, and how much that is."""
     count = sum(mask is not None for mask in masks)
-    share = 0.0 if importance is None else float((importance >= PROTECTED / 2).mean())
+    most = 1.0 if importance is None else float(importance.max())
     photos = f"{count} photo{'' if count == 1 else 's'} of {len(masks)}"
-    if share == 0:
+    if importance is None or most <= 1:
         return f"protect: nothing is white in the pictures of {photos}, so nothing counts more"
-    return f"protect: {100 * share:.1f} % of the photos' pixels count {PROTECTED:g} times, of {photos}"
+    is_white = most >= PROTECTED / 2
+    share = 100 * float((importance >= (PROTECTED / 2 if is_white else (1 + most) / 2)).mean())
+    times = f"{PROTECTED:g}" if is_white else f"at most {most:.2g}"
+    return f"protect: {share:.1f} % of the photos' pixels count {times} times, of {photos}"
 
 
 def _match_masks(files: SceneFiles, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:

@@ -96,7 +96,7 @@ def test_what_a_grid_leaves_behind(charted_scene: Path) -> None:
 @pytest.mark.slow
 def test_the_bytes_are_those_of_the_file(charted_scene: Path, tmp_path: Path) -> None:
     record = runs(charted_scene / "out")["gsmerge, budget 1%, fit none"]
-    result = gsmerge.compact(gsmerge.read_scene(charted_scene / "room"), budget="1%", fit="none")
+    result = gsmerge.compact(gsmerge.read_scene(charted_scene / "room"), budget="1%", fill=True, fit="none")
     gsmerge.write_ply(tmp_path / "small.ply", result.gaussians)
     assert (tmp_path / "small.ply").stat().st_size == record.bytes
 

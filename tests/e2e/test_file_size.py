@@ -56,12 +56,14 @@ def test_states_and_batch_meet_it(
     name: str, size: int, small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
-    many, bare = ("--set", "superpixels=40%", "--set", "checkpoint=none", "-q"), ("--fit", "none", "-q")
+    many = ("--set", "superpixels=40%", "--set", "checkpoint=none", "-q")
+    bare, filled = ("--fit", "none", "-q"), ("--set", "fill=true")
     run("extend", tmp_path / "a.gsm", small_scene, *many, code=0)
-    run("compact", tmp_path / "a.gsm", "-o", tmp_path / "out" / name, "--budget", f"{size}B", *bare, code=0)
+    run("compact", tmp_path / "a.gsm", "-o", tmp_path / "out" / name, "--budget", f"{size}B", *filled, *bare, code=0)
     assert 0.97 * size <= (tmp_path / "out" / name).stat().st_size <= size
     folder = tmp_path / "batch"
-    run("batch", small_scene, "-o", folder, "--name", name, "--budget", f"{size}B", *QUICK[:-1], "--quiet", code=0)
+    size_asked = ("--budget", f"{size}B", *filled)
+    run("batch", small_scene, "-o", folder, "--name", name, *size_asked, *QUICK[:-1], "--quiet", code=0)
     (written,) = folder.rglob(name)
     assert 0.97 * size <= written.stat().st_size <= size
 

@@ -41,7 +41,8 @@ def test_a_budget_is_met_with_networks_and_without(make_scene: Callable[..., Pat
     for checkpoint in ("none", str(SHIPPED)):
         given = gsmerge.compact(scene, checkpoint=checkpoint, k=k, budget=budget, **faint)
         assert len(given.gaussians) == budget
-        counts[checkpoint] = len(gsmerge.compact(scene, checkpoint=checkpoint, k=k, **faint).gaussians)
+        unpruned = gsmerge.compact(scene, checkpoint=checkpoint, k=k, min_contribution=0, **faint)
+        counts[checkpoint] = len(unpruned.gaussians)
     assert counts["none"] < counts[str(SHIPPED)]
 
 
@@ -57,7 +58,7 @@ def test_the_benchmark_compares_at_equal_count(
     monkeypatch.setattr(benchmark, "read_held_out", lambda folder: read_held_out(load, made / "targets"))
     store = benchmark.Store(tmp_path / "runs.jsonl")
     args = argparse.Namespace(checkpoint=SHIPPED, lpips=False, cache=tmp_path, store=store)
-    condition = benchmark.Condition("no fit", {"fit": "none", "min_opacity": 0.5, "k": 2})
+    condition = benchmark.Condition("no fit", {"fit": "none", "min_opacity": 0.5, "min_contribution": 0, "k": 2})
     own = {learned: benchmark.run(made, condition, args, learned=learned) for learned in (False, True)}
     before, after = benchmark.at_equal_count(made, condition, args)
     assert own[False]["count"] < own[True]["count"]

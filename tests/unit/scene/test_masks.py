@@ -122,7 +122,16 @@ def test_bright_pixels_count_by_their_opacity(tmp_path: Path) -> None:
     levels = np.random.default_rng(0).integers(0, 256, (600, 3, 2), np.uint8)
     write(tmp_path / "a.png", np.dstack([levels[..., 0]] * 3 + [levels[..., 1]]))
     products = levels[..., 0].astype(int) * levels[..., 1]
-    assert np.array_equal(decode_levels(tmp_path / "a.png"), np.round(products * (255 / products.max())))
+    assert np.array_equal(decode_levels(tmp_path / "a.png"), np.round(products / np.float32(255)))
+
+
+@pytest.mark.parametrize(("most", "dtype", "white"), [
+    (1, np.uint8, 255), (64, np.uint8, 64), (255, np.uint8, 255), (1, np.uint16, 255), (32768, np.uint16, 128),
+])  # fmt: skip
+def test_grey_is_a_weight(tmp_path: Path, most: int, dtype: type, white: int) -> None:
+    """Only a picture of 0 and 1 alone is stretched."""
+    write(tmp_path / "a.png", np.array([[0, most, 0]], dtype))
+    assert decode_levels(tmp_path / "a.png").tolist() == [[0, white, 0]]
 
 
 def test_a_mask_may_take_what_its_photo_allows(tmp_path: Path) -> None:

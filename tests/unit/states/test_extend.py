@@ -180,9 +180,10 @@ def test_a_state_comes_back_from_its_file(room: Scene, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 2, 3])
 def test_batches_of_any_size(size: int) -> None:
-    """For as many Gaussians no more than 0.3 dB below all views at once, on average over scenes of six views.
+    """For as many Gaussians no more than 0.5 dB below all views at once, on average over scenes of six views.
 
-    Over three seeds, too: of the wall with its 40 dB they differ by 6.
+    Over three seeds, too: of the wall with its 40 dB they differ by 6. Of what late splits gain, all views at once have
+    .4 dB, batches .1.
     """
     differences = []
     for shape in SHAPES.values():
@@ -192,7 +193,7 @@ def test_batches_of_any_size(size: int) -> None:
             results = compact(scene, budget=400, checkpoint="none", seed=seed), state.compact(budget=400, seed=seed)
             whole, batched = (scenes.psnr_of(result.gaussians, scene) for result in results)
             differences.append(batched - whole)
-    assert np.mean(differences) > -0.3
+    assert np.mean(differences) > -0.5
 
 
 def test_wrong_use(room: Scene) -> None:

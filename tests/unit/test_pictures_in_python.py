@@ -1,0 +1,52 @@
+"""Pictures as Python code has them: of bytes, of numbers up to 255, beyond [0, 1]."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+
+import gsmerge
+from gsmerge import Scene
+from gsmerge.types import Views, as_pictures
+
+QUICK = {"effort": "draft", "fit": "none", "checkpoint": "none"}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
+
+
+def test_bytes_are_scaled(scene: Scene) -> None:
+    levels = np.round(scene.images * 255)
+    assert as_pictures(levels.astype(np.uint8)).dtype == np.float32
+    rounded, of_bytes = (
+        gsmerge.compact(replace(scene, images=images), **QUICK)
+        for images in ((levels / 255).astype(np.float32), levels.astype(np.uint8))
+    )
+    assert of_bytes.report.psnr_after == pytest.approx(rounded.report.psnr_after, abs=1e-3)
+    assert not any("another look" in note for note in of_bytes.report.notes)
+
+
+@pytest.mark.parametrize(("change", "remedy"), [
+    (lambda images: images * 255, "divide them by 255"), (lambda images: images - 0.5, "clip them"),
+    (lambda images: images * 3, "divide|clip"), (lambda images: images * np.float32(np.nan), "clip them"),
+])  # fmt: skip
+def test_others_are_refused(scene: Scene, change: Any, remedy: str) -> None:
+    images = change(scene.images)
+    with pytest.raises(ValueError, match=remedy):
+        gsmerge.compact(replace(scene, images=images), **QUICK)
+    views = Views(scene.cameras, images, scene.names)
+    with pytest.raises(ValueError, match=remedy):
+        gsmerge.evaluate(scene, {}, views)
+    with pytest.raises(ValueError, match=remedy):
+        gsmerge.evaluate(replace(scene, images=images), {"a": scene.gaussians})
+
+
+def test_what_rounding_leaves_is_taken(scene: Scene) -> None:
+    images = scene.images * np.float32(1.001)
+    assert as_pictures(images) is images
