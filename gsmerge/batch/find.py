@@ -28,17 +28,19 @@ SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
 
 def scene_plys(scene: Path) -> list[Path]:
     """List the files of a scene, given one of them or their folder; empty if the folder cannot be read as a scene."""
-    with suppress(SceneError):
+    with suppress(SceneError, OSError):
         return list_plys(scene) if os.path.isdir(scene) else [scene]
     return []
 
 
 def main_file(scene: Path) -> Path:
-    """Find the file that identifies a scene; the folder itself if several files could."""
+    """Find the file that identifies a scene; the folder itself if several files could, or it cannot be read."""
     if not os.path.isdir(scene):
         return scene
-    plys = other_plys(scene)
-    return named_ply(scene) or (plys[0] if len(plys) == 1 else scene)
+    with suppress(OSError):  # reading the scene says why
+        plys = other_plys(scene)
+        return named_ply(scene) or (plys[0] if len(plys) == 1 else scene)
+    return scene
 
 
 def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:

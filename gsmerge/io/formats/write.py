@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from os import fspath
 from pathlib import Path
 
 from gsmerge.io.atomic import AddOutput, atomic_output
 from gsmerge.io.formats import ply
-from gsmerge.io.formats.table import Contents, NamedPhotos, find_format, output_format
+from gsmerge.io.formats.table import OUTPUT_FORMATS, PLY, Contents, NamedPhotos, find_format, output_format
 from gsmerge.types import Gaussians, StrPath
 
 
@@ -78,7 +79,7 @@ def write_gaussians(
     chosen = output_format(ending or path)
     if chosen.encode is None:
         degree = min(gaussians.sh_degree, chosen.max_degree)
-        write_ply(path, gaussians, overwrite=overwrite, sh_degree=degree, comments=comments, normals=normals)
+        _write_ply(path, gaussians, overwrite, degree, comments, normals)
         return
     check_readable(gaussians, comments)
     with atomic_output(path, overwrite=overwrite) as temporary:
@@ -109,13 +110,22 @@ def write_ply(
 
     Raises:
         SceneError: If the file exists or cannot be written.
-        ValueError: If there is no Gaussian, NaN or inf, fewer harmonics than asked for, a comment is no line of ASCII,
-            or there are half a million characters of them.
+        ValueError: If the name is that of another format, there is no Gaussian, NaN or inf, fewer harmonics than asked
+            for, a comment is no line of ASCII, or there are half a million characters of them.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget=300)
         >>> gsmerge.write_ply("demo/small.ply", result.gaussians, overwrite=True)
     """
+    if fspath(path).lower().endswith(tuple(ending for ending in OUTPUT_FORMATS if ending != PLY.ending)):
+        raise ValueError(f"path: expected a name that ends in .ply, got {fspath(path)}; write_gaussians writes that")
+    _write_ply(path, gaussians, overwrite, sh_degree, comments, normals)
+
+
+def _write_ply(
+    path: StrPath, gaussians: Gaussians, overwrite: bool, sh_degree: int | None, comments: Sequence[str], normals: bool
+) -> None:
+    """Write a ``.ply`` to a file of any name."""
     check_readable(gaussians, comments)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= gaussians.sh_degree:

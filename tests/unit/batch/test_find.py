@@ -6,6 +6,7 @@ import os
 import pathlib
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from batches import touch
 from messages import refuses
 from tiny_scene import Tiny, write_npz
 
-from gsmerge.batch.find import find_scenes
+from gsmerge.batch.find import find_scenes, main_file, scene_plys
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.scene.files import find_scene_files
 
@@ -155,6 +156,21 @@ def test_a_folder_that_cannot_be_read_is_a_scene_that_fails() -> None:
     if sys.version_info < (3, 13):  # whose pathlib calls what the fixture put in the place of os.scandir
         with refuses(SceneError, "all/locked", "Permission denied"):
             find_scene_files(Path("all/locked"))
+
+
+def test_a_folder_whose_files_may_not_be_looked_at_is_its_own_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that it fails alone, when it is read."""
+    touch("all/locked/a.ply")
+    stat = os.stat
+
+    def refuse(path: str | Path, *args: Any, **kwargs: Any) -> os.stat_result:
+        if Path(path).parent.name == "locked":
+            raise PermissionError(13, "Permission denied", str(path))
+        return stat(path, *args, **kwargs)
+
+    monkeypatch.setattr(os, "stat", refuse)
+    assert main_file(Path("all/locked")) == Path("all/locked")
+    assert scene_plys(Path("all/locked")) == []
 
 
 @pytest.mark.parametrize(

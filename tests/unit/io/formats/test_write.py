@@ -253,3 +253,12 @@ def test_impossible_values_are_refused(tmp_path: Path, tiny: Tiny) -> None:
         with refuses(ValueError, "", "finite"):
             write_ply(tmp_path / "a.ply", replace(tiny.gaussians, **{field: values}))
         assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", [*QUANTISED, ".SPZ"])
+def test_a_ply_under_the_name_of_another_format_is_refused(ending: str, scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"\.ply.*write_gaussians"):
+        write_ply(tmp_path / f"a{ending}", scene.gaussians)
+    write_ply(tmp_path / "a", scene.gaussians)
+    write_gaussians(tmp_path / "b.spz", scene.gaussians, ending=".ply")
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b.spz").read_bytes()
