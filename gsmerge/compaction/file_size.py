@@ -43,7 +43,7 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
         size, count = measure_bytes(built[-1].gaussians, file, built[-1].cameras), len(built[-1].gaussians)
         asked = max(count, built[-1].count or 0)  # what nobody sees is left out, and its bytes are not filled up
         whole = rest + (size - rest) * asked / max(count, 1)
-        room = min(int(SURPLUS * asked * (most - rest) / max(whole - rest, 1)), plan.limits.most)
+        room = min(int(SURPLUS * count * (most - rest) / max(size - rest, 1)), plan.limits.most)
         fits = room >= (1 - MOST_DROPPED) * count and (whole >= NEAR_SHARE * most or room <= SURPLUS * asked)
         return None if fits or len(built) > MAX_REBUILDS else room
 

@@ -50,10 +50,8 @@ class Fitted:
     outside: Outside | None = None  # Where it was to put nothing; None: not known
 
 
-def record_fit(report: FitReport | None, planned: int) -> None:
-    """Add the report of a fit of so many ``planned`` steps to the current record; None: there was no fit."""
-    if report is None:
-        return
+def record_fit(report: FitReport, planned: int) -> None:
+    """Add the report of a fit of so many ``planned`` steps to the current record."""
     choose(fit=report.to_dict())
     if report.stopped == TIME_SPENT and report.steps < planned:
         note(f"time_budget ended the fit after {report.steps} of {planned} steps")

@@ -179,9 +179,9 @@ def _continue_surfaces(
     eye, rays = camera.centres[0], matmul(matmul(pixels, invert(K).T), viewmat[:3, :3])  # to depth 1
     tried = np.array(DEEPER)[:, None] * (sums[:, 4] / sums[:, 0]).astype(np.float64)
     points = (eye + tried[..., None] * rays).reshape(-1, 3)
-    wrong = np.logical_or(*(some.contradict(points) for some in seen))
-    if not beyond:
-        wrong |= ~seen[0].show(points)
+    wrong = np.zeros(len(points), bool) if beyond else ~seen[0].show(points)
+    for some in seen:
+        wrong[~wrong] = some.contradict(points[~wrong])
     if outside is not None:
         wrong[~wrong] = outside.contradict(points[~wrong], FRONT)
     hidden = ~wrong.reshape(tried.shape)
