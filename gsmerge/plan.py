@@ -471,7 +471,8 @@ def _merge_unseen(
     if clean_options.asked:
         from gsmerge.stages.clean import clean
 
-        merged, _ = clean(merged, clean_options, scene.cameras, scene.images, prepared.frame.leave)
+        rows, _ = clean(merged, clean_options, scene.cameras, scene.images, prepared.frame.leave)
+        merged = merged[rows]
     return merged, num_input
 
 

@@ -69,14 +69,16 @@ class _Model:
         return count * float(log((errors * errors).mean())) + self.free * float(log(count))
 
 
-def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | None:
+def calibrate(pairs: Correspondences, width: int, height: int, count: int = 0) -> Calibration | None:
     """Calibrate the cameras of views of ``width`` x ``height`` pixels from ``pairs`` of Gaussians and pixels.
 
-    None where the points do not determine cameras, or where Gaussians lie farther from their pixels than is allowed.
+    There are ``count`` views, or as many as pairs show; one without pairs has the camera of the view before. None where
+    the points do not determine cameras, or where Gaussians lie farther from their pixels than is allowed.
     """
     if not len(pairs.rows):
         return None
-    views = [pairs.select(pairs.views == view) for view in range(int(pairs.views.max(initial=-1)) + 1)]
+    numbers = np.unique(pairs.views)
+    views = [pairs.select(pairs.views == view) for view in numbers]
     middle = np.median(pairs.points, 0)
     unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
     points, pixels = [(view.points - middle) / unit for view in views], [view.pixels for view in views]
@@ -88,7 +90,9 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
         return None
     viewmats = model.poses.copy()
     viewmats[:, :3, 3] = unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], middle)
-    return Calibration(Cameras(viewmats, model.Ks, width, height), model.worst_px)
+    every = np.arange(max(count, int(numbers[-1]) + 1))
+    camera = np.maximum(np.searchsorted(numbers, every, side="right") - 1, 0)
+    return Calibration(Cameras(viewmats[camera], model.Ks[camera], width, height), model.worst_px)
 
 
 def _choose_model(

@@ -33,7 +33,7 @@ def estimate_cameras(
     fits = []
     for layout in possible:
         pairs = find_correspondences(gaussians.means, valid, subsample(layout, _GRID_GAUSSIANS))
-        fit = calibrate(pairs, layout.width, layout.height)
+        fit = calibrate(pairs, layout.width, layout.height, len(names))
         fits += [] if fit is None else [fit]
     fits.sort(key=lambda fit: fit.worst_px)
     if not fits or (len(fits) > 1 and not is_clearly_nearer(fits[0].worst_px, fits[1].worst_px)):

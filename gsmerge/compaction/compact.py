@@ -181,7 +181,8 @@ def _clean(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gaussians, d
     from gsmerge.stages.clean import clean
 
     cameras = None if prepared.reference.placed else fitted.cameras  # placed ones judge a scene, and do not show it all
-    return clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
+    rows, counts = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
+    return fitted.gaussians[rows], counts
 
 
 def _note_clean(counts: dict[str, int], left: int, count: int | None, prepared: Prepared) -> None:

@@ -19,6 +19,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, upward_axis
+from gsmerge.io.formats.extra_columns import describe_extra_columns, join_extra_columns, read_extra_columns
 from gsmerge.io.formats.read import FileInfo, kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import DEPTHS, Contents, Format, NamedPhotos, find_format
@@ -75,7 +76,8 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
             near = find_scene_files(options.inputs[0]).cameras if options.cameras != NONE else None
             raise SceneError(options.inputs[0], problem, f"name them with --cameras {near or 'FILE'}")
         count = len(gaussians)
-        gaussians, left_out = _clean(gaussians, options, stored)
+        rows, left_out = _clean(gaussians, options, stored)
+        gaussians = gaussians[rows]
         if len(gaussians) == 0:
             problem = f"expected Gaussians that are kept, found none of {count:,}"
             raise SceneError(options.inputs[0], problem, "look where the scene lies with gsmerge inspect")
@@ -86,9 +88,11 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
             raise UsageError(f"--scale, --translate: expected a scene of 1e-30 to 1e30 across, would be {side:.0e}")
     gaussians = pad_harmonics(gaussians, NUM_FULL) if options.full_columns else gaussians
     infos = [file.info for file in files]
+    columns, missing = join_extra_columns([read_extra_columns(file.info)[file.valid] for file in files])
+    columns = columns[rows]
     named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
-    notes += unread
+    notes += [*unread, *describe_extra_columns(columns, missing, chosen, moves=options.placement.moves)]
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, left_out["unseen"], count, None if stored is None else stored.path)
     grey = [path for path in options.inputs if find_format(path) is DEPTHS and not holds_images(path)]
@@ -101,7 +105,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
-    num_bytes, beside = _write(options, chosen, gaussians, moved, photos, names, comments)
+    num_bytes, beside = _write(options, chosen, gaussians, columns, moved, photos, names, comments)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": chosen.ending}
     read = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     named_cameras = None if stored is None else str(stored.path)
@@ -172,8 +176,8 @@ def _photo_folder(options: ConvertOptions, stored: CameraFile | None) -> Path | 
 
 def _clean(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
-) -> tuple[Gaussians, dict[str, int]]:
-    """Crop the Gaussians and drop unwanted ones; return the rest, and the number dropped for each reason."""
+) -> tuple[np.ndarray, dict[str, int]]:
+    """Crop the Gaussians and drop unwanted ones; return the rows of the rest, and counts of the others."""
     drops = options.clean.drops
     if not {"sky", "unseen"} & set(drops) or len(gaussians) == 0:
         return clean(gaussians, options.clean, None, None, lambda g: g)
@@ -189,14 +193,14 @@ def _clean(
     placed = place_viewpoints(gaussians) if cameras is None else cameras
     frame = scene_frame(Scene(gaussians, placed, None, None, tuple(map(str, range(len(placed))))))
     canonical = frame.enter(replace(gaussians, means=gaussians.means.astype(np.float64)))
-    left, counts = clean(canonical, options.clean, frame.enter_cameras(placed), images, frame.leave)
-    return frame.leave(left), counts
+    return clean(canonical, options.clean, frame.enter_cameras(placed), images, frame.leave)
 
 
 def _write(
     options: ConvertOptions,
     chosen: Format,
     gaussians: Gaussians,
+    columns: np.ndarray,
     cameras: Cameras,
     photos: NamedPhotos,
     names: Sequence[str],
@@ -206,7 +210,9 @@ def _write(
     out, beside = options.output, None
     with atomic_outputs(overwrite=options.overwrite) as add:
         title = scene_title(options.inputs[0])
-        contents = Contents([gaussians], comments, cameras, photos, title, normals=options.normals, apart=options.site)
+        contents = Contents(
+            [gaussians], comments, cameras, photos, title, options.normals, options.site, extra_columns=columns
+        )
         written = chosen.write(add, out, add(out), contents)
         if len(cameras) and not chosen.cameras:
             beside = viewer_cameras_path(out)

@@ -19,6 +19,7 @@ from gsmerge.errors import DoubtWarning, SceneError, UsageError
 from gsmerge.facts.compare_photos import STRAY_PHOTOS
 from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
+from gsmerge.io.formats.columns import UNUSED, list_names
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents, find_format
@@ -172,12 +173,17 @@ def check_cameras(scene: Scene, out: Path) -> None:
         raise UsageError(f"{out}: expected a scene with cameras, got none")
 
 
-def _compact_notes(loaded: Loaded) -> tuple[str, ...]:
-    """Return a note if the scene is a result of gsmerge, by its header or by its small number of Gaussians."""
-    scene, comments = loaded.scene, loaded.info.comments
+def _compact_notes(loaded: Loaded) -> list[str]:
+    """Note columns that results lack, and a scene that is a result, by its header or its small number of Gaussians."""
+    scene, comments, notes = loaded.scene, loaded.info.comments, list[str]()
+    named = " ".join(note for note in loaded.info.adapted if note.startswith(UNUSED))
+    lost = [name for name in loaded.info.extra_columns if name not in named]
+    if lost:
+        notes.append(f"columns that merged Gaussians do not have: {list_names(lost)}; gsmerge convert copies them")
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
     few = is_from_gsmerge(comments) and scene.num_gaussians <= pixels / 2
-    if not few and RESULT_COMMENT not in comments:
-        return ()
-    count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
-    return (f"the scene is compact already ({count}, written by gsmerge): start from the original for more detail",)
+    if few or RESULT_COMMENT in comments:
+        count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
+        remedy = "start from the original for more detail"
+        notes.append(f"the scene is compact already ({count}, written by gsmerge): {remedy}")
+    return notes

@@ -34,7 +34,7 @@ from gsmerge.io.cameras.camera_file import (
     check_camera,
     check_size,
 )
-from gsmerge.io.formats.read import clear_empty, clear_invalid
+from gsmerge.io.formats.read import clear_invalid, clear_rows, find_empty
 from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
 from gsmerge.types import NO_CAMERAS, Array, Cameras, Gaussians, Pixels, Scene, as_array, to_float32
@@ -215,8 +215,9 @@ def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, l
     out["quats"][off] = normalize(out["quats"][off])
     out["quats"][(out["quats"] == 0).all(1)] = (1, 0, 0, 0)
     notes = [f"{num_bad:,} row(s) with NaN or inf, set aside"] if num_bad else []
-    num_empty = clear_empty("means", out | {"valid": valid})
-    notes += [f"{num_empty:,} empty row(s) at the origin, set aside"] if num_empty else []
+    empty = find_empty("means", out | {"valid": valid})
+    clear_rows(out | {"valid": valid}, empty)
+    notes += [f"{len(empty):,} empty row(s) at the origin, set aside"] if len(empty) else []
     return Gaussians(**out), valid, notes
 
 

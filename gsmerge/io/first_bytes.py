@@ -10,7 +10,7 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 
 _PACKED_SCENES = (".spz", ".splat", ".sog", ".ksplat", ".npz", ".glb", ".gsm")
-_PHOTOS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+_PHOTOS = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff")
 NO_TEXT = (".ply", *_PACKED_SCENES, *_PHOTOS, ".torch", ".safetensors", ".bin")  # endings of what is never plain text
 _START = 1 << 10  # bytes of a file that are looked at
 _DOWNLOAD = "download it again, from a browser if it needs a click or a login"
@@ -47,6 +47,23 @@ FOREIGN: dict[str, tuple[str, str]] = {
     ".spx": ("a file of Reall3DViewer", "name the .ply that it was made from"),
     ".splatv": ("splats that move", "name a .ply of one moment"),
 }
+_RAW = ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"
+# Pictures that are not read: how people call them, the endings of their names, and a pattern of their first bytes
+OTHER_PICTURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    ("AVIF", (".avif",), r"(?s).{4}ftypavi[fs]"),
+    ("HEIC", (".heic", ".heif", ".hif"), r"(?s).{4}ftyp(hei|hev|mif1|msf1)"),
+    ("JPEG XL", (".jxl",), r"\xff\x0a|\0\0\0\x0cJXL "),
+    ("JPEG 2000", (".jp2", ".j2k", ".jpx"), r"\xff\x4f\xff\x51|\0\0\0\x0cjP  "),
+    ("GIF", (".gif",), r"GIF8"),
+    ("OpenEXR", (".exr",), r"v/1\x01"),
+    ("Radiance", (".hdr",), r"#\?R(ADIANCE|GBE)"),
+    ("Photoshop", (".psd", ".psb"), r"8BPS"),
+    ("DirectDraw", (".dds",), r"DDS "),
+    ("Targa", (".tga",), r"(?!)"),  # whose files begin with no mark
+    ("SVG", (".svg",), r"(?:<\?xml[^>]*>)?\s*<svg"),
+    ("raw", _RAW, r"(?s)FUJIFILMCCD-RAW|.{4}ftypcrx|II[RU][OS\0]"),  # others begin as TIFF does
+)
+CONVERT = "convert it to .jpg or .png"
 # In the order of trial
 OTHER_CONTENTS = (
     OtherContent("a Git LFS pointer", r"version https://git-lfs\.github\.com/spec/", "fetch it with: git lfs pull"),
@@ -77,6 +94,7 @@ OTHER_CONTENTS = (
     ),
 )  # fmt: skip
 _PATTERNS = tuple(re.compile(row.start.encode("latin-1")) for row in OTHER_CONTENTS)
+_PICTURES = tuple((name, re.compile(start.encode("latin-1"))) for name, _, start in OTHER_PICTURES)
 
 
 def read_start(path: Path, count: int = 1 << 12) -> bytes:
@@ -84,6 +102,16 @@ def read_start(path: Path, count: int = 1 << 12) -> bytes:
     with suppress(OSError), path.open("rb") as file:
         return file.read(count)
     return b""
+
+
+def refuse_picture(path: Path, *, by_name: bool) -> None:
+    """Raise SceneError for a picture of a format that is not read, by its first bytes, or else its name."""
+    start, ending = read_start(path, _START), path.suffix.lower()
+    names = [name for name, pattern in _PICTURES if pattern.match(start)]
+    names += [name for name, endings, _ in OTHER_PICTURES if by_name and ending in endings]
+    if names:
+        problem = f"expected an image, found a picture of the format {names[0]}, which is not read"
+        raise SceneError(path, problem, CONVERT)
 
 
 def check_first_bytes(path: Path, size: int) -> None:
@@ -97,6 +125,8 @@ def check_first_bytes(path: Path, size: int) -> None:
     if ending in FOREIGN:
         what, remedy = FOREIGN[ending]
         raise SceneError(path, f"expected a scene, found {what}", remedy)
+    if ending in _PHOTOS:
+        refuse_picture(path, by_name=False)
     start = read_start(path, _START)
     for row, pattern in zip(OTHER_CONTENTS, _PATTERNS, strict=True):
         match = pattern.match(start) if ending not in row.right and ending in (row.wrong or (ending,)) else None

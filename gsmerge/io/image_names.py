@@ -11,11 +11,11 @@ from pathlib import Path, PurePath, PurePosixPath
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import walk_files
-from gsmerge.io.first_bytes import FILM, FOREIGN
+from gsmerge.io.first_bytes import FILM, FOREIGN, OTHER_PICTURES
 from gsmerge.types import StrPath
 
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
-OTHER_PICTURES = frozenset({".heic", ".heif", ".avif", ".gif", ".jp2", ".jxl", ".exr", ".dng", ".raw", ".cr2", ".nef"})
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
+OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of pictures not read
 FILMS = frozenset(ending for ending, (what, _) in FOREIGN.items() if what == FILM)
 _CUT = "cut it into the frames that the model saw: ffmpeg -i FILM photos/%05d.jpg"
 _MAX_PARTS = 16  # of a path, its name and the folders above, by which files are found
@@ -129,7 +129,7 @@ def check_photo_folder(path: Path) -> None:
     """Raise SceneError if a path is a film or a picture, or a folder without a photo that is read."""
     if path.suffix.lower() in FILMS and path.is_file():
         raise SceneError(path, "expected a folder of photos, found a film", _CUT)
-    if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_PICTURES and path.is_file():
+    if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES and path.is_file():
         raise SceneError(path, "expected a folder of photos, found a picture", "name its folder")
     if not path.is_dir() or list_images(path):
         return
@@ -150,8 +150,8 @@ def describe_unread(folder: Path, places: Sequence[str]) -> list[str]:
 def _find_unread(files: Sequence[Path]) -> tuple[str, str] | None:
     """Describe pictures or films among files that are not read, and what to do about them; None without any."""
     found = Counter(file.suffix.lower() for file in files)
-    if pictures := sum(found[ending] for ending in OTHER_PICTURES):
-        endings = " and ".join(sorted(ending for ending in found if ending in OTHER_PICTURES))
+    if pictures := sum(found[ending] for ending in OTHER_SUFFIXES):
+        endings = " and ".join(sorted(ending for ending in found if ending in OTHER_SUFFIXES))
         return f"{pictures} {endings}", "convert them to .jpg or .png, with their names"
     return (FILM, _CUT) if any(found[ending] for ending in FILMS) else None
 

@@ -17,6 +17,7 @@ from PIL import Image
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
+from gsmerge.io.first_bytes import refuse_picture
 from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import turn_picture
@@ -30,7 +31,7 @@ _ORIENTATION_TAG = 274
 # Turn that each tag asks for: quarter turns counterclockwise, and 4 more where the photo is mirrored first
 _TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
 _MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of any file: four floats a pixel, and profiles or thumbnails
-_OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".ppm"})
+_OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
 _HALF_OPAQUE = 127
 ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a multiple of 14 by itself
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
@@ -319,6 +320,12 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
 def _undecodable(path: Path, size: Size) -> SceneError:
     """Make the error of an image that a library did not decode; MemoryError if there was no memory for it."""
     np.empty((_CHANNELS + _EMBEDDED_BYTES, *size), np.uint8)  # libraries do not tell
+    return _unreadable(path)
+
+
+def _unreadable(path: Path) -> SceneError:
+    """Make the error of a file that is no image of a format that is read."""
+    refuse_picture(path, by_name=True)
     return SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
 
 
@@ -377,7 +384,7 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
         problem = f"expected at most {MAX_PIXELS // 1_000_000} million pixels an image, found more"
         raise SceneError(path, problem) from error
     except Exception as error:  # whatever a damaged header makes the library raise
-        raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it") from error
+        raise _unreadable(path) from error
     check_pixels(path, width, height)
     return (width, height), max(_COPIES[0] * _CHANNELS, _CHANNELS + pixel_bytes)
 

@@ -14,7 +14,7 @@ from gsmerge.io.cameras.npz_files import array_names, missing_of_depths
 from gsmerge.io.first_bytes import FOREIGN
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
-from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_PICTURES, list_images
+from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES, list_images
 from gsmerge.scene.files import IMAGE_PLACES
 
 MAX_FOLDERS = 100  # in a folder of scenes that are looked into
@@ -109,7 +109,7 @@ def _content(folder: Path) -> tuple[str, str] | None:
     if foreign is not None:
         what, remedy = FOREIGN[foreign.suffix.lower()]
         return f"{what} ({foreign.name})", remedy
-    beside = any(path.suffix.lower() in IMAGE_SUFFIXES | OTHER_PICTURES for path in folder.glob("[!.]*"))
+    beside = any(path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES for path in folder.glob("[!.]*"))
     return _PHOTOS if beside or any(list_images(folder / place) for place in IMAGE_PLACES) else None
 
 

@@ -6,6 +6,7 @@ Names and folders propose a file for each camera; what the photos show decides (
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -23,9 +24,10 @@ from gsmerge.evidence.pictures import ViewPictures, show_views
 from gsmerge.evidence.rays import find_on_rays
 from gsmerge.evidence.scores import stands_out
 from gsmerge.frame import canonicalise
-from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import CHUNK, read_cameras
+from gsmerge.io.first_bytes import CONVERT
 from gsmerge.io.formats.table import is_frame
 from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_key, propose_images
 from gsmerge.io.photo_files import (
@@ -99,6 +101,15 @@ class Proposal:
         """The files as they are proposed, as they are stored."""
         return [None if photo is None else Assignment(photo, 0) for photo in self.named]
 
+    def without_views(self, cameras: Sequence[int]) -> Proposal:
+        """Return a copy that says of cameras without Gaussians why they have no photo."""
+        faults = list(self.faults)
+        for camera in cameras:
+            photo = self.named[camera]
+            which = f"view {camera}" if photo is None else _inside(self.pool[photo], self)
+            faults[camera] = f"{which}: no Gaussian shows where it was taken"
+        return replace(self, faults=tuple(faults))
+
     def without_broken(self) -> Proposal | None:
         """Return a copy without the proposed files that cannot be decoded; None where all can be, or none."""
         named = [None if photo is None else self.pool[photo] for photo in self.named]
@@ -163,7 +174,7 @@ def _describe_missing(folder: Path, name: str) -> str:
     shown = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner
     if not others:
         return f"{shown}: no such file"
-    return f"{shown}: no such file, and {min(others)} is in no format that is read; convert it to .jpg or .png"
+    return f"{shown}: no such file, and {min(others)} is in no format that is read; {CONVERT}"
 
 
 def _keep_sound(proposal: Proposal, named: Sequence[Path | None], *, decode: bool = False) -> Proposal:
@@ -197,7 +208,7 @@ def _find_fault(path: Path, *, decode: bool = False) -> str | None:
         if decode:
             decode_image(path, size)
     except SceneError as error:
-        return error.problem
+        return f"{error.problem}; {CONVERT}" if error.remedy == CONVERT else error.problem
     return None
 
 
@@ -262,6 +273,30 @@ def read_photos(
     return ScenePhotos(decode_views(paths, turns, size), paths, turns, tuple(notes))
 
 
+def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, str] | None:
+    """Select the views whose photos have the shape that most have; None where all have, or one view alone is left.
+
+    Returns their cameras and photos, and a note on the others.
+    """
+    paths = [None if photo is None else proposal.pool[photo] for photo in proposal.named]
+    stored = zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)
+    sizes = [size if path is None else image_size(path) for path, size in zip(paths, stored, strict=True)]
+    usual = Counter(size for size, path in zip(sizes, paths, strict=True) if path is not None).most_common(1)[0][0]
+    used = [view for view, size in enumerate(sizes) if min(size) <= 1 or same_shape(size, usual)]
+    if len(used) in (1, len(sizes)):
+        return None
+    others = [
+        f"{camera_file.names[view]} ({size[0]} x {size[1]})" for view, size in enumerate(sizes) if view not in used
+    ]
+    shape = f"have another shape than {usual[0]} x {usual[1]} and are left out"
+    note = f"{len(others)} of {len(sizes)} views {shape}: {list_some(others)}"
+    unused = {paths[view] for view in range(len(sizes)) if view not in used}
+    pool = tuple(path for path in proposal.pool if path not in unused)
+    faults = tuple(proposal.faults[view] for view in used)
+    fewer = replace(proposal, pool=pool, named=(), faults=faults)
+    return select_views(camera_file, used), _keep_sound(fewer, [paths[view] for view in used]), note
+
+
 def _turned_size(path: Path, turn: int) -> Size:
     width, height = image_size(path)
     return (height, width) if turn % 2 else (width, height)
@@ -296,13 +331,19 @@ def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
 
 
 def assign_to_views(
-    scene: Scene, cameras: Sequence[int], proposal: Proposal, *, read: bool, fit: GridFit | None = None
+    scene: Scene,
+    cameras: Sequence[int],
+    proposal: Proposal,
+    *,
+    read: bool,
+    guessed: Sequence[int] = (),
+    fit: GridFit | None = None,
 ) -> list[Assignment | None]:
     """Assign files to the views of a scene, each with its camera; see :func:`gsmerge.evidence.assign.assign_photos`.
 
     ``read``: whether the scene has the photos that names propose; other files are read small, and brought to the pixels
     of a grid by ``fit``. A photo with Gaussians of its colours on its rays stays, whatever their depths make of
-    drawings. Cameras that no view has keep what names propose.
+    drawings. Cameras that no view has keep what names propose; ``guessed`` ones have no photo.
     """
     views = [list(cameras).index(camera) for camera in dict.fromkeys(cameras)]  # layers of a camera have one photo
     named = [proposal.named[cameras[view]] for view in views]
@@ -331,7 +372,14 @@ def assign_to_views(
         right = find_on_rays(canonicalise(scene)[0], given, [images[view] for view in given])
         for view in {*left} & {view for view, stands in zip(given, right, strict=True) if stands}:
             chosen[cameras[view]] = usual[cameras[view]]
-    return chosen
+    return [None if camera in guessed else each for camera, each in enumerate(chosen)]
+
+
+def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
+    """List the views without Gaussians, of which cameras that are estimated from Gaussians are guesses."""
+    if camera_file.source != ESTIMATED or scene.pixels is None:
+        return []
+    return np.flatnonzero(~scene.pixels.shown.any((1, 2))).tolist()
 
 
 def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:

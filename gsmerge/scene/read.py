@@ -54,11 +54,13 @@ from gsmerge.scene.photos import (
     describe_assignment,
     describe_unused,
     fit_to_grid,
+    list_guessed,
     name_by_photos,
     photos_inside,
     propose_photos,
     read_photos,
     refuse_photos,
+    select_one_shape,
     shows_better,
     stored_photos,
     without_photo,
@@ -319,7 +321,7 @@ def _align(
         searched &= RESULT_COMMENT not in ply.info.comments  # beside which lie clips of it
         unread = describe_unread(files.ply.parent, IMAGE_PLACES) if searched else []
         return replace(load, notes=(*load.notes, *unread))
-    load = _assign(ply, files, camera_file, proposal, hints)
+    load = _assign_of_one_shape(ply, files, camera_file, proposal, hints)
     usual = proposal.folder
     seen = usual.parent / SEEN_PLACE
     if usual == seen or files.images is None or not seen.is_dir() or load.scene.images is None:
@@ -332,6 +334,20 @@ def _align(
             text = f"photos are those of {SEEN_PLACE}: they show what the Gaussians show, those of {usual.name} less"
             return replace(other, notes=(*other.notes, text))
     return load
+
+
+def _assign_of_one_shape(
+    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
+) -> Loaded:
+    """Combine as :func:`_assign`, without the views of another shape than most if all together cannot be used."""
+    try:
+        return _assign(ply, files, camera_file, proposal, hints)
+    except SceneError:
+        fewer = select_one_shape(camera_file, proposal)
+        if fewer is None:
+            raise
+    cameras, photos, note = fewer
+    return _assign(ply, files, cameras, photos, hints).with_left_out([note])
 
 
 def _assign(
@@ -355,7 +371,9 @@ def _assign(
         raise why or error from None
     if is_grid and proposal.pool:
         fit = fit_to_grid(bare.scene, proposal)
-    chosen = assign_to_views(bare.scene, bare.views.of_scene, proposal, read=whole is not None, fit=fit)
+    guessed, is_read = list_guessed(bare.scene, camera_file), whole is not None
+    proposal = proposal.without_views(guessed)
+    chosen = assign_to_views(bare.scene, bare.views.of_scene, proposal, read=is_read, guessed=guessed, fit=fit)
     if not any(chosen):
         if why is not None:
             raise why

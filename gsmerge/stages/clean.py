@@ -90,32 +90,34 @@ def floater_share(gaussians: Gaussians) -> float:
 
 def clean(
     gaussians: Gaussians, options: CleanOptions, cameras: Cameras | None, photos: np.ndarray | None, to_world: ToWorld
-) -> tuple[Gaussians, Counts]:
-    """Remove unwanted Gaussians; return the rest and the numbers removed: ``cropped``, and one for each of ``drop``.
+) -> tuple[np.ndarray, Counts]:
+    """Choose wanted Gaussians; return their rows, and the numbers of others: ``cropped``, and one for each of ``drop``.
 
     Gaussians and ``cameras`` are canonical; ``to_world`` maps to the frame of the crop. The sky is found in the
     ``photos [v,h,w,3]``; without cameras, what no placed camera shows is unseen.
     """
-    counts = {}
+    rows, counts = np.arange(len(gaussians)), Counts()
+
+    def remove(name: str, unwanted: np.ndarray) -> Gaussians:
+        nonlocal rows
+        rows, counts[name] = rows[~unwanted], int(unwanted.sum())
+        return gaussians[rows]
+
+    left = gaussians
     if "unseen" in options.drops:  # before others go that hide it
-        placed = place_viewpoints(gaussians) if cameras is None and len(gaussians) else cameras
-        shown = np.zeros(0, bool) if placed is None else count_views(gaussians, placed) > 0
-        gaussians, counts["unseen"] = gaussians[shown], int((~shown).sum())
+        placed = place_viewpoints(left) if cameras is None and len(left) else cameras
+        left = remove("unseen", np.ones(0, bool) if placed is None else count_views(left, placed) == 0)
     if options.crop is not None:
-        inside = inside_crop(to_world(gaussians).means, options.crop)
-        gaussians, counts["cropped"] = gaussians[inside], int((~inside).sum())
+        left = remove("cropped", ~inside_crop(to_world(left).means, options.crop))
     if "transparent" in options.drops:
-        faint = gaussians.opacities < LEAST_OPACITY
-        gaussians, counts["transparent"] = gaussians[~faint], int(faint.sum())
+        left = remove("transparent", left.opacities < LEAST_OPACITY)
     if "sky" in options.drops:
         assert cameras is not None, "sky is dropped where there are photos"
         assert photos is not None, "sky is dropped where there are photos"
-        above = sky(gaussians, cameras, photos)
-        gaussians, counts["sky"] = gaussians[~above], int(above.sum())
+        left = remove("sky", sky(left, cameras, photos))
     if "floaters" in options.drops:
-        isolated = floaters(gaussians)
-        gaussians, counts["floaters"] = gaussians[~isolated], int(isolated.sum())
-    return gaussians, counts
+        remove("floaters", floaters(left))
+    return rows, counts
 
 
 def describe_counts(counts: Counts, *, placed: bool) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import noted, refuses
+from plyfile import PlyData, PlyElement
 from splat_transform_programs import put_stand_in, run_here
 from sweeps import sweep
 
@@ -194,6 +195,35 @@ def test_several_files_are_joined(result: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(both.means[400:], flat.means, atol=1e-6)
     assert not both.shN[400:].any()
     assert len(join_gaussians([flat])) == 400
+
+
+def test_columns_of_the_users_own_stay_with_their_rows(result: Path, tmp_path: Path) -> None:
+    """Of any type, through cuts and joins; what a file cannot hold, or not all files have, is named."""
+    own = PlyData.read(str(result))["vertex"].data
+    rows = np.zeros(len(own), [*own.dtype.descr, ("label", "<i4"), ("confidence", "<f8"), ("vx", "<f4")])
+    for name in own.dtype.names:
+        rows[name] = own[name]
+    rows["label"], rows["confidence"], rows["vx"] = np.arange(len(own)), np.arange(len(own)) / 7, 1
+    rows["x"][3] = np.nan
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "own.ply"))
+    crop = "sphere:" + ",".join(f"{np.nanmedian(rows[name]):.6f}" for name in "xyz") + ",2"
+    cut = ConvertOptions([tmp_path / "own.ply"], tmp_path / "cut.ply", clean=CleanOptions(crop=crop))
+    document = convert_files(replace(cut, placement=PlacementOptions(scale=2.0)))
+    written = PlyData.read(str(tmp_path / "cut.ply"))["vertex"].data
+    assert 0 < len(written) < len(rows) - 1
+    source = rows[written["label"]]
+    np.testing.assert_array_equal(written["confidence"], source["confidence"])
+    np.testing.assert_allclose(written["x"], 2 * source["x"], rtol=1e-5)
+    assert noted(document["notes"], "copied as they are", "label, confidence, vx")
+    assert noted(document["notes"], "not moved: vx")
+
+    both = convert_files(ConvertOptions([tmp_path / "own.ply", tmp_path / "cut.ply"], tmp_path / "both.ply"))
+    joined = PlyData.read(str(tmp_path / "both.ply"))["vertex"].data
+    np.testing.assert_array_equal(joined["label"][len(rows) - 1 :], written["label"])
+    assert not noted(both["notes"], "left out")
+    for inputs, out in (([tmp_path / "own.ply", result], "less.ply"), ([tmp_path / "own.ply"], "own.spz")):
+        lost = convert_files(ConvertOptions(inputs, tmp_path / out))
+        assert noted(lost["notes"], "left out", "label, confidence, vx")
 
 
 def test_parts_are_kept_or_left_out(result: Path, tmp_path: Path) -> None:

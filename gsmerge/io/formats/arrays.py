@@ -33,6 +33,7 @@ QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 FILTER = "filter_3D"  # of Mip-Splatting: the standard deviation by which scales grow
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of a compressed PLY instead
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
+MAX_STRAY = 0.01  # share of a column's values that may contradict the rest: roundings and damage
 _EXACT = 1e-5  # by which a number that turns harmonics may differ from a whole one that it is
 _UNPACKING = 16_000_000  # bytes of the blocks that are unpacked at a time
 GAUSSIAN_BYTES = 4 * len(REQUIRED) + 1  # in memory, without higher harmonics, and whether it is finite
@@ -116,6 +117,11 @@ def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
     """Return the column names of the base colour: ``f_dc_*``, or those of plain colours where a file has none."""
     plain = (colors for colors in PLAIN_COLORS if set(colors) <= set(names or ()))
     return SH0 if names is None or SH0[0] in names else next(plain, SH0)
+
+
+def are_logarithms(scales: np.ndarray) -> bool:
+    """Return whether stored scales are logarithms: of standard deviations hardly any is negative."""
+    return bool(np.count_nonzero(scales < 0) > MAX_STRAY * scales.size)
 
 
 @dataclass(frozen=True)

@@ -85,11 +85,12 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
             by_kind.setdefault(kind, []).append(name)
     for kind, names in by_kind.items():
         if kind is not None and kind.remedy:
-            problem = f"expected Gaussians to be drawn as they are stored, found {_list(names)}: {kind.what}"
+            problem = f"expected Gaussians to be drawn as they are stored, found {list_names(names)}: {kind.what}"
             raise SceneError(path, problem, kind.remedy)
-    parts = [f"{_list(names)} ({kind.what}: {kind.effect})" for kind, names in by_kind.items() if kind and kind.what]
-    parts += [f"{_list(by_kind[None])} (unknown)"] if None in by_kind else []
-    parts += [f"{_list(layers)} (more Gaussians)"] if layers else []
+    known = [(kind, names) for kind, names in by_kind.items() if kind and kind.what]
+    parts = [f"{list_names(names)} ({kind.what}: {kind.effect})" for kind, names in known]
+    parts += [f"{list_names(by_kind[None])} (unknown)"] if None in by_kind else []
+    parts += [f"{list_names(layers)} (more Gaussians)"] if layers else []
     return (UNUSED + "; ".join(parts),) if parts else ()
 
 
@@ -104,6 +105,14 @@ def _check_types(path: Path, row: np.dtype[np.void]) -> None:
             raise SceneError(path, problem, "export it with floats")
 
 
-def _list(names: Sequence[str]) -> str:
+def describes_places(name: str) -> bool:
+    """Return whether a column may hold places or directions, such as a motion; labels and weights do not."""
+    kinds = (kind for kind, names in zip(COLUMN_KINDS, _PATTERNS, strict=True) if names.fullmatch(name))
+    kind = next(kinds, None)
+    return kind is None or bool(kind.what)
+
+
+def list_names(names: Sequence[str]) -> str:
+    """List the names of columns, of many the first ones."""
     more = len(names) - _MOST_NAMES
     return ", ".join(name[:_LONGEST] for name in names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")

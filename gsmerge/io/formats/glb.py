@@ -22,7 +22,17 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import quat_to_rotmat, rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats import spz
-from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored, turn_half, turner
+from gsmerge.io.formats.arrays import (
+    Columns,
+    Packed,
+    StoredRows,
+    are_logarithms,
+    to_bytes,
+    to_columns,
+    to_stored,
+    turn_half,
+    turner,
+)
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
@@ -302,7 +312,7 @@ def _read_splats(
     columns = (quats, scales, sh0, *([] if opacities is None else [opacities]), *harmonics)
     if any(len(column.stored) != count for column in columns):
         raise _ForeignError(f"one with values for others than its {count} Gaussians")
-    are_logs, move = scales.stored.min() < 0, _mover(place, len(harmonics))
+    are_logs, move = are_logarithms(scales.stored), _mover(place, len(harmonics))
 
     def unpack(block: slice) -> Columns:
         colors = sh0[block]

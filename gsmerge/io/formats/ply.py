@@ -8,21 +8,22 @@ import threading
 import warnings
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from io import BufferedReader, FileIO, TextIOWrapper
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any, Literal
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElementParseError, PlyListProperty, PlyParseError
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import ReadBudget, check_file, read_budget
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.columns import check_columns
-from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_PICTURES
+from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.types import Gaussians
@@ -36,11 +37,15 @@ THIN = 1e-3  # of the smaller scale: the third of a 2D Gaussian
 MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
 BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache from the first column to the last
 
+_PREFIXED = "columns are read without the {!r} before their names, as CloudCompare writes it"
 MAX_HEADER_BYTES = 1 << 20
 MAX_LINE = 1 << 20  # characters of a row of text: its words take many times as much memory
 MAX_LIST_VALUES = 1_000_000  # of elements with lists, which are read one value at a time
 _LIST_BYTES = 140  # of memory for each of these values
 _STEPS_PER_ELEMENT = 50  # of a budget's 20 microseconds: several readers open a file one after the other
+_TYPES = {  # by NumPy's names
+    "i1": "char", "i2": "short", "i4": "int", "f4": "float", "u1": "uchar", "u2": "ushort", "u4": "uint", "f8": "double"
+}  # fmt: skip
 _SIZES = {
     **dict.fromkeys(("char", "uchar", "int8", "uint8", "i1", "u1", "b1"), 1),
     **dict.fromkeys(("short", "ushort", "int16", "uint16", "i2", "u2"), 2),
@@ -54,15 +59,20 @@ def read_rows(path: Path) -> arrays.StoredRows:
     data = open_ply(path)
     elements = {e.name: {p.name for p in e.properties} for e in data.elements}
     compressed = "chunk" in elements and elements.get("vertex", set()) >= set(arrays.PACKED)
-    rows = _PACKED_ROWS(path, data) if compressed else _vertex(path, data).data
+    rows, prefix = (_PACKED_ROWS(path, data), "") if compressed else _vertex_rows(path, data)
     others = tuple(name for name in elements if name != "vertex")
     layers = [f"element {name}" for name in others if {"opacity", arrays.QUATS[0]} <= elements[name]]
     unused = check_columns(path, rows.dtype, layers)
     names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
-    linear, notes = arrays.color_columns(names) == arrays.PLAIN_COLORS[1] and not _has_log_scales(path, rows), []
+    colors, white, notes = arrays.color_columns(names), 1.0, list[str]()
+    linear = colors == arrays.PLAIN_COLORS[1] and not arrays.are_logarithms(_read_column(path, rows, arrays.SCALES[0]))
     if linear:
-        notes += ["colours are r, g and b, and no scale is negative: scales are taken as activated, not as logarithms"]
+        notes += ["colours are r, g and b, scales hardly negative: they are taken as activated, not as logarithms"]
+    of_floats = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
+    if of_floats and np.nanmedian(_read_column(path, rows, colors[0])) > 1:
+        white, what = 255.0, f"half of the values of {colors[0]} are above 1"
+        notes += [f"{what}: colours are taken as 0 to 255"]
     if arrays.SCALES[2] not in names:
         notes += [f"2D Gaussians of two scales: the third is {THIN:g} of the smaller one"]
         comments += (arrays.FLAT_COMMENT,)
@@ -74,21 +84,26 @@ def read_rows(path: Path) -> arrays.StoredRows:
         sizes=_bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
         extra_elements=others,
-        notes=(*notes, *unused),
-        adapt=partial(_with_log_scales, linear=linear) if notes else None,
+        notes=(*notes, *([_PREFIXED.format(prefix)] if prefix else []), *unused),
+        adapt=partial(_adapt_rows, linear=linear, white=white) if notes else None,
     )
 
 
-def _has_log_scales(path: Path, rows: np.ndarray) -> bool:
-    """Return whether a scale is negative, as logarithms of most are."""
+def _read_column(path: Path, rows: np.ndarray, name: str) -> np.ndarray:
+    """Read one column of a file's rows."""
     size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
     with open_rows(path, rows) as read:
-        return any((read(slice(i, i + size))[arrays.SCALES[0]] < 0).any() for i in range(0, len(rows), size))
+        return np.concatenate([read(slice(i, i + size))[name] for i in range(0, len(rows), size)])
 
 
-def _with_log_scales(rows: np.ndarray, *, linear: bool) -> np.ndarray:
-    """Return a block of rows with logarithms of ``linear`` scales, and with a thin third scale where there are two."""
+def _adapt_rows(rows: np.ndarray, *, linear: bool, white: float) -> np.ndarray:
+    """Return a block of rows with logarithms of ``linear`` scales, a third, thin one where there are two, and colours.
+
+    ``white`` is the value of a full colour of floats.
+    """
     columns = {name: rows[name] for name in rows.dtype.names or ()}
+    if white != 1:
+        columns |= {name: columns[name] / white for name in arrays.color_columns(rows.dtype.names)}
     scales = [columns[name].astype(np.float64) for name in arrays.SCALES if name in columns]
     with np.errstate(all="ignore"):  # a scale of 0
         scales = [log(scale) for scale in scales] if linear else scales
@@ -105,16 +120,18 @@ def is_from_gsmerge(comments: Sequence[str]) -> bool:
     return arrays.LOGIT_COMMENT in comments or arrays.RESULT_COMMENT in comments
 
 
-def _vertex(path: Path, data: PlyData) -> PlyElement:
+def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
+    """Return the rows of the Gaussians without the prefix of their columns' names, and this prefix."""
     if "vertex" not in data:
         names = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
         raise SceneError(path, f"expected an element 'vertex', found {names}")
     vertex = data["vertex"]
-    columns = {p.name for p in vertex.properties}
+    rows, prefix = _without_prefix(vertex.data)
+    columns = set(rows.dtype.names or ())
     optional = {arrays.SCALES[2], *(() if arrays.color_columns(columns) == arrays.SH0 else arrays.SH0)}
     missing = [name for name in arrays.REQUIRED if name not in columns | optional]
     if missing:
-        check_columns(path, vertex.data.dtype, ())  # which may say why
+        check_columns(path, rows.dtype, ())  # which may say why
         remedy = "this is no Gaussian splat"
         if any(name.startswith("packed_") for name in columns):
             remedy = "it is compressed, but lacks its element 'chunk'"
@@ -123,7 +140,22 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
-    return vertex
+    return rows, prefix
+
+
+def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
+    """Return rows without what stands before the names of the columns of Gaussians, and this prefix.
+
+    CloudCompare writes "scalar_" before names that are not its own, and "scalar_scal_" when it wrote the file before.
+    """
+    names, last = tuple(rows.dtype.names or ()), arrays.QUATS[0]
+    prefix = next((name.removesuffix(last) for name in names if name.endswith(last)), "")
+    stripped = [name.removeprefix(prefix) for name in names]
+    if last in names or rows.dtype.hasobject or len(set(stripped)) < len(names):
+        return rows, ""
+    fields = [(rows.dtype.fields or {})[name] for name in names]
+    kinds = {"names": stripped, "formats": [kind for kind, *_ in fields], "offsets": [place for _, place, *_ in fields]}
+    return rows.view(np.dtype(kinds | {"itemsize": rows.dtype.itemsize})), prefix
 
 
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
@@ -173,7 +205,7 @@ def open_ply(path: Path) -> PlyData:
         with path.open("rb") as file:
             start = file.read(MAX_HEADER_BYTES)
         if start[:4] not in (b"ply\n", b"ply\r"):
-            if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_PICTURES:
+            if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES:
                 raise SceneError(path, "expected Gaussians, found a picture", "a model makes them of photos first")
             problem = "expected a PLY file, found one that does not start with the line 'ply'"
             raise SceneError(path, problem, "name the .ply")
@@ -269,7 +301,7 @@ def header_counts(path: Path) -> tuple[int, int]:
     except (OSError, SceneError):
         return 0, 0
     match = re.search(rb"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
-    return int(match[1]) if match else 0, len(re.findall(rb"^property \S+ f_rest_\d+\s*$", header, re.MULTILINE))
+    return int(match[1]) if match else 0, len(re.findall(rb"^property \S+ \w*f_rest_\d+\s*$", header, re.MULTILINE))
 
 
 def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
@@ -287,7 +319,8 @@ def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
         return "result"
     columns = re.findall(rb"^property .*?(\w+)\s*$", header, re.MULTILINE) if end else []
     expected = (b"scale_", b"rot_", b"f_dc_", b"packed_")
-    return "Gaussians" if not columns or any(name.startswith(expected) for name in columns) else "other"
+    known = any(part in name for name in columns for part in expected)  # after a prefix, too
+    return "Gaussians" if known or not columns else "other"
 
 
 def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
@@ -337,10 +370,14 @@ def _truncated(path: Path, promise: str, num_whole: int, reason: str) -> SceneEr
 
 
 def ply_blocks(
-    gaussians: Gaussians, degree: int, comments: Sequence[str], *, normals: bool
+    gaussians: Gaussians, degree: int, comments: Sequence[str], *, normals: bool, extra: np.ndarray | None = None
 ) -> Iterator[bytes | memoryview]:
-    """Yield the header and blocks of rows of a PLY file with harmonics up to ``degree``; ValueError for NaN or inf."""
-    header, num_columns = _header(len(gaussians), degree, comments, normals=normals)
+    """Yield the header and blocks of rows of a PLY file with harmonics up to ``degree``; ValueError for NaN or inf.
+
+    ``extra``: structured array ``[n]`` of little-endian columns that follow those of the Gaussians.
+    """
+    more = {} if extra is None else {name: extra.dtype[name].str[1:] for name in extra.dtype.names or ()}
+    header, num_columns = _header(len(gaussians), degree, comments, normals=normals, extra=more)
     yield header
     block = max(1, BLOCK_BYTES // (4 * num_columns))
     for start in range(0, len(gaussians), block):
@@ -358,11 +395,25 @@ def ply_blocks(
         rows = np.concatenate(parts, axis=1, dtype="<f4", casting="same_kind")
         if not np.isfinite(rows).all():
             raise ValueError(f"expected finite Gaussians, got an opacity outside [0, 1] in the rows from {start}")
-        yield rows.data
+        if not more or extra is None:
+            yield rows.data
+            continue
+        beside = np.ascontiguousarray(extra[start : start + block]).view(np.uint8).reshape(len(rows), -1)
+        yield np.concatenate([rows.view(np.uint8), beside], axis=1).data
 
 
-def _header(count: int, sh_degree: int, comments: Sequence[str] = (), *, normals: bool = True) -> tuple[bytes, int]:
-    """Return the header of a float32 ``.ply`` of ``count`` Gaussians, and its number of columns."""
+def _header(
+    count: int,
+    sh_degree: int,
+    comments: Sequence[str] = (),
+    *,
+    normals: bool = True,
+    extra: Mapping[str, str] = MappingProxyType({}),
+) -> tuple[bytes, int]:
+    """Return the header of a ``.ply`` of ``count`` Gaussians, and its number of columns of float32.
+
+    ``extra``: names of columns after these, with their types as NumPy writes them.
+    """
     num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
     names = [
         *arrays.MEANS,
@@ -374,7 +425,8 @@ def _header(count: int, sh_degree: int, comments: Sequence[str] = (), *, normals
     comments = comments if arrays.RESULT_COMMENT in comments else (arrays.LOGIT_COMMENT, *comments)
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
-    lines += [*(f"property float {name}" for name in names), "end_header", ""]
+    lines += [f"property float {name}" for name in names]
+    lines += [*(f"property {_TYPES[kind]} {name}" for name, kind in extra.items()), "end_header", ""]
     return "\n".join(lines).encode("ascii"), len(names)
 
 

@@ -32,7 +32,7 @@ _MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviation
 # The same in units of the width over the root of the number of Gaussians: sound files have 0.3 to
 # 2, linear scales that are taken for logarithms 10 to 1,000.
 _MAX_SPACINGS = 6.0
-_RAW_ROUNDING, _MAX_OUTSIDE = 0.01, 0.01  # by which opacities may exceed [0, 1], and the share of them that may be more
+_RAW_ROUNDING = 0.01  # by which opacities that are rounded to half of a float's bits may exceed [0, 1]
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
         "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
         "Gaussian(s) with a zero quaternion, taken as the identity": info.num_zero_quats,
     }
-    raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; --hint opacity=logit says otherwise",)
+    raw = ("opacities lie in [0, 1]: taken as activated, not as logits; --hint opacity=logit says otherwise",)
     notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
     odd = (info.odd_scales,) if info.odd_scales else ()
     return (*info.adapted, *notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
@@ -188,13 +188,20 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         part_rows = slice(first, first + len(part.rows))
         clipped, zero = _convert_file(name, part, {key: column[part_rows] for key, column in out.items()})
         num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, part_rows.stop
-    declared_encoding = opacity if opacity != "auto" else _declared_encoding(paths, parts, out["opacities"])
+    empty = find_empty(path, out)
+    opacities = out["opacities"]
     if opacity == "raw":
-        _check_raw(path, out["opacities"])
-    encoding = _activate(out["opacities"], out["valid"], declared_encoding)
+        _check_raw(path, opacities)
+    declared_encoding, encoding = opacity if opacity != "auto" else None, opacity
+    if opacity == "auto":
+        judged = opacities if len(empty) == 0 else opacities.copy()
+        judged[empty] = np.nan
+        declared_encoding = _declared_encoding(paths, parts, judged)
+        encoding = declared_encoding or guess_encoding(judged)
+    _activate(opacities, out["valid"], encoding)
     notes = _apply_filter(out) if arrays.FILTER in out else ()
     num_bad = clear_invalid(path, out)
-    num_empty = clear_empty(path, out)
+    clear_rows(out, empty)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
     if byte_columns == arrays.NORMALS:
         _spread_low_degree(out["shN"])
@@ -216,9 +223,9 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         opacity_encoding=encoding,
         opacity_guessed=declared_encoding is None,
         num_nonfinite=num_bad,
-        num_empty=num_empty,
+        num_empty=len(empty),
         num_clipped_scales=num_clipped,
-        num_zero_quats=max(0, num_zero_quats - num_empty),  # which have none as a rule
+        num_zero_quats=max(0, num_zero_quats - len(empty)),  # which have none as a rule
         odd_scales=_describe_odd_scales(out["means"], out["scales"], out["valid"]),
         adapted=(*notes, *stored.notes, *_describe_end(out["valid"])),
     )
@@ -361,7 +368,7 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
         values = opacities[first : first + len(part.rows)]
         first += len(values)
         is_clear = len(parts) > 1 and np.isfinite(values).sum() >= _MIN_JUDGED
-        encoding = part.encoding or (_guess_encoding(values) if is_clear else None)
+        encoding = part.encoding or (guess_encoding(values) if is_clear else None)
         if encoding is not None:
             seen.setdefault(encoding, path.name)
         if len(seen) > 1:
@@ -371,21 +378,16 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
     return next((part.encoding for part in parts if part.encoding is not None), None)
 
 
-def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str | None) -> str:
-    """Convert stored opacities to [0, 1] in place, and return their encoding, which is guessed if unknown.
-
-    Opacities are raw if all finite values lie in [0, 1]. An infinite raw value makes its row invalid.
-    """
-    encoding = encoding or _guess_encoding(opacities)
+def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
+    """Convert stored opacities to [0, 1] in place; an infinite raw value makes its row invalid."""
     if encoding == "raw":
         valid &= np.isfinite(opacities)
         np.clip(opacities, 0, 1, out=opacities)
-        return encoding
+        return
     with np.errstate(all="ignore"):
         opacities[:] = exp(np.negative(opacities, out=opacities))
         np.add(opacities, 1, out=opacities)
         np.reciprocal(opacities, out=opacities)
-    return encoding
 
 
 def _apply_filter(out: dict[str, np.ndarray]) -> tuple[str]:
@@ -407,17 +409,26 @@ def _check_raw(path: Path, opacities: np.ndarray) -> None:
     """Raise SceneError for logits that the caller says are opacities in [0, 1]."""
     finite = np.isfinite(opacities)
     outside = (np.abs(opacities - 0.5) > 0.5 + _RAW_ROUNDING) & finite
-    if outside.sum() > _MAX_OUTSIDE * finite.sum():
+    if outside.sum() > arrays.MAX_STRAY * finite.sum():
         share = 100 * outside.sum() / finite.sum()
         problem = f"expected opacities in [0, 1], as hinted, found {share:.3g} % outside, as logits are"
         raise SceneError(path, problem, "leave out --hint opacity=raw")
 
 
-def _guess_encoding(opacities: np.ndarray) -> str:
+def guess_encoding(opacities: np.ndarray) -> str:
+    """Return "raw" where finite stored opacities lie in [0, 1], but for roundings and damage; else "logit".
+
+    The density of logits goes on beyond 0 and 1, that of opacities ends there: hardly any lies beyond, and fewer than
+    as near to the ends inside.
+    """
     finite = np.isfinite(opacities)
     low = opacities.min(where=finite, initial=np.inf)
     high = opacities.max(where=finite, initial=-np.inf)
-    return "raw" if 0 <= low <= high <= 1 else "logit"
+    if 0 <= low <= high <= 1:
+        return "raw"
+    beyond = np.abs(opacities[finite] - 0.5) - 0.5
+    num_beyond, num_near = np.count_nonzero(beyond > 0), np.count_nonzero((beyond <= 0) & (beyond > -_RAW_ROUNDING))
+    return "raw" if num_beyond < min(num_near, arrays.MAX_STRAY * len(beyond)) else "logit"
 
 
 def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:
@@ -433,8 +444,8 @@ def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarra
     text += f" in a scene of a width of {width:.3g}"
     most = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
     linear = float(log(size))
-    if linear <= most < size and sizes.min() >= 1 and scales.min(where=valid[:, None], initial=np.inf) >= 1:
-        start = f"no stored scale is negative (median {linear:.3g}), as if linear"
+    if linear <= most < size and not arrays.are_logarithms(log(sizes)):
+        start = f"hardly a stored scale is negative (median {linear:.3g}), as if linear"
         return f"{start}: {text}; logarithms are expected"
     if size > _MAX_WIDTH * width:
         return f"{text}: the scales, which are logarithms, are too large"
@@ -466,19 +477,19 @@ def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
         number = f"{len(bad):,} of" if num_good else "all"
         problem = f"expected finite Gaussians, found NaN or inf in {number} {len(valid):,} rows"
         raise SceneError(path, problem, "export it again" if num_good else "")
-    _clear(out, bad)
+    clear_rows(out, bad)
     return len(bad)
 
 
-def clear_empty(path: str | Path, out: dict[str, np.ndarray]) -> int:
-    """Make rows that hold the place of a Gaussian transparent, in place; return their number.
+def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the valid rows that hold the place of a Gaussian and are none.
 
     Those are rows at the origin, not turned, round and grey, as a table of zeros is; and rows at the origin that are
     all equal, as VolSplat fills its files up. A few stay where a file has no others; SceneError for many.
     """
     rows = np.flatnonzero((out["means"] == 0).all(1) & out["valid"])
     if len(rows) == 0:
-        return 0
+        return rows
     scales, sh0 = out["scales"][rows], out["sh0"][rows, 0]
     empty = (out["quats"][rows] == (1, 0, 0, 0)).all(1) & (scales == scales[:, :1]).all(1) & (sh0 == 0).all(1)
     if len(rows) >= MIN_PADDING:
@@ -487,18 +498,20 @@ def clear_empty(path: str | Path, out: dict[str, np.ndarray]) -> int:
     rows = rows[empty]
     if len(rows) == np.count_nonzero(out["valid"]):
         if len(rows) < MIN_PADDING:
-            return 0
+            return rows[:0]
         problem = f"expected Gaussians, found {len(rows):,} rows that are empty or equal, at the origin"
         raise SceneError(path, problem, "the export may have broken off; export it again")
-    out["valid"][rows] = False
-    _clear(out, rows)
-    return len(rows)
+    return rows
 
 
-def _clear(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
-    """Give rows that are no Gaussians the position and scales of the Gaussian before, and make them transparent."""
+def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
+    """Make rows that are no Gaussians invalid and transparent, in place.
+
+    They get the position and scales of the Gaussian before.
+    """
     if len(rows) == 0:
         return
+    out["valid"][rows] = False
     good = np.flatnonzero(out["valid"])
     before = good[np.maximum(np.searchsorted(good, rows) - 1, 0)]
     for name in ("means", "scales"):

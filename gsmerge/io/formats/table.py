@@ -41,6 +41,7 @@ class Contents:
     title: str = ""
     normals: bool = True  # of a ``.ply``, as in :func:`gsmerge.write_ply`
     apart: bool = False  # whether a page has its parts in files beside it
+    extra_columns: np.ndarray | None = None  # structured array ``[n]``: more columns of a ``.ply`` with one level
 
 
 # How to add files to :func:`gsmerge.io.atomic_outputs`, the path of the output, its temporary file, which is there

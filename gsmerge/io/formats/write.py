@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from os import fspath
 from pathlib import Path
 
+import numpy as np
+
 from gsmerge.io.atomic import AddOutput, atomic_output
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.table import OUTPUT_FORMATS, PLY, Contents, NamedPhotos, find_format, output_format
@@ -37,6 +39,11 @@ def write_apart(add: AddOutput, path: Path, first: Path, contents: Contents) -> 
     written, ending = {path: [first]}, output_format(path).ending
     for level in range(1, len(contents.levels)):
         written[level_output(path, level)] = [add(level_output(path, level))]
+    if ending == PLY.ending and contents.extra_columns is not None:
+        (gaussians,), extra = contents.levels, contents.extra_columns
+        degree = min(gaussians.sh_degree, PLY.max_degree)
+        _write_ply(first, gaussians, True, degree, contents.comments, contents.normals, extra)
+        return written
     for (file,), gaussians in zip(written.values(), contents.levels, strict=True):
         write_gaussians(
             file, gaussians, overwrite=True, comments=contents.comments, ending=ending, normals=contents.normals
@@ -123,7 +130,13 @@ def write_ply(
 
 
 def _write_ply(
-    path: StrPath, gaussians: Gaussians, overwrite: bool, sh_degree: int | None, comments: Sequence[str], normals: bool
+    path: StrPath,
+    gaussians: Gaussians,
+    overwrite: bool,
+    sh_degree: int | None,
+    comments: Sequence[str],
+    normals: bool,
+    extra_columns: np.ndarray | None = None,
 ) -> None:
     """Write a ``.ply`` to a file of any name."""
     check_readable(gaussians, comments)
@@ -131,7 +144,7 @@ def _write_ply(
     if not 0 <= degree <= gaussians.sh_degree:
         raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
     with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
-        file.writelines(ply.ply_blocks(gaussians, degree, comments, normals=normals))
+        file.writelines(ply.ply_blocks(gaussians, degree, comments, normals=normals, extra=extra_columns))
 
 
 def check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:

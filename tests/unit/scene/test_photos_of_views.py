@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from messages import names
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from gsmerge.scene.read import Loaded, load_scene
 
@@ -128,6 +129,67 @@ def test_a_photo_in_a_format_that_is_not_read(folder: Path) -> None:
     left_out = load_scene(folder).left_out
     assert left_out is not None
     assert names(left_out, path.name, path.with_suffix(".HEIC").name, "convert")
+
+
+@pytest.mark.parametrize(
+    ("start", "name"),
+    [
+        (b"\0\0\0\x20ftypavif", "AVIF"), (b"\0\0\0\x18ftypheic", "HEIC"), (b"v/1\x01\2\0\0\0", "OpenEXR"),
+        (b"\0\0\0\x0cJXL \r\n\x87\n", "JPEG XL"), (b"\0\0\0\x0cjP  \r\n\x87\n", "JPEG 2000"), (b"GIF89a", "GIF"),
+        (b"#?RADIANCE\n", "Radiance"), (b"8BPS\0\1", "Photoshop"), (b"FUJIFILMCCD-RAW 0201", "raw"),
+    ],
+)  # fmt: skip
+def test_a_photo_whose_content_is_in_a_format_that_is_not_read(folder: Path, start: bytes, name: str) -> None:
+    """Whatever its ending says; the note says how to go on."""
+    path = photos_in(folder)[1]
+    path.write_bytes(start.ljust(4096, b"\x80"))
+    left_out = load_scene(folder).left_out
+    assert left_out is not None
+    assert names(left_out, path.name, name, "convert it to .jpg or .png")
+
+
+@pytest.mark.parametrize("sizes", ["apart", "of all"])
+def test_one_photo_of_another_shape(folder: Path, truth: np.ndarray, sizes: str) -> None:
+    """A portrait among landscapes: its view is left out with its Gaussians' pixels, and the others are used."""
+    path, file = photos_in(folder)[3], folder / "transforms.json"
+    picture = (read(path)[:, 42:150] * 255).astype(np.uint8)
+    Image.fromarray(picture).save(path)
+    data = PlyData.read(str(folder / "scene.ply"), mmap=False)
+    rows = data["vertex"].data.reshape(VIEWS, 144, 192)
+    kept = np.concatenate([rows[:3].reshape(-1), rows[3, :, 42:150].reshape(-1)])
+    PlyData([PlyElement.describe(kept, "vertex")]).write(str(folder / "scene.ply"))
+    cameras = json.loads(file.read_text())
+    if sizes == "apart":
+        common = {key: cameras[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+        for frame in cameras["frames"]:
+            frame |= common
+        cameras["frames"][3] |= {"w": 108, "cx": common["cx"] - 42}
+        cameras = {key: value for key, value in cameras.items() if key not in common}
+        file.write_text(json.dumps(cameras))
+    loaded = load_scene(folder)
+    assert len(loaded.scene.photo_views) == 3
+    photos = np.asarray(loaded.scene.images)[:3]
+    assert np.abs(photos - truth[:3]).mean((1, 2, 3)).max() < 0.02
+    assert loaded.left_out is not None
+    assert names(loaded.left_out, "1 of 4 views", path.name)
+    assert not any("without a camera" in note for note in loaded.notes)
+
+
+@pytest.mark.parametrize("view", [0, 2, 3])
+def test_a_view_without_gaussians_has_no_photo_where_cameras_are_estimated(
+    folder: Path, truth: np.ndarray, view: int
+) -> None:
+    (folder / "transforms.json").unlink()
+    data = PlyData.read(str(folder / "scene.ply"), mmap=False)
+    rows = data["vertex"].data
+    for name in rows.dtype.names:
+        rows[name][view * 144 * 192 : (view + 1) * 144 * 192] = np.nan
+    data.write(str(folder / "scene.ply"))
+    loaded = load_scene(folder)
+    assert absent(loaded) == [view]
+    assert [right for other, right in enumerate(right_ones(loaded, truth)) if other != view] == [True] * 3
+    assert loaded.left_out is not None
+    assert names(loaded.left_out, photos_in(folder)[view].name, "no Gaussian")
 
 
 def test_smaller_copies_alone(folder: Path, truth: np.ndarray) -> None:

@@ -16,6 +16,7 @@ from slow_readers import drawn, read_splat, read_spz
 from gsmerge.errors import SceneError
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
+from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.read import file_notes, read_parts
 from gsmerge.kernels import elementary
 from gsmerge.runtime.threads import use_threads
@@ -142,6 +143,67 @@ def test_activated_opacities_are_recognised(tmp_path: Path) -> None:
     assert read_ply(tmp_path / "b.ply", opacity="raw").gaussians.opacities.max() == 1
     with refuses(ValueError, "opacity", "linear"):
         read_ply(path, opacity="linear")
+
+
+def test_opacities_are_recognised_by_their_distribution(tmp_path: Path) -> None:
+    """Roundings above 1 and a damaged value change nothing; logits of which most lie in [0, 1] stay logits."""
+    rng = np.random.default_rng(0)
+    rows = columns(10_000)
+    rows["opacity"] = rng.uniform(0, 1, 10_000)
+    rows["opacity"][:50] = 1.0000001
+    rows["opacity"][50] = 7
+    rounded = read_ply(save(tmp_path / "a.ply", rows))
+    assert rounded.info.opacity_encoding == "raw"
+    assert rounded.gaussians.opacities.max() == 1
+    np.testing.assert_array_equal(rounded.gaussians.opacities[51:], rows["opacity"][51:])
+    assert any("--hint opacity=logit" in note for note in file_notes(rounded.info))
+    rows["opacity"] = rng.normal(0.5, 0.22, 10_000)  # 2 % beyond
+    assert read_ply(save(tmp_path / "b.ply", rows)).info.opacity_encoding == "logit"
+    rows["opacity"] = rng.normal(0.5, 0.17, 10_000)  # .3 %, as many as near the ends
+    assert read_ply(save(tmp_path / "c.ply", rows)).info.opacity_encoding == "logit"
+    rows["opacity"] = 0
+    for name in NAMES:
+        rows[name][5:] = 0  # placeholders, which say nothing
+    rows["opacity"][:5] = (-1, 3, 4, 0.5, 6)
+    assert read_ply(save(tmp_path / "d.ply", rows)).info.opacity_encoding == "logit"
+
+
+def test_scales_and_colours_are_recognised_by_their_distribution(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    plain = (*(name for name in NAMES if not name.startswith("f_dc")), "r", "g", "b")
+    rows = columns(10_000, names=plain)
+    for name in "rgb":
+        rows[name] = rng.uniform(0, 1, 10_000)
+    for name in ("scale_0", "scale_1", "scale_2"):
+        rows[name] = rng.uniform(0.01, 0.1, 10_000)
+        rows[name][:3] = -1e-9
+    activated = read_ply(save(tmp_path / "a.ply", rows))
+    assert any("activated" in note for note in file_notes(activated.info))
+    np.testing.assert_allclose(activated.gaussians.scales[5:, 0], rows["scale_0"][5:], rtol=1e-5)
+    for name in "rgb":
+        rows[name] *= 255
+    bright = read_ply(save(tmp_path / "b.ply", rows))
+    assert any("0 to 255" in note for note in file_notes(bright.info))
+    np.testing.assert_allclose(bright.gaussians.sh0[5:], activated.gaussians.sh0[5:], atol=1e-5)
+
+
+@pytest.mark.parametrize("prefix", ["scalar_", "scalar_scal_"])
+@pytest.mark.parametrize("text", [True, False])
+def test_columns_with_a_prefix(tmp_path: Path, prefix: str, text: bool) -> None:
+    rows = columns(40, 9)
+    expected = read_ply(save(tmp_path / "a.ply", rows)).gaussians
+    renamed = rows.astype([(name if name in "xyz" else prefix + name, "<f4") for name in rows.dtype.names])
+    more = np.zeros(40, [*renamed.dtype.descr, (f"{prefix}label", "<f4")])
+    for name in renamed.dtype.names:
+        more[name] = renamed[name]
+    actual = read_ply(save(tmp_path / "b.ply", more, text=text))
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        np.testing.assert_allclose(getattr(actual.gaussians, name), getattr(expected, name), rtol=1e-5, atol=1e-6)
+    assert actual.info.extra_columns == ("label",)
+    assert noted(file_notes(actual.info), repr(prefix), "CloudCompare")
+    assert header_content(tmp_path / "b.ply") == "Gaussians"
+    with refuses(SceneError, tmp_path / "c.ply", "no Gaussian splat"):
+        read_ply(save(tmp_path / "c.ply", repack_fields(more[["x", "y", "z", f"{prefix}label"]])))
 
 
 def test_our_own_files_are_never_guessed_at(tmp_path: Path) -> None:

@@ -1,0 +1,63 @@
+"""Columns of the user's own, such as labels: read from PLY files, and joined, for results that keep rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.formats import ply
+from gsmerge.io.formats.columns import describes_places, list_names
+from gsmerge.io.formats.read import FileInfo
+from gsmerge.io.formats.table import PLY, Format
+
+
+def read_extra_columns(info: FileInfo) -> np.ndarray:
+    """Read the columns of a file that are no Gaussians', row by row.
+
+    Returns a structured array ``[n]``, without fields where there are none. SceneError if the file changed or cannot be
+    read.
+    """
+    path = Path(info.path)
+    if not info.extra_columns:
+        return np.empty(info.count, [])
+    rows = ply.read_rows(path).rows
+    names = [name for name in info.extra_columns if not rows.dtype[name].hasobject]
+    out = np.empty(info.count, [(name, rows.dtype[name].newbyteorder("<")) for name in names])
+    if len(rows) != info.count:
+        raise SceneError(path, f"expected {info.count:,} rows, found {len(rows):,}: it changed while it was read")
+    size = max(1, ply.BLOCK_BYTES // rows.dtype.itemsize)
+    with ply.open_rows(path, rows) as read:
+        for first in range(0, len(rows), size):
+            block = read(slice(first, first + size))
+            for name in names:
+                out[name][first : first + size] = block[name]
+    return out
+
+
+def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
+    """Join columns of files whose rows follow each other; also return the names of those that not all files have."""
+    kinds = [{name: part.dtype[name] for name in part.dtype.names or ()} for part in parts]
+    names = dict.fromkeys(name for kind in kinds for name in kind)
+    common = [name for name in names if len({kind.get(name) for kind in kinds}) == 1]
+    out = np.empty(sum(map(len, parts)), [(name, kinds[0][name]) for name in common])
+    for name in common:
+        out[name] = np.concatenate([part[name] for part in parts])
+    return out, [name for name in names if name not in common]
+
+
+def describe_extra_columns(columns: np.ndarray, missing: Sequence[str], chosen: Format, *, moves: bool) -> list[str]:
+    """Describe what becomes of columns in a file of a format: one sentence each, without a full stop."""
+    names, notes = list(columns.dtype.names or ()), list[str]()
+    if missing:
+        notes.append(f"columns that not all files have, or of other types, are left out: {list_names(missing)}")
+    if names and chosen is not PLY:
+        notes.append(f"{chosen.ending} has no room for more columns, left out: {list_names(names)}")
+    elif names:
+        notes.append(f"columns that are copied as they are: {list_names(names)}")
+        places = [name for name in names if describes_places(name)]
+        if moves and places:
+            notes.append(f"columns that may hold places or directions are copied, not moved: {list_names(places)}")
+    return notes
