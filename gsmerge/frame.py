@@ -97,4 +97,6 @@ def sample_rows(scene: Scene) -> np.ndarray:
 def canonicalise(scene: SceneT, frame: Frame | None = None) -> tuple[SceneT, Frame]:
     """Move a scene into the canonical ``frame``, by default its own; return the scene and the frame."""
     frame = frame or scene_frame(scene)
-    return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame
+    region = None if scene.region is None else scene.region.enter(frame.origin, frame.unit)
+    gaussians, cameras = frame.enter(scene.gaussians), frame.enter_cameras(scene.cameras)
+    return replace(scene, gaussians=gaussians, cameras=cameras, region=region), frame

@@ -52,7 +52,8 @@ def finish(fitted: Fitted, prepared: Prepared, plan: Plan, most: int) -> Fitted:
     """
     seen, unseen = split_unseen(fitted.gaussians, fitted.cameras)
     is_long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
-    is_whole = prepared.scene.empty is None and prepared.reference.of_views  # what placed views see is all there is
+    scene = prepared.scene
+    is_whole = scene.empty is None and scene.region is None and prepared.reference.of_views  # placed ones see all
     others = seen[:0]
     if is_long and is_whole:
         others = fill_between(seen, fitted.cameras, fitted.outside, len(unseen), beyond=plan.fit.beyond)

@@ -24,6 +24,8 @@ from gsmerge.errors import refuse_without_torch
 if TYPE_CHECKING:
     import torch
 
+    from gsmerge.geometry import Region
+
 SceneT = TypeVar("SceneT", bound="Scene")
 StrPath = str | os.PathLike[str]
 Array = NDArray[Any]  # or a torch tensor where a docstring allows one, which type checkers do not see
@@ -354,6 +356,7 @@ class Scene:
         masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. A view without a photo has none such.
         importance: ``[v,h,w]`` float32, how many pixels a photo's pixel counts as in a fit; None: one everywhere.
         filled: ``[n]`` bool, Gaussians that the file lacks and that fill holes; None: none.
+        region: Part of the space outside of which there is nothing, as after a crop; None: everywhere.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -373,6 +376,7 @@ class Scene:
     masks: np.ndarray | None = None
     importance: np.ndarray | None = None
     filled: np.ndarray | None = None
+    region: Region | None = None
 
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width

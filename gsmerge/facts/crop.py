@@ -9,8 +9,7 @@ import numpy as np
 from gsmerge.errors import UsageError
 from gsmerge.facts.views import take_rows
 from gsmerge.frame import canonicalise
-from gsmerge.geometry import rgb_to_sh0, turn_by
-from gsmerge.kernels.matrices import matmul
+from gsmerge.geometry import Region, rgb_to_sh0, turn_by
 from gsmerge.raster import render_in_turn
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
@@ -20,16 +19,19 @@ from gsmerge.types import Scene
 MOSTLY = 0.5  # of what a pixel shows, from which on it shows the inside more than the outside
 
 
-def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
-    """Return a mask ``[n]`` of the world-frame centres ``[n,3]`` inside a crop, border included."""
+def find_region(crop: str) -> Region:
+    """Return the region of a crop, in world units."""
     shape, parsed = parse_crop(crop)
     numbers = np.array(parsed)
     if shape == "sphere":
-        return np.asarray(np.square(means - numbers[:3]).sum(1) <= numbers[3] ** 2)
-    if len(numbers) > 6:
-        middle = (numbers[:3] + numbers[3:6]) / 2
-        means = middle + matmul(means - middle, turn_by(numbers[6:]))  # as seen by the box
-    return np.asarray(((means >= numbers[:3]) & (means <= numbers[3:6])).all(1))
+        return Region(numbers[:3], np.full(3, numbers[3]), np.eye(3), is_sphere=True)
+    low, high, turn = numbers[:3], numbers[3:6], np.pad(numbers[6:], (0, 9 - len(numbers)))
+    return Region((low + high) / 2, (high - low) / 2, turn_by(turn).T if turn.any() else np.eye(3), is_sphere=False)
+
+
+def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
+    """Return a mask ``[n]`` of the world-frame centres ``[n,3]`` inside a crop, border included."""
+    return find_region(crop).contains(means)
 
 
 def crop_scene(scene: Scene, crop: str) -> Scene:
@@ -37,11 +39,14 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
 
     Counts, fit and scores are then those of what is left. UsageError if that is nothing.
     """
-    inside = inside_crop(scene.gaussians.means, crop)
+    means, region = scene.gaussians.means, find_region(crop)
+    inside = region.contains(means)
     count = int(inside.sum())
     if count == 0:
         remedy = "gsmerge inspect says where the scene is"
         raise UsageError(f"crop: expected Gaussians of the scene in {crop}, found none; {remedy}")
+    reach = float(np.abs(region.middle).max() + region.half.max())
+    scene = replace(scene, region=replace(region, rounding=float(np.finfo(means.dtype).eps) * reach))
     if count == scene.num_gaussians:
         return scene
     note(f"crop: {count:,} of {scene.num_gaussians:,} Gaussians are inside; counts, fit and scores are of these")

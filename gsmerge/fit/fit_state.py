@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.geometry import Region
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.raster import Splats
@@ -37,6 +38,11 @@ class FitState:
         for name in CARRIED:
             setattr(kept, name, getattr(self, name)[rows])
         return kept
+
+    def keep_inside(self, region: Region) -> None:
+        """Move centres outside of a region to its border, in place, except those of fixed Gaussians."""
+        rows = np.flatnonzero(~region.contains(self.x[:, :SIZE]) & ~self.fixed)
+        self.x[rows, :SIZE] = self.splats.means[rows] = region.clamp(self.x[rows, :SIZE])
 
     def view_colors(self) -> np.ndarray | None:
         """Return the colours for the rasterizer; None if it evaluates the harmonics, which are updated first."""

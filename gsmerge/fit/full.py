@@ -61,6 +61,8 @@ def fit_full(
         outside_view = run.outside_view(step, part)
         if outside_view is not None:
             optimiser.clear_veils(state, drawn, outside_view)
+        if job.region is not None:
+            state.keep_inside(job.region)
         if step > steps * (1 - options.tuning.average_share):
             tail.add(state.x)
         if options.time_budget is not None and step == PROBE:

@@ -10,6 +10,7 @@ import numpy as np
 from gsmerge.fit.edges import Edges
 from gsmerge.fit.outside import Outside
 from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weights
+from gsmerge.geometry import Region
 from gsmerge.kernels.elementary import power
 from gsmerge.raster.photos import WHOLE_PHOTO, Photos, Sample
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
@@ -61,6 +62,7 @@ class FitJob:
     num_judged: int | None = None
     outside: Outside | None = None  # Views in which some steps clear fog and veils; None: none
     edges: Edges | None = None  # At which Gaussians are cut; None: they may reach anywhere
+    region: Region | None = None  # In which their centres stay; None: everywhere
 
     def judges(self, size: int) -> Photos:
         """Return the photos that a result has to show better, at a size as of :class:`DrawMode`."""

@@ -51,8 +51,10 @@ def fit_scene(
         job = FitJob(photos, options, decoded.count, seed, report_steps, decoded.fixed, num_judged)
         outside = look_outside(scene, decoded.gaussians, job.judges(1), options)
         edges = None if options.beyond else find_edges(scene.cameras, decoded.count)
-        job = replace(job, outside=outside, edges=edges)
+        job = replace(job, outside=outside, edges=edges, region=scene.region)
         gaussians, report = fit(decoded.gaussians, job)
+        if scene.region is not None:  # what grew last took no step since
+            gaussians = replace(gaussians, means=scene.region.clamp(gaussians.means).astype(np.float32))
         record_fit(report, options.steps)
     cameras = scene.cameras
     if report.viewmats is not None:

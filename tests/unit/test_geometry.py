@@ -4,8 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gsmerge.geometry import (
+    Region,
     camera_centres,
     covariances,
     lower_median,
@@ -15,6 +18,7 @@ from gsmerge.geometry import (
     quat_to_rotmat,
     rotmat_to_quat,
     step_outside,
+    turn_by,
 )
 from gsmerge.types import Cameras
 
@@ -96,3 +100,31 @@ def test_a_camera_steps_back_and_turns_about_what_it_sees() -> None:
         assert pivot @ outside[:3, :3].T + outside[:3, 3] == pytest.approx(np.array([[0, 0, 6]]), abs=1e-9)
     assert camera_centres(step_outside(viewmat, 4, 0.5, azimuth=90)) == pytest.approx([6, 0, 4])  # on the right
     assert camera_centres(step_outside(viewmat, 4, 0.5, elevation=90)) == pytest.approx([0, -6, 4])  # above
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    is_sphere=st.booleans(),
+    origin=st.floats(-1e3, 1e3),
+    unit=st.sampled_from([0.25, 1.0, 8.0]),
+)
+def test_points_are_clamped_to_the_nearest_inside(seed: int, is_sphere: bool, origin: float, unit: float) -> None:
+    """In any frame: no other point of the region is nearer, and what is inside stays."""
+    rng = np.random.default_rng(seed)
+    half = np.full(3, 1.5) if is_sphere else rng.uniform(0.5, 3, 3)
+    axes = np.eye(3) if is_sphere else turn_by(rng.uniform(-180, 180, 3))
+    world = Region(rng.normal(size=3), half, axes, is_sphere)
+    region, points = world.enter(np.full(3, origin), unit), rng.normal(size=(40, 3)) * 4
+    inside = world.contains(points)
+    local = (points - world.middle) @ axes.T
+    np.testing.assert_array_equal(
+        inside, np.linalg.norm(local, axis=1) <= 1.5 if is_sphere else (abs(local) <= half).all(1)
+    )
+    moved = (points - origin) / unit
+    clamped = region.clamp(moved).astype(np.float32)
+    assert region.contains(clamped).all()
+    reach = 1e-6 * (1 + abs(moved).max() + abs(region.middle).max())
+    np.testing.assert_allclose(clamped[inside], moved[inside], atol=reach)
+    others = region.clamp(moved + rng.normal(size=(60, *moved.shape)) / unit)
+    nearest = np.linalg.norm(others - moved, axis=2).min(0)
+    assert (np.linalg.norm(clamped - moved, axis=1) <= nearest + 4 * reach).all()

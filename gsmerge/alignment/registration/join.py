@@ -123,6 +123,7 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
         masks=None if photos is None else _concat_values(scenes, [scene.masks for scene in scenes], usual=True),
         importance=_concat_values(scenes, [scene.importance for scene in scenes], usual=np.float32(1)),
+        region=scenes[0].region,
     )
 
 

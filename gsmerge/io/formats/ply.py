@@ -153,9 +153,11 @@ def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
     stripped = [name.removeprefix(prefix) for name in names]
     if last in names or rows.dtype.hasobject or len(set(stripped)) < len(names):
         return rows, ""
-    fields = [(rows.dtype.fields or {})[name] for name in names]
-    kinds = {"names": stripped, "formats": [kind for kind, *_ in fields], "offsets": [place for _, place, *_ in fields]}
-    return rows.view(np.dtype(kinds | {"itemsize": rows.dtype.itemsize})), prefix
+    kinds = [rows.dtype[name] for name in names]
+    fields: Any = rows.dtype.fields
+    offsets = [fields[name][1] for name in names]
+    named: Any = {"names": stripped, "formats": kinds, "offsets": offsets, "itemsize": rows.dtype.itemsize}
+    return rows.view(np.dtype(named)), prefix
 
 
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:

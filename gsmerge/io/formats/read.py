@@ -189,16 +189,8 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         clipped, zero = _convert_file(name, part, {key: column[part_rows] for key, column in out.items()})
         num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, part_rows.stop
     empty = find_empty(path, out)
-    opacities = out["opacities"]
-    if opacity == "raw":
-        _check_raw(path, opacities)
-    declared_encoding, encoding = opacity if opacity != "auto" else None, opacity
-    if opacity == "auto":
-        judged = opacities if len(empty) == 0 else opacities.copy()
-        judged[empty] = np.nan
-        declared_encoding = _declared_encoding(paths, parts, judged)
-        encoding = declared_encoding or guess_encoding(judged)
-    _activate(opacities, out["valid"], encoding)
+    encoding, is_guess = _choose_encoding(paths, parts, out["opacities"], empty, opacity)
+    _activate(out["opacities"], out["valid"], encoding)
     notes = _apply_filter(out) if arrays.FILTER in out else ()
     num_bad = clear_invalid(path, out)
     clear_rows(out, empty)
@@ -221,7 +213,7 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         comments=stored.comments,
         sh_degree=arrays.sh_degree(num_higher),
         opacity_encoding=encoding,
-        opacity_guessed=declared_encoding is None,
+        opacity_guessed=is_guess,
         num_nonfinite=num_bad,
         num_empty=len(empty),
         num_clipped_scales=num_clipped,
@@ -357,6 +349,20 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
     return zero
 
 
+def _choose_encoding(
+    paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray, empty: np.ndarray, named: OpacityChoice
+) -> tuple[str, bool]:
+    """Choose the encoding of opacities, and return whether it is guessed; ``empty`` rows say nothing of it."""
+    if named == "raw":
+        _check_raw(paths[0], opacities)
+    if named != "auto":
+        return named, False
+    judged = opacities if len(empty) == 0 else opacities.copy()
+    judged[empty] = np.nan
+    declared = _declared_encoding(paths, parts, judged)
+    return declared or guess_encoding(judged), declared is None
+
+
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
     """Return the encoding of opacities that the parts declare; None if none does.
 
@@ -422,13 +428,11 @@ def guess_encoding(opacities: np.ndarray) -> str:
     as near to the ends inside.
     """
     finite = np.isfinite(opacities)
-    low = opacities.min(where=finite, initial=np.inf)
-    high = opacities.max(where=finite, initial=-np.inf)
-    if 0 <= low <= high <= 1:
-        return "raw"
     beyond = np.abs(opacities[finite] - 0.5) - 0.5
-    num_beyond, num_near = np.count_nonzero(beyond > 0), np.count_nonzero((beyond <= 0) & (beyond > -_RAW_ROUNDING))
-    return "raw" if num_beyond < min(num_near, arrays.MAX_STRAY * len(beyond)) else "logit"
+    num_beyond = int(np.count_nonzero(beyond > 0))
+    num_near = int(np.count_nonzero((beyond <= 0) & (beyond > -_RAW_ROUNDING)))
+    few = num_beyond < num_near and num_beyond < arrays.MAX_STRAY * len(beyond)
+    return "raw" if len(beyond) and (few or num_beyond == 0) else "logit"
 
 
 def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:

@@ -13,6 +13,7 @@ from gsmerge import CompactOptions, Gaussians, Scene, compact, render
 from gsmerge.errors import UsageError
 from gsmerge.facts.crop import crop_scene, inside_crop
 from gsmerge.facts.support import count_views
+from gsmerge.raster.metrics import decibels
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.clean import clean, faintest_dropped, floater_share, floaters
@@ -145,6 +146,24 @@ def test_counts_fit_and_scores_are_of_the_inside(scene: Scene) -> None:
     assert part.report.psnr_after > 20
 
 
+@pytest.mark.parametrize("shape", ["sphere", "box", "turned"])
+def test_what_the_cropped_scene_shows_opaque_stays_opaque(shape: str) -> None:
+    """Centres stay inside while they are fitted, so none is cut off afterwards."""
+    scene = scenes.make_scene(scenes.room(), scenes.arc(5, 96, 72), noise=0.05)
+    means = scene.gaussians.means.astype(float)
+    low, high = np.quantile(means, (0.2, 0.8), axis=0)
+    box = "box:" + ",".join(map(str, (*low, *high)))
+    crop = {"sphere": sphere_in(scene, 0.5), "box": box, "turned": f"{box},10,20,30"}[shape]
+    result, inside = compact(scene, crop=crop), crop_scene(scene, crop)
+    assert inside_crop(result.gaussians.means, crop).all()
+    assert result.report.choices["clean"]["cropped"] == 0
+    shown, fitted = (render(some, scene.cameras, background=0.0) for some in (inside.gaussians, result.gaussians))
+    opaque = shown.alphas[..., 0] > 0.98
+    assert (fitted.alphas[..., 0][opaque] < 0.5).mean() < 0.005
+    assert inside.images is not None
+    assert decibels(np.square(fitted.images - inside.images)[opaque & inside.masks].mean()) > 30
+
+
 def test_a_crop_leaves_what_shows_it(scene: Scene) -> None:
     """Pixels count whose own Gaussian is inside, but for borders; without pixels the same photos count."""
     crop = sphere_in(scene, 0.5)
@@ -157,7 +176,9 @@ def test_a_crop_leaves_what_shows_it(scene: Scene) -> None:
     assert len(free.gaussians) == own.sum()
     np.testing.assert_array_equal(free.masks, inside.masks)
     assert crop_scene(replace(scene, images=None, masks=None), crop).masks is None
-    assert crop_scene(scene, "sphere:0,0,0,1e6") is scene
+    whole = crop_scene(scene, "sphere:0,0,0,1e6")
+    assert whole.masks is scene.masks
+    assert whole.gaussians is scene.gaussians
 
 
 def test_levels_and_baselines_are_cropped(scene: Scene) -> None:
