@@ -247,12 +247,14 @@ def _describe_lack(num_views: int) -> str:
 
 
 def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
+    from gsmerge.raster.metrics import MAX_PSNR
     from gsmerge.runtime.memory import human_share
 
     psnr = report["psnr_input_views"]
     quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
     if judged := report["choices"].get("fidelity"):
-        quality = ["the input", f"{judged['psnr']:.2f}"]  # which it is compared with, for lack of photos
+        # which it is compared with, for lack of photos
+        quality = ["the input", "equal" if judged["psnr"] >= MAX_PSNR else f"{judged['psnr']:.2f}"]
     counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
     gain = "" if new is None else f"{new['low']:+.1f} to {new['high']:+.1f} dB"
     return output, *counts, human_share(report["ratio"]), gain, *quality, f"{report['total_seconds']:.1f}"
