@@ -456,7 +456,7 @@ def test_a_phone(opened: tuple[Browser, Any]) -> None:
 
 
 def test_the_narrowest_phone(opened: tuple[Browser, Any]) -> None:
-    """Nothing is wider than the screen, however the pictures are compared, or is beside it where it cannot be scrolled."""
+    """Nothing is wider than the screen, however the pictures are compared."""
     tab, _ = opened
     resize(tab, 320, 640)
     tab.run("document.querySelectorAll('details').forEach(one => { one.open = true; })")
