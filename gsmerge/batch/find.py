@@ -14,6 +14,7 @@ from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_budget, read_lines
 from gsmerge.io.formats import depth_maps
 from gsmerge.io.formats.table import may_hold_gaussians
+from gsmerge.io.image_names import natural_order
 from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
 from gsmerge.scene.no_gaussians import find_remedy
 from gsmerge.settings.extend import SUFFIX
@@ -49,7 +50,7 @@ def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
 
 
 def find_named_scenes(arguments: Sequence[str], out: Path) -> Iterator[NamedScene]:
-    """Yield the scenes among the arguments, in order, sorted within each; a scene may come twice.
+    """Yield the scenes among the arguments, in order, in natural order within each; a scene may come twice.
 
     A folder that cannot be read counts as a scene: reading it says why. SceneError if an argument does not exist, has
     no scene or too many folders without one, UsageError if it is the output folder.
@@ -105,7 +106,7 @@ class _Search:
                 folders[:] = [name for name in folders if name not in SCENE_PARTS]
                 scenes = [inside]
             else:
-                scenes = other_plys(inside) if any(name.endswith(SCENE_SUFFIXES) for name in names) else []
+                scenes = _other_scenes(inside, names)
             self.num_empty = 0 if scenes else self.num_empty
             yield from ((scene, folder) for scene in scenes)
 
@@ -131,12 +132,23 @@ class _Search:
             except OSError:
                 yield folder, None, []
                 continue
-            names = sorted(name for name in entries if not name.startswith("."))
+            names = natural_order(name for name in entries if not name.startswith("."))
             inside = [name for name in names if _is_folder(entries[name])]
             yield folder, list(entries), inside
             for name in reversed(inside):
                 below = os.path.join(real, name)
                 stack.append((folder / name, os.path.realpath(below) if entries[name].is_symlink() else below))
+
+
+def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
+    """List the scenes in a folder that contains these names and is none itself; itself if it has vanished meanwhile."""
+    if SCENE_NAMES.isdisjoint(names) and not any(name.endswith(SCENE_SUFFIXES) for name in names):
+        return []
+    with suppress(OSError):
+        scenes = other_plys(folder)
+        if scenes or os.path.isdir(folder):
+            return scenes
+    return [folder]  # reading it says why
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:
@@ -159,7 +171,7 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
 
 
 def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
-    for name in dict.fromkeys(sorted(_expand(pattern, search))):
+    for name in dict.fromkeys(natural_order(_expand(pattern, search))):
         path = Path(name)
         if os.path.isdir(path):
             yield from search.walk(path)

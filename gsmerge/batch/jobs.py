@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from gsmerge import __version__
 from gsmerge.batch.find import find_named_scenes, main_file, scene_plys
 from gsmerge.compaction.files import Outputs, compact_files
-from gsmerge.errors import UsageError
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import OUTPUT_FORMATS
 from gsmerge.io.formats.table import estimate_counts
 from gsmerge.io.formats.write import level_output
@@ -30,6 +30,7 @@ from gsmerge.settings.stages import Engine
 from gsmerge.types import StrPath
 
 FIELDS = ("stem", "parent", "index", "k")
+PLACES = ("cameras", "images", "masks", "protect")  # of what is beside a scene
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class BatchOptions(Settings):
         "each in it.",
         "By default those beside each scene; `none`: without.")  # fmt: skip
     images: str | None = setting(None, "Folder of the photos, in the same way.")
+    masks: str | None = setting(None, "Folder of their masks, in the same way.")
+    protect: str | None = setting(None, "Folder of pictures of what has to stay sharp, in the same way.")
     output: str = setting("{stem}.ply", "Name of a result in the output folder: {stem} (the scene's name), {parent} "
         "(the folder it is in), {index} (its place in the list, from 0) and {k} are filled in; its ending says the "
         "format.")  # fmt: skip
@@ -127,6 +130,8 @@ class Job:
     num_rest: int = 0  # columns of higher harmonics, likewise
     cameras: StrPath | None = None  # None: beside the scene
     images: StrPath | None = None  # likewise
+    masks: StrPath | None = None  # likewise
+    protect: StrPath | None = None  # None: nothing has to stay sharper
     within: Path | None = None  # folder that was named, up to which cameras and photos are searched
 
     @property
@@ -141,19 +146,23 @@ class Job:
 
     def find_files(self) -> SceneFiles:
         """Find the files of the scene; SceneError if there are none."""
-        return find_scene_files(Path(self.scene), cameras=self.cameras, images=self.images, within=self.within)
+        places = {name: getattr(self, name) for name in PLACES}
+        return find_scene_files(Path(self.scene), **places, within=self.within)
 
 
 def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, results: Collection[str] = ()) -> list[Job]:
     """Find all scenes, each once, and name their results in the output folder.
 
     ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
-    line. ``results`` has the real paths of former results, which are not scenes. SceneError if something does not exist
-    or has no scene, or networks are unusable; UsageError if two scenes would be written to one file, or over another.
+    line. ``results`` has the real paths of former results, which are not scenes. SceneError if something, or what all
+    scenes shall use, does not exist or has no scene, or networks are unusable; UsageError if two scenes would be
+    written to one file, or over another.
     """
     if options.settings.checkpoint not in CHECKPOINTS:
         load_checkpoint(options.settings.checkpoint)  # once, and not for each scene
     call = CompactCall(options.settings, options.opacity, options.hints)
+    for name in PLACES:
+        _check_place(name, getattr(options, name))
     jobs: list[Job] = []
     owners: dict[str, str] = {}
     inputs: set[str] = set()
@@ -171,13 +180,21 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
                     f" {scene}; tell them apart with --name, such as '{{parent}}-{{stem}}.ply'"
                 )
             owners[name] = str(scene)
-        named = options.cameras, options.images
-        cameras, images = (path if path == NONE else filled(path, scene) for path in named)
-        jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), cameras, images, within))
+        named = {name: getattr(options, name) for name in PLACES}
+        places: dict[str, Any] = {name: path if path == NONE else filled(path, scene) for name, path in named.items()}
+        jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), **places, within=within))
     for name in owners:
         if os.path.realpath(out / name) in inputs:
             raise UsageError(f"{out / name}: is one of the scenes, and would be replaced; name another --output")
     return jobs
+
+
+def _check_place(option: str, place: str | None) -> None:
+    """Raise SceneError if a path for all scenes does not exist: each of them would fail."""
+    if place in (None, NONE) or "{" in place or os.path.exists(place):
+        return
+    beside = f"for one beside each scene pass --{option} '{{parent}}/{place}'"
+    raise SceneError(place, "no such file or folder", "" if os.path.isabs(place) else beside)
 
 
 def output_name(options: BatchOptions, scene: Path, index: int) -> str:

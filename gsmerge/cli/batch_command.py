@@ -41,6 +41,9 @@ def parse_jobs(text: str) -> int:
         opt.option("cameras", str, "Cameras: one path for all scenes, or with {scene}, {parent} and {stem} of each in "
                    "it; none: without.", wording="beside each"),
         opt.option("images", str, "Folder of the photos, in the same way.", wording="beside each"),
+        opt.option("masks", str, "Folder of their masks, as of compact, in the same way: '{parent}/masks'.",
+                   wording="beside the photos of each"),
+        opt.option("protect", str, "Folder of images, white where a text or face has to stay sharp, in the same way."),
     ),
     "hint budget quality effort",
     opt.settings_option(CompactOptions, Engine, example="fit=none"),
@@ -74,8 +77,8 @@ def batch(args: opt.Args) -> None:
     settings, place = args.make(CompactOptions, Engine)
     try:
         options = BatchOptions(
-            settings, args.opacity, hints, args.cameras, args.images, args.name, args.jobs or None,
-            args.overwrite, place.engine, place.address,
+            settings, args.opacity, hints, args.cameras, args.images, args.masks, args.protect, args.name,
+            args.jobs or None, args.overwrite, place.engine, place.address,
         )  # fmt: skip
     except ValueError as error:
         raise UsageError(str(error).replace("output:", "--name:", 1)) from error
@@ -208,11 +211,13 @@ class Totals:
         """Write a table of the results, ``columns`` wide, what is worse, what failed, and a line of totals."""
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.io.formats.columns import UNUSED
+        from gsmerge.io.image_names import natural_key
         from gsmerge.report import text_table
         from gsmerge.runtime.memory import human_share
 
         header = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
-        lines = text_table([header, *sorted(self.rows)], columns=columns, least=(2, 7, 5, 6, 3)) if self.rows else []
+        rows = [header, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
+        lines = text_table(rows, columns=columns, least=(2, 7, 5, 6, 3)) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
         kinds = (
@@ -247,12 +252,14 @@ def _describe_lack(num_views: int) -> str:
 
 
 def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
+    from gsmerge.raster.metrics import MAX_PSNR
     from gsmerge.runtime.memory import human_share
 
     psnr = report["psnr_input_views"]
     quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
     if judged := report["choices"].get("fidelity"):
-        quality = ["the input", f"{judged['psnr']:.2f}"]  # which it is compared with, for lack of photos
+        # which it is compared with, for lack of photos
+        quality = ["the input", "equal" if judged["psnr"] >= MAX_PSNR else f"{judged['psnr']:.2f}"]
     counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
     gain = "" if new is None else f"{new['low']:+.1f} to {new['high']:+.1f} dB"
     return output, *counts, human_share(report["ratio"]), gain, *quality, f"{report['total_seconds']:.1f}"

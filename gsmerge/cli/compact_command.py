@@ -87,7 +87,7 @@ def look(args: opt.Args) -> None:
     from gsmerge.cli.view_command import view
 
     before, *after = shown
-    cameras = {} if len(shown) == 1 else args.given(("cameras", "images", "hint"))
+    cameras = {} if len(shown) == 1 else args.given(("cameras", "images", "masks", "protect", "hint"))
     loaded = replace(loads[0], notes=()) if after else None  # which were said
     wanted = args.open and not args.json
     opt.call(view, before=before, after=after, **cameras, open=wanted, quiet=args.silent, loaded=loaded)

@@ -15,7 +15,9 @@ from gsmerge.settings.reading import NONE
 
 MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
 PICTURES, CLIPS = (".png", ".jpg", ".jpeg", ".webp"), (".mp4", ".webm", ".gif")
-ALPHA_CLIP = ".webm"  # the one kind of clip that has alpha
+# What can have alpha beside its colours, show opacity, and show depth, which takes 16 bits; so do pictures in a folder
+LAYERS = {"color": (".png", ".webp", ".webm"), "alpha": (*PICTURES, *CLIPS), "depth": (".png",)}
+MAX_DIGITS = 9  # of a number of views: more are as many
 SIDES = (16, 16384)  # pixels of a picture
 
 
@@ -26,6 +28,16 @@ def parse_size(text: str) -> tuple[int, int]:
     if not all(SIDES[0] <= side <= SIDES[1] for side in size):
         raise typer.BadParameter(f"expected WIDTHxHEIGHT, such as 1920x1080, {SIDES[0]} to {SIDES[1]} pixels each")
     return size
+
+
+def parse_views(text: str) -> int | str:
+    """Parse ``--views``: a number, or the name of a view."""
+    if not re.fullmatch(r"[+-]?[\d.]+", text):
+        return text
+    count = int(text[:MAX_DIGITS]) if text.isdecimal() else 0
+    if count < 1:
+        raise typer.BadParameter(f"expected a number from 1, or the name of a view, got {text}")
+    return count
 
 
 def parse_background(text: str) -> float | str:
@@ -45,7 +57,8 @@ def parse_background(text: str) -> float | str:
     opt.argument("scenes", list[Path], "SCENES...", "Gaussian files, the first may be a folder: before, after, ..."),
     opt.READING,
     opt.output("A panel of photos and scenes, .png or .jpg; a clip, .mp4, .webm or .gif, in which a line moves between "
-               "two scenes; or a folder for a picture of each camera.", default=opt.REQUIRED),
+               "two scenes; or a folder for a picture of each camera. With --views NAME a picture of one.",
+               default=opt.REQUIRED),
     *opt.panel(
         opt.OUTPUT,
         opt.option("path", str, "The way of the camera: orbit about the middle view, or orbit:45 by 45 degrees to each "
@@ -57,13 +70,15 @@ def parse_background(text: str) -> float | str:
                    metavar="WIDTHxHEIGHT", parser=parse_size),
         opt.option("frames", int, "Frames of a clip, 30 a second, or 12.5 of a GIF.",
                    wording="6 seconds of a turntable, else 4", min=2, max=100_000),
-        opt.option("views", int, "Views at most, at equal intervals.", wording="4 on a panel, else all", min=1),
+        opt.option("views", str, "Views at most, at equal intervals; or the name of one, which the picture of one "
+                   "scene shows alone.", metavar="NUMBER|NAME", parser=parse_views,
+                   wording="4 on a panel, else all; the first of a picture with alpha, opacity or depth"),
         opt.option("overlay", ("support",), "Colour what one view of the scene alone shows, and what none does: "
                    "yellow, red."),
-        opt.option("background", str, "Grey level behind the scene, 0 to 1; none: nothing, a .webm or pictures in a "
-                   "folder have alpha.", wording="0", metavar="LEVEL|none", parser=parse_background),
-        opt.option("channel", ("color", "alpha", "depth"), "What the pictures in a folder show: colour, opacity, or "
-                   "depth in 16 bits, 0 where nothing is; --json has their unit.", wording="color"),
+        opt.option("background", str, "Grey level behind the scene, 0 to 1; none: nothing, so that .png, .webp, .webm "
+                   "and pictures in a folder have alpha.", wording="0", metavar="LEVEL|none", parser=parse_background),
+        opt.option("channel", ("color", "alpha", "depth"), "What pictures and clips show: colour; opacity; or depth, "
+                   "in a .png or a folder, in 16 bits, 0 where nothing is; --json has their unit.", wording="color"),
     ),
     "overwrite",
 )  # fmt: skip
@@ -99,7 +114,7 @@ def render(args: opt.Args) -> None:
 
 
 def _choose_kind(args: opt.Args) -> str:
-    """Choose what is drawn by the name of the output and ``--path``; UsageError if they do not fit."""
+    """Choose what is drawn by the name of the output and the options; UsageError if they do not fit."""
     suffix = args.output.suffix.lower()
     is_clip, is_picture = suffix in CLIPS, suffix in PICTURES
     if suffix and not is_clip and not is_picture and not args.output.is_dir():
@@ -107,19 +122,36 @@ def _choose_kind(args: opt.Args) -> str:
         raise UsageError(f"{args.output}: expected {expected}")
     if is_clip and args.path is None:
         args.path = "orbit"
-    in_folder = not (is_clip or is_picture) and len(args.scenes) == 1
-    if args.channel not in (None, "color") and not in_folder:
-        raise UsageError(f"{args.output}: expected a folder and one scene with --channel")
-    if args.background == NONE and not in_folder and (suffix != ALPHA_CLIP or len(args.scenes) > 1):
-        raise UsageError(f"{args.output}: expected a folder or a {ALPHA_CLIP}, and one scene, with --background none")
+    is_layer = _check_layer(args, suffix if is_clip or is_picture else "")
     if args.path is not None:
         if is_picture:
             raise UsageError(f"{args.output}: expected a clip, {opt.join_words(CLIPS)}, or a folder with --path")
+        if isinstance(args.views, str):
+            raise UsageError("--views: expected a number of views with --path and clips, got a name")
         _check_path(args)
         return "path"
     if args.frames is not None:
         raise UsageError(f"--frames: expected a clip, {opt.join_words(CLIPS)}, or --path with it")
-    return "panel" if is_picture else "views"
+    if is_layer and is_picture and isinstance(args.views, int):
+        raise UsageError(f"{args.output}: expected a folder with a number of --views, or the name of one view")
+    alone = is_layer or (isinstance(args.views, str) and len(args.scenes) == 1)
+    return "panel" if is_picture and not alone else "views"
+
+
+def _check_layer(args: opt.Args, suffix: str) -> bool:
+    """Return whether alpha, opacity or depth is asked for; UsageError unless the output, "" for a folder, has it."""
+    channel = args.channel or "color"
+    if channel == "color" and args.background != NONE:
+        return False
+    option, endings = f"--channel {channel}", LAYERS[channel]
+    if channel == "color":
+        option = "--background none"
+    for other in ("overlay", "background") if channel != "color" else ():
+        if vars(args)[other] is not None:
+            raise UsageError(f"--{other}: expected colours with it, got {option}")
+    if len(args.scenes) > 1 or (suffix and suffix not in endings):
+        raise UsageError(f"{args.output}: expected a folder or {opt.join_words(endings)}, and one scene, with {option}")
+    return True
 
 
 def _check_path(args: opt.Args) -> None:

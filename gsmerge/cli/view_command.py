@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @opt.command(
     opt.BEFORE,
     opt.AFTER,
-    f"{opt.READING} targets sizes",
+    f"{opt.READING} masks protect targets sizes",
     opt.output("The page, .html; one that gsmerge made is replaced.",
                wording="AFTER.compare.html, or BEFORE.view.html, beside it"),
     *opt.panel(
@@ -39,6 +39,8 @@ def view(args: opt.Args) -> None:
     from gsmerge.report import document_head
 
     args.after = args.after or []
+    if args.protect is not None and not args.sizes and "loaded" not in vars(args):
+        raise UsageError("--protect: expected --sizes with it, which are compacted; files AFTER stay as they are")
     files, after = args.files(args.before), args.after
     beside = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.base.with_suffix(".view.html")
     output = args.output or beside

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.compaction.new_views import NewViews
+from gsmerge.raster.metrics import psnr_words
 from gsmerge.report import document_head, file_sha256, html_table, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share
 
@@ -122,7 +123,7 @@ class CompactReport:
         if protected := self.protected:
             facts += [("where they are protected", f"{protected.before:.2f} -> {protected.after:.2f} dB")]
         if judged := self.choices.get("fidelity"):
-            facts += [("PSNR", f"{judged['psnr']:.1f} dB {_judged_by(judged)}")]
+            facts += [("PSNR", f"{psnr_words(judged['psnr'])} {_judged_by(judged)}")]
         return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
 
 
@@ -238,7 +239,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
         rows += [("", f"{protected['before']:.2f} dB", f"{protected['after']:.2f} dB", share)]
     judged = document["choices"].get("fidelity")
     if judged:
-        rows += [("PSNR", "", f"{judged['psnr']:.1f} dB", _judged_by(judged))]
+        rows += [("PSNR", "", psnr_words(judged["psnr"]), _judged_by(judged))]
     if pruned := document["choices"].get("pruned"):
         rows += [("left out", "", f"{pruned:,}", "Gaussians that no photo shows")]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
@@ -293,7 +294,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
     psnr, path = document["psnr_input_views"], document.get("viewer_cameras")
     cameras = f"; cameras for viewers in {os.path.basename(path)}" if path else ""
     judged = document["choices"].get("fidelity")
-    quality = f"; {judged['psnr']:.1f} dB {_judged_by(judged)}" if judged else ""
+    quality = f"; {psnr_words(judged['psnr'])} {_judged_by(judged)}" if judged else ""
     if psnr["before"] is not None and psnr["after"] is not None:
         quality = f"; a sample of {_own(document)} {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
     if new := document["new_views"]:

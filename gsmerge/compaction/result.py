@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
     from gsmerge.pages.view import Page
 
-SAME = 120.0  # dB of equal pictures
-
 
 @dataclass(frozen=True)
 class CompactResult:
@@ -200,7 +198,7 @@ def covers_all(before: PhotoScore | None) -> bool:
 def _fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
     """Measure the mean PSNR (dB), at most 120, of canonical Gaussians against renders of the input."""
     views = [prepared.repeated[view] for view in plan.scored_views] if prepared.repeated else plan.scored_views
-    return min(score_photos(gaussians, scene_photos(prepared.scene), views).psnr, SAME)
+    return score_photos(gaussians, scene_photos(prepared.scene), views).psnr
 
 
 def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:

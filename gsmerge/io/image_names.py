@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePath, PurePosixPath
+from typing import TypeVar
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import walk_files
@@ -23,6 +24,7 @@ _NAME_FOLDER = "name the folder of the photos with --images, or with --target-im
 _HIDDEN = ".@"  # with which names of hidden folders begin: .thumb, @eaDir
 ImageSource = StrPath | Sequence[StrPath]
 PixelCount = Callable[[Path], int]  # of an image file
+PathT = TypeVar("PathT", str, Path)
 
 
 def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
@@ -160,6 +162,11 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Make a sort key that puts "view 2" before "view 10"."""
     parts = [(p, p.lstrip("0")) for p in re.split(r"([0-9]+)", name) if p]
     return [(0, len(digits), digits) if p[0] in "0123456789" else (1, 0, p) for p, digits in parts]
+
+
+def natural_order(paths: Iterable[PathT]) -> list[PathT]:
+    """Sort paths so that "view 2" comes before "view 10"; equal numbers, as of "view 02", by their letters."""
+    return sorted(sorted(paths), key=lambda path: natural_key(os.fspath(path)))
 
 
 def find_image(folder: Path, name: str, remedy: str = _NAME_FOLDER) -> Path | None:

@@ -150,23 +150,29 @@ def find_ffmpeg(encoder: str) -> str | None:
     return None
 
 
+def stored_size(path: StrPath, width: int, height: int) -> tuple[int, int]:
+    """Return the size that frames have in a clip: colours of videos are kept for pairs of pixels, so sides are even."""
+    odd = 0 if Path(path).suffix.lower() == GIF else 1
+    return width + width % 2 * odd, height + height % 2 * odd
+
+
 def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrite: bool = False) -> str:
     """Write pictures ``[h,w,3]`` of one size as a video or a GIF, and return the name of its encoding.
 
-    A ``.mp4`` is H.264 if :func:`find_ffmpeg` finds a program for it; otherwise the first encoding that OpenCV has is
-    used. A ``.webm`` of pictures with alpha ``[h,w,4]`` needs that program. All frames of a GIF share a palette, and
-    are in memory together.
+    Grey pictures ``[h,w]`` are taken, too. A ``.mp4`` is H.264 if :func:`find_ffmpeg` finds a program for it; otherwise
+    the first encoding that OpenCV has is used. A ``.webm`` of pictures with alpha ``[h,w,4]`` needs that program. All
+    frames of a GIF share a palette, and are in memory together.
 
-    Of a video one frame is in memory at a time. Odd sides get one more row or column, a copy of the last, since
-    encodings require even sides. SceneError if there is no encoder for the ending of the name, or the file cannot be
+    Of a video one frame is in memory at a time, and of :func:`stored_size`: odd sides get one more row or column, a
+    copy of the last. SceneError if there is no encoder for the ending of the name, or the file cannot be
     written completely.
     """
     path = Path(path)
     with atomic_output(path, overwrite=overwrite) as temporary:
         if path.suffix.lower() == GIF:
-            _write_gif(temporary, list(frames), fps)
+            _write_gif(temporary, list(map(_to_channels, frames)), fps)
             return "GIF"
-        even = map(_to_even, frames)
+        even = (_to_even(_to_channels(frame)) for frame in frames)
         first = next(even)
         writer, encoding = _open_writer(path, temporary, first, fps)
         written: list[Future[None]] = []
@@ -196,6 +202,10 @@ def _write_gif(path: Path, frames: Sequence[Picture], fps: float) -> None:
     plain = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first, *others = plain
     first.save(path, "GIF", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
+
+
+def _to_channels(picture: Picture) -> Picture:
+    return picture if picture.ndim == 3 else picture[..., None].repeat(3, 2)
 
 
 def _to_even(picture: Picture) -> Picture:

@@ -31,6 +31,7 @@ from gsmerge.measure.clip import (
     SUFFIXES,
     draw_swipe,
     make_captions,
+    stored_size,
     swipe_places,
     write_clip,
 )
@@ -48,6 +49,7 @@ from gsmerge.scene.read import Loaded, SceneViews, move_cameras_to_scene, read_g
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
 
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 PANEL_VIEWS = 4  # rows of a panel
 SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # of a path, at least
 VIEW_FRAMES = 4  # for each view of a spline, at least
@@ -72,7 +74,7 @@ class DrawOptions:
     output: Path  # A picture, a video, or a folder for pictures
     opacity: OpacityChoice = "auto"
     hints: ReadHints = AUTO
-    views: int | None = None  # Views at most; None: all, of a panel four
+    views: int | str | None = None  # Views at most, or the name of the only one; None: all, of a panel four
     path: str | None = None  # See :func:`gsmerge.measure.camera_path.parse_path`, or a file of cameras
     frames: int | None = None  # Along the path; None: those of SECONDS, of a spline at least 4 for each view
     size: tuple[int, int] | None = None  # Width and height of a picture; None: those of the cameras
@@ -85,9 +87,11 @@ class DrawOptions:
         """Return the grey level behind pictures that have no alpha."""
         return 0.0 if isinstance(self.background, str) else self.background
 
-    def choose(self, count: int, most: int | None = None) -> list[int]:
-        """Choose ids of ``count`` views: as many as the option ``views``, or else ``most``; None: all."""
-        return pick_views(count, self.views or most or count)
+    def choose(self, names: Sequence[str], most: int | None = None) -> list[int]:
+        """Choose ids of views: by the option ``views``, or else ``most``; None: all."""
+        if isinstance(self.views, str):
+            return [find_view(self.views, names)]
+        return pick_views(len(names), self.views or most or len(names))
 
     @property
     def legend(self) -> str:
@@ -193,26 +197,28 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     group = _read(options, photos=True)
     used = list(group.load.views.used)
     cameras, photos = options.resize(group.load.views.cameras[used]), group.load.views.images
-    ids = options.choose(len(used), PANEL_VIEWS)
+    ids = options.choose([group.load.views.names[view] for view in used], PANEL_VIEWS)
+    pictured = {group.load.views.of_scene[view] for view in group.load.scene.photo_views}
 
     def draw(_: int) -> Iterator[Picture]:
         parts = [(f"{path.name}{options.legend}", gaussians) for path, gaussians in group.scenes]
-        shown = [photos[used[i]] for i in ids] if len(photos) else None
+        shown = [photos[used[i]] if used[i] in pictured else None for i in ids] if pictured else None
         if shown and options.size:
-            shown = [fill_photo(photo, *options.size) for photo in shown]
+            shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         plain = options.overlay is None
         rows = view_pictures(parts, cameras[ids], shown, ids, scored=plain, background=options.grey)
-        outside = outside_pictures(parts, cameras, photos=len(photos) > 0, background=options.grey)
+        outside = outside_pictures(parts, cameras, photos=shown is not None, background=options.grey)
         yield contact_sheet([*rows, outside])
 
-    facts = {"scenes": group.counts(), "views": ids, "photos": len(photos) > 0, "notes": group.notes}
+    facts = {"scenes": group.counts(), "views": ids, "photos": len(pictured) > 0, "notes": group.notes}
     return Drawing([options.output], facts, draw)
 
 
 def prepare_pictures(options: DrawOptions) -> Drawing:
-    """Prepare one picture for each camera, of several scenes side by side."""
+    """Prepare a picture for each camera, of several scenes side by side; the only one where no folder is named."""
     group = _read(options, photos=False)
-    ids = options.choose(len(group.load.views.cameras))
+    is_folder = options.output.suffix.lower() not in PICTURES
+    ids = options.choose(group.load.views.names) if is_folder or options.views else [0]
     views, stems = options.resize(group.load.views.cameras[ids]), picture_stems(group.load.views.names)
     names = [f"{path.name}{options.legend}: {len(gaussians):,}" for path, gaussians in group.scenes]
 
@@ -222,7 +228,7 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
 
     facts = {"width": views.width, "height": views.height, "scenes": group.counts(), "views": ids, "notes": group.notes}
     facts |= _depth_unit(group, views, options)
-    return Drawing([options.output / f"{stems[i]}.png" for i in ids], facts, draw)
+    return Drawing([options.output / f"{stems[i]}.png" for i in ids] if is_folder else [options.output], facts, draw)
 
 
 def _depth_unit(group: DrawnScenes, cameras: Cameras, options: DrawOptions) -> dict[str, float]:
@@ -258,7 +264,13 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     if options.output.suffix.lower() not in SUFFIXES:
         return Drawing([options.output / f"frame_{i:05d}.png" for i in range(len(cameras))], facts, draw)
     _check_frames(options.output, cameras.width, cameras.height, len(cameras))
-    return Drawing([options.output], facts | {"fps": options.fps}, draw)
+    width, height = stored_size(options.output, cameras.width, cameras.height)
+    if (width, height) != (cameras.width, cameras.height):
+        group.notes.append(
+            f"frames of {cameras.width} x {cameras.height} are written as {width} x {height}, the last row or column"
+            " twice: a video has even sides"
+        )
+    return Drawing([options.output], facts | {"width": width, "height": height, "fps": options.fps}, draw)
 
 
 def _check_frames(output: Path, width: int, height: int, count: int) -> None:
@@ -281,7 +293,8 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
     group = _read(options, photos=False)
     placed = group.load.views.cameras
     cameras = placed if file is None or not separate else _place_file(file, group.load)
-    ids = options.choose(len(cameras))
+    assert not isinstance(options.views, str)
+    ids = pick_views(len(cameras), options.views or len(cameras))
     cameras = cameras[ids]
     depth = viewing_depth(cameras if file is None else placed, group.scenes[0][1].means)
     if path is not None:
@@ -346,6 +359,16 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     notes = [text for text in record.notes if text != NO_VIEWS]  # that is for results
     placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
     return replace(load, scene=scene, views=views, notes=(*load.notes, *notes, placed))
+
+
+def find_view(view: str, names: Sequence[str]) -> int:
+    """Find a view by its name, with or without folders and ending; UsageError if there is none, or several."""
+    stems = picture_stems(names)
+    places = [place for place, name in enumerate(names) if view in (name, Path(name).name, stems[place])]
+    if len(places) != 1:
+        found = f"{len(places)} views of this name" if places else "no view of this name"
+        raise UsageError(f"--views {view}: expected a number or the name of a view, such as {stems[0]}, found {found}")
+    return places[0]
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:

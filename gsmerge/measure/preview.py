@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.raster import render
-from gsmerge.raster.metrics import psnr
+from gsmerge.raster.metrics import psnr, psnr_words
 from gsmerge.types import Cameras, Gaussians
 
 Picture = NDArray[np.uint8]  # [h,w,3], sRGB, RGB order
 FACE = cv2.FONT_HERSHEY_SIMPLEX
+MAX_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}  # pixels, of a format and of its encoder
 BAND, WIDE = 22, 640  # height of the band that carries a tile's label, pixels, and width of a tile from which it grows
 DARK = 32  # level of the bands, and of the cell without a photo
 GAP = 4
@@ -37,6 +40,10 @@ def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool =
     It has three channels, four with alpha, or none: ``[h,w]`` of 8 or 16 bits.
     """
     stored = picture if picture.ndim == 2 else picture[..., [2, 1, 0, 3][: picture.shape[2]]]
+    most, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
+    if max(height, width) > most:
+        problem = f"expected at most {most:,} pixels a side of a {path.suffix}, got {width} x {height}"
+        raise SceneError(path, problem, "name a .png, or lower --size")
     _, data = cv2.imencode(path.suffix, np.ascontiguousarray(stored), settings)
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(data.tobytes())
@@ -69,7 +76,7 @@ def shorten_text(text: str, width: int, scale: float, thickness: int) -> str:
 def view_pictures(
     scenes: Sequence[tuple[str, Gaussians]],
     cameras: Cameras,
-    photos: Sequence[np.ndarray] | None = None,
+    photos: Sequence[np.ndarray | None] | None = None,
     ids: Sequence[int] | None = None,
     *,
     scored: bool = True,
@@ -79,18 +86,22 @@ def view_pictures(
 
     Every picture comes with a line of text: its name, its number of Gaussians, and, if it is ``scored``, its PSNR
     to the whole photo ``[h,w,3]``, or without photos to the first scene; a photo with the number of its view in
-    ``ids``. ``drawing`` is passed on to :func:`gsmerge.render`.
+    ``ids``. Of a view whose photo is None a dark picture comes first. ``drawing`` is passed on to
+    :func:`gsmerge.render`.
     """
     renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
     for row, view in enumerate(ids or range(len(cameras))):
         columns = [(f"{name}: {len(part):,}", drawn[row]) for (name, part), drawn in zip(scenes, renders, strict=True)]
-        if photos is not None:
-            columns.insert(0, (f"photo, view {view}", photos[row]))
+        photo = None if photos is None else photos[row]
+        if photo is not None:
+            columns.insert(0, (f"photo, view {view}", photo))
+        elif photos is not None:
+            columns.insert(0, (f"view {view}: no photo", np.full_like(renders[0][row], DARK / 255)))
         first, *others = columns
-        if scored:
+        if scored and (photo is not None or photos is None):
             what = "the photo" if photos is not None else scenes[0][0]
-            others = [(f"{text}, {psnr(image, first[1]):.1f} dB to {what}", image) for text, image in others]
+            others = [(f"{text}, {psnr_words(psnr(image, first[1]))} to {what}", image) for text, image in others]
         views.append([(text, to_picture(image)) for text, image in (first, *others)])
     return views
 

@@ -12,6 +12,7 @@ WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard
 C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data range of 1
 MAX_LOSS = 0.5  # dB that a result may show its own photos worse than its input without a word about it
 WORSE = "worse than the input does"  # by which commands tell warnings from notes
+MAX_PSNR = 120.0  # dB of equal pictures, whose PSNR is infinite
 POOR = 30.0  # dB from its input below which the views of a result look different, where there are no photos
 
 
@@ -49,6 +50,11 @@ def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
 def decibels(error: float) -> float:
     """Convert a mean squared error of values in [0, 1] to PSNR, dB; at most 120."""
     return -10 * float(log10(max(error, 1e-12)))
+
+
+def psnr_words(psnr: float) -> str:
+    """Write a PSNR (dB) for people: of equal pictures there is none."""
+    return "no difference" if psnr >= MAX_PSNR else f"{psnr:.1f} dB"
 
 
 def describe_loss(name: str, before: float | None, after: float | None, pictures: str) -> str | None:

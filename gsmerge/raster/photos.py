@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import composite
-from gsmerge.raster.metrics import psnr
+from gsmerge.raster.metrics import MAX_PSNR, psnr
 from gsmerge.raster.tiled_view import Splats, make_splats, tile_view
 from gsmerge.runtime.memory import make_array
 from gsmerge.runtime.threads import parallel_map
@@ -247,10 +247,10 @@ def score_photos(
 
 
 def _mean_score(scores: Sequence[RenderScore]) -> PhotoScore:
-    """Average the scores of views."""
-    inside = [score.covered_psnr for score in scores if score.share > 0]
+    """Average the scores of views, at most MAX_PSNR each, so that one view of equal pictures does not hide others."""
+    inside = [min(score.covered_psnr, MAX_PSNR) for score in scores if score.share > 0]
     share = float(np.mean([score.share for score in scores]))
-    mean = float(np.mean([score.psnr for score in scores]))
+    mean = float(np.mean([min(score.psnr, MAX_PSNR) for score in scores]))
     return PhotoScore(mean, float(np.mean(inside)) if inside else math.nan, share, tuple(s.covered for s in scores))
 
 

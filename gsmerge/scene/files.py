@@ -36,7 +36,7 @@ from gsmerge.io.formats.table import (
     is_frame,
     may_hold_gaussians,
 )
-from gsmerge.io.image_names import check_photo_folder, list_images
+from gsmerge.io.image_names import check_photo_folder, list_images, natural_order
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.reading import NONE
@@ -347,7 +347,7 @@ def _scenes_below(folder: Path) -> list[Path]:
                     return []
                 if depth < _MAX_DEPTH and entry.name[0] != "." and entry.is_dir(follow_symlinks=False):
                     places.append((place / entry.name, depth + 1))
-    return sorted(scenes)
+    return natural_order(scenes)
 
 
 def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:
@@ -404,14 +404,14 @@ def other_plys(folder: Path) -> list[Path]:
 
     Without any it is the only file of another format, except in a web site.
     """
-    plys = sorted(folder.glob("[!.]*.ply"))
+    plys = natural_order(folder.glob("[!.]*.ply"))
     scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
     packed = [] if scenes or (folder / HTML.site).exists() else [p for p in folder.glob("[!.]*") if p.suffix in _PACKED]
     return packed if len(packed) == 1 and may_hold_gaussians(packed[0]) else scenes
 
 
 def _results_in(folder: Path) -> list[Path]:
-    plys = sorted(folder.glob("[!.]*.ply"))[:_MAX_HEADERS]
+    plys = natural_order(folder.glob("[!.]*.ply"))[:_MAX_HEADERS]
     return [path for path in plys if _RESULT.search(path.name) or header_content(path) == "result"]
 
 

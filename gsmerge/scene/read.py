@@ -463,7 +463,7 @@ def _make_load(
     Cameras of ``absent`` have no photo.
     """
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
-    names = () if camera_file is None else camera_file.names
+    camera_names = () if camera_file is None else camera_file.names
     gaussians, pixels = take_gaussians(ply, result)
     num_faint = int(ply.valid.sum()) - len(gaussians)
     more = [f"{num_faint:,} Gaussian(s) that nothing draws, fainter than 1/255, set aside"] if num_faint else []
@@ -475,7 +475,7 @@ def _make_load(
     masks, described = check_masks(masks[views], files)
     more += described
     photos = images if len(images) else None
-    names = tuple(names[view] for view in views)
+    names = tuple(camera_names[view] for view in views)
     scene = Scene(gaussians, cameras, photos, pixels, names, large, masks.counts, masks.importance)
     frame = None if result.recovery is None else result.recovery.best.frame
     source = "" if camera_file is None else camera_file.source
@@ -501,7 +501,7 @@ def _make_load(
         info=ply.info,
         files=files,
         cameras=camera_file,
-        views=SceneViews(result.cameras, result.images, names, tuple(views)),
+        views=SceneViews(result.cameras, result.images, camera_names, tuple(views)),
         exporters=exporters,
         notes=(*files.notes, *file_notes(ply.info), *notes, *more),
         alignment=alignment,

@@ -58,3 +58,28 @@ def test_a_protected_part_of_the_photos_is_shown_better(
     assert 0.03 < protected["share"] < 0.07
     assert protected["after"] > protected["before"]
     assert any(note.startswith("protect: ") for note in report["notes"])
+
+
+def test_a_batch_and_a_page_take_what_each_scene_has(run: Run, make_scene: Callable[..., Path], tmp_path: Path) -> None:
+    """Masks and what is to be protected, as of ``compact``: the same bytes."""
+    for number in (0, 1):
+        room = make_scene(tmp_path / "rooms" / f"room{number}", num_views=3, width=24, height=16, seed=number)
+        for name, level in (("shades", 255), ("signs", 0)):
+            picture = np.full((16, 24), level, np.uint8)
+            picture[:8, :12] = 255 - level
+            for photo in (room / "images").iterdir():
+                (room / name).mkdir(exist_ok=True)
+                assert cv2.imwrite(str(room / name / f"{photo.stem}.png"), picture)
+    quick, places = ("--effort", "draft", "--set", "fit=none"), ("--masks", "{parent}/shades", "--protect")
+    batch = ("batch", tmp_path / "rooms", "-o", tmp_path / "out", *quick)
+    lines = run(*batch, *places, "{parent}/signs", "--json", code=0).out.splitlines()
+    reports = [json.loads(line)["report"] for line in lines]
+    assert [report["psnr_protected"]["share"] > 0 for report in reports] == [True, True]
+    assert all(any(note.startswith("masks leave out 25 %") for note in report["notes"]) for report in reports)
+    own = ("--masks", room / "shades", "--protect", room / "signs")
+    run("compact", room, "-o", tmp_path / "own.ply", *quick, *own, code=0)
+    assert (tmp_path / "own.ply").read_bytes() == (tmp_path / "out" / "room1.ply").read_bytes()
+    assert "'{parent}/signs'" in run(*batch, "--protect", "signs", code=3).err
+    page = ("view", room, *own, "-o", tmp_path / "page.html", "--no-open")
+    assert "--sizes" in run(*page, code=2).err
+    assert "protect: " in run(*page, "--sizes", "10", code=0).err

@@ -236,16 +236,66 @@ def test_pictures_have_alpha_opacity_or_depth(small_scene: Path, tmp_path: Path,
         assert (depth > 0).any()
 
 
+def test_a_picture_of_one_view_is_that_of_the_folder(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    """The first view unless one is named, by its photo."""
+    for flags in (("--background", "none"), ("--channel", "alpha"), ()):
+        run("render", small_scene, *flags, "-o", tmp_path / "all", "--overwrite", code=0)
+        for view, number in ((None, 0), ("view_001", 1), ("view_002.png", 2)):
+            if flags or view:
+                more = () if view is None else ("--views", view)
+                run("render", small_scene, *flags, *more, "-o", tmp_path / "a.png", "--overwrite", code=0)
+                whole, one = (tmp_path / name for name in (f"all/view_{number:03d}.png", "a.png"))
+                assert one.read_bytes() == whole.read_bytes()
+    run("render", small_scene, "--background", "none", "-o", tmp_path / "a.webp", code=0)
+    assert cv2.imread(str(tmp_path / "a.webp"), cv2.IMREAD_UNCHANGED).shape == (HEIGHT, WIDTH, 4)
+    run("render", small_scene, small_scene / "scene.ply", "--views", "view_001", "-o", tmp_path / "panel.jpg", code=0)
+
+
+def test_cameras_of_views_that_the_file_lacks_are_drawn(small_copy: Path, tmp_path: Path, run: Run) -> None:
+    gaussians = gsmerge.read_ply(small_copy / "scene.ply").gaussians
+    gsmerge.write_ply(small_copy / "scene.ply", gaussians[WIDTH * HEIGHT : 3 * WIDTH * HEIGHT], overwrite=True)
+    run("render", small_copy, "-o", tmp_path / "all", code=0)
+    assert list(listing(tmp_path / "all")) == [f"view_{i:03d}.png" for i in range(5)]
+
+
+def test_clips_show_opacity(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    path = ("--path", small_scene / "transforms.json", "--views", 2, "--channel", "alpha")
+    for name in ("frames", "a.webm", "a.gif"):
+        run("render", small_scene, *path, "-o", tmp_path / name, code=0)
+    first = cv2.imread(str(tmp_path / "frames" / "frame_00000.png"))
+    assert error(first[..., 0], first[..., 1]) == 0
+    assert max(error(first, read(tmp_path / name)[0]) for name in ("a.webm", "a.gif")) < 12
+
+
+def test_even_sides_of_videos_are_said(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    for name, size in (("a.mp4", (50, 34)), ("a.gif", (49, 33))):
+        call = ("render", small_scene, "--size", "49x33", "--frames", 2, "-o", tmp_path / name, "--json")
+        document = json.loads(run(*call, code=0).out)
+        assert read(tmp_path / name)[0].shape[1::-1] == size == (document["width"], document["height"])
+        said = [note for note in document["notes"] if names(note, "49 x 33", "50 x 34", "even")]
+        assert len(said) == (name == "a.mp4")
+
+
+DEEP, BARE = ("--channel", "depth"), ("--background", "none")
+
+
 @pytest.mark.parametrize(
-    ("flags", "name"),
+    ("flags", "name", "words"),
     [
-        (("--background", "none"), "a.png"), (("--channel", "depth"), "a.webm"),
-        (("--background", "nothing"), "folder"), (("--background", "2"), "folder"), (("--background", "nan"), "folder"),
+        (BARE, "a.jpg", (".png", ".webp", ".webm", "--background none")), (DEEP, "a.webm", (".png", "depth")),
+        (DEEP, "a.jpg", (".png", "--channel depth")), ((*BARE, "--views", 2), "a.png", ("--views", "name")),
+        ((*DEEP, "--overlay", "support"), "folder", ("--overlay", "--channel depth")),
+        ((*DEEP, "--background", "1"), "folder", ("--background", "--channel depth")),
+        (("--views", "view_001"), "a.gif", ("--views", "number", "--path")), (("--views", "0"), "folder", ("--views",)),
+        (("--views", "nine"), "a.png", ("--views nine", "view_000")),
+        (("--background", "nothing"), "folder", ("--background",)), (("--background", "2"), "folder", ()),
+        (("--background", "nan"), "folder", ()),
     ],
 )  # fmt: skip
-def test_only_pictures_in_a_folder_have_alpha(
-    flags: tuple[str, str], name: str, small_scene: Path, tmp_path: Path, run: Run
+def test_options_that_do_not_fit_are_refused(
+    flags: tuple[str | int, ...], name: str, words: tuple[str, ...], small_scene: Path, tmp_path: Path, run: Run
 ) -> None:
+    """Nothing that is asked for is left out without a word."""
     outcome = run("render", small_scene, *flags, "-o", tmp_path / name, code=2)
-    assert flags[0] in outcome.err
+    assert all(word in outcome.err for word in words)
     assert not (tmp_path / name).exists()

@@ -62,6 +62,17 @@ def test_the_output_folder_is_not_searched() -> None:
         actual("all", out=Path("all"))
 
 
+def test_numbers_are_in_their_order() -> None:
+    """So that {index} is that of the moment."""
+    touch(*(f"all/frame_{i}.ply" for i in range(1, 13)), *(f"all/room{i}/scene.ply" for i in (10, 9, 100)))
+    frames, rooms = [f"all/frame_{i}.ply" for i in range(1, 13)], [f"all/room{i}" for i in (9, 10, 100)]
+    assert actual("all") == [*frames, *rooms]
+    assert actual("all/*.ply") == frames
+    assert actual("all/r*") == rooms
+    touch("zeros/view_01.ply", "zeros/view_1.ply", "zeros/view_001.ply")
+    assert actual("zeros") == ["zeros/view_001.ply", "zeros/view_01.ply", "zeros/view_1.ply"]
+
+
 def test_patterns_and_lists() -> None:
     touch("s/one/scene.ply", "s/two/scene.ply", "s/notes.ply.txt", "s/x.ply")
     assert actual("s/*") == ["s/one", "s/two", "s/x.ply"]
@@ -156,6 +167,24 @@ def test_a_folder_that_cannot_be_read_is_a_scene_that_fails() -> None:
     if sys.version_info < (3, 13):  # whose pathlib calls what the fixture put in the place of os.scandir
         with refuses(SceneError, "all/locked", "Permission denied"):
             find_scene_files(Path("all/locked"))
+
+
+@pytest.mark.parametrize("is_listed", [False, True])
+def test_a_folder_that_vanishes_is_a_scene_that_fails(is_listed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before its names are listed, and after."""
+    touch("all/a.ply", "all/gone/b.ply", "all/z/c.ply")
+    scandir = os.scandir
+
+    def vanish(path: Any = ".") -> Any:
+        listed = scandir(path) if is_listed else None
+        if str(path) == os.path.join("all", "gone") and os.path.isdir(path):
+            os.rename(path, "elsewhere")
+        return listed or scandir(path)
+
+    monkeypatch.setattr(os, "scandir", vanish)
+    assert actual("all") == ["all/a.ply", "all/gone", "all/z/c.ply"]
+    with refuses(SceneError, "all/gone", "no such file"):
+        find_scene_files(Path("all/gone"))
 
 
 def test_a_folder_whose_files_may_not_be_looked_at_is_its_own_file(monkeypatch: pytest.MonkeyPatch) -> None:

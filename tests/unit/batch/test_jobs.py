@@ -14,7 +14,7 @@ from messages import refuses
 
 from gsmerge.batch import BatchOptions, find_jobs
 from gsmerge.batch.jobs import output_name
-from gsmerge.errors import UsageError
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.settings.compact import CompactOptions
 
 OUT = Path("out")
@@ -103,9 +103,14 @@ def test_names_are_filled_in(tmp_path: Path) -> None:
 
 
 def test_cameras_and_photos_of_each_scene_are_filled_in() -> None:
-    touch("s/a/scene.ply", "s/b.ply")
-    jobs = find_jobs(["s"], OUT, BatchOptions(cameras="{parent}/{stem}.json", images="photos"))
+    touch("s/a/scene.ply", "s/b.ply", "photos/0.png")
+    options = BatchOptions(cameras="{parent}/{stem}.json", images="photos", masks="{parent}/masks", protect="none")
+    jobs = find_jobs(["s"], OUT, options)
     assert [job.cameras for job in jobs] == [Path("s/b.json"), Path("s/a/a.json")]
     assert [job.images for job in jobs] == [Path("photos")] * 2
+    assert [job.masks for job in jobs] == [Path("s/masks"), Path("s/a/masks")]
+    assert [job.protect for job in jobs] == ["none"] * 2
+    with refuses(SceneError, "", "signs", "--protect '{parent}/signs'"):
+        find_jobs(["s"], OUT, BatchOptions(protect="signs"))
     with refuses(UsageError, "", "{scene}", "{name}"):
         find_jobs(["s"], OUT, BatchOptions(cameras="{name}"))

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from gsmerge.errors import SceneError
 from gsmerge.measure import preview
 from gsmerge.types import Cameras, Gaussians
 
@@ -37,6 +40,27 @@ def test_contact_sheet_shows_scenes_left_to_right_below_their_labels() -> None:
     assert photo == 51
     assert dark == pytest.approx(0.95 * 0.3 * 255, abs=4)
     assert bright == pytest.approx(0.95 * 0.9 * 255, abs=4)
+
+
+def test_a_view_without_a_photo_has_none_and_no_score() -> None:
+    photo = np.full((12, 20, 3), 0.2, np.float32)
+    first, second = preview.view_pictures([("one", blob(0.3))], cameras(2), [None, photo])
+    assert [text for text, _ in first] == ["view 0: no photo", "one: 1"]
+    assert float(first[0][1].mean()) == preview.DARK
+    assert [text.partition(",")[0] for text, _ in second] == ["photo", "one: 1"]
+    assert second[1][0].endswith("dB to the photo")
+
+
+def test_equal_pictures_have_no_number() -> None:
+    ((_, (text, _)),) = preview.view_pictures([("one", blob(0.3)), ("two", blob(0.3))], cameras(1))
+    assert text == "two: 1, no difference to one"
+
+
+@pytest.mark.parametrize(("name", "most"), [("a.webp", 16383), ("a.jpg", 65500)])
+def test_pictures_too_long_for_their_format_are_refused(name: str, most: int, tmp_path: Path) -> None:
+    preview.save_picture(tmp_path / name, np.zeros((1, most, 3), np.uint8))
+    with pytest.raises(SceneError, match=f"{most:,}"):
+        preview.save_picture(tmp_path / name, np.zeros((1, most + 1, 3), np.uint8))
 
 
 @pytest.mark.parametrize("photos", [True, False])

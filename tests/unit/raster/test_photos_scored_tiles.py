@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scenes
 
 from gsmerge import Scene
 from gsmerge.raster.composite import composite
-from gsmerge.raster.photos import NEAR_PLANE, scene_photos, score_photos, scored_tiles
+from gsmerge.raster.metrics import MAX_PSNR, psnr_words
+from gsmerge.raster.photos import NEAR_PLANE, render_photos, scene_photos, score_photos, scored_tiles
 from gsmerge.raster.tiled_view import make_splats, tile_view
 
 
@@ -57,3 +60,14 @@ def test_quarter_is_near_the_whole(scene: Scene) -> None:
     )
     assert quarter == pytest.approx(whole, abs=0.5)
     assert quarter != whole
+
+
+def test_a_view_of_equal_pictures_hides_no_other(scene: Scene) -> None:
+    """Its PSNR is infinite, and would be the mean's."""
+    photos = scene_photos(scene)
+    drawn = render_photos(scene.gaussians, photos, near=NEAR_PLANE)
+    photos = replace(photos, images=np.stack([drawn[0].clip(0, 1), *photos.images[1:]]))
+    views = [score_photos(scene.gaussians, photos, [view], near=NEAR_PLANE).psnr for view in range(2)]
+    assert psnr_words(views[0]) == "no difference"
+    assert psnr_words(views[1]) == f"{views[1]:.1f} dB" < "60"
+    assert score_photos(scene.gaussians, photos, range(2), near=NEAR_PLANE).psnr == (MAX_PSNR + views[1]) / 2
