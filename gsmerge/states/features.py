@@ -28,6 +28,7 @@ from gsmerge.pooling import Members, feature_to_gaussians, gaussian_members
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.setting import piece_settings
 from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
 from gsmerge.stages.assign import assign
@@ -37,7 +38,7 @@ from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
 from gsmerge.stages.segment import segment_scene
 from gsmerge.stages.superpixels import scene_saliency
-from gsmerge.states.extend import BatchReport, number_names
+from gsmerge.states.extend import NOT_COMPARED, NOT_KNOWN, BatchReport, compare_worlds, number_names, refuse_other_world
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
 
 SAMPLE_STEP = 8  # pixels between the samples of a view along each axis
@@ -123,7 +124,12 @@ class _JoinContext(NetworkContext):
 
 
 def extend_features(
-    state: FeatureState | None, scene: Scene, options: CompactOptions, *, progress: Progress | None = None
+    state: FeatureState | None,
+    scene: Scene,
+    options: CompactOptions,
+    extend_options: ExtendOptions,
+    *,
+    progress: Progress | None = None,
 ) -> tuple[FeatureState, BatchReport]:
     """Add a batch of views to a state, or begin one; see :func:`gsmerge.states.extend.extend`.
 
@@ -141,11 +147,15 @@ def extend_features(
     options = options.with_settings(piece_settings(CompactOptions))
     with use_threads(options.threads), record_run(progress) as record:
         prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame)
+        pictured, world = prepared.scene, NOT_KNOWN
+        if state is not None:
+            world = compare_worlds(feature_to_gaussians(state.refined), pictured, pictured.gaussians.means)
+            refuse_other_world(world, extend_options)
         plan = make_plan(prepared, options, None if state is None else _own_checkpoint(state, options))
         weights = plan.networks
         if weights is None or not weights.options.encoder or not weights.options.makes_children:
             raise UsageError(f"recipe paper: expected an encoder and absolute outputs, {options.checkpoint} lacks them")
-        pictured, cameras = prepared.scene, in_float64(prepared.scene.cameras)
+        cameras = in_float64(pictured.cameras)
         segmentation = segment_scene(pictured, plan.superpixels, None)
         members = assign(pictured, segmentation.groups, by_contribution=plan.by_contribution)
         context = NetworkContext(weights, members, cameras, plan.seed)
@@ -165,9 +175,11 @@ def extend_features(
             made = _join(state, features, saliency, context, samples, plan.match)
             made = replace(made, unseen=Gaussians.concat([state.unseen, plan.unseen]))
     numbers = {"num_views": len(pictured), "num_input": scene.num_gaussians, "num_new": len(features)}
+    notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == NOT_KNOWN else [])]
     report = BatchReport(
-        **numbers, num_gaussians=len(made), num_kept=0, pictures=prepared.reference.name, seconds=record.seconds,
-        choices=record.choices | plan.network_facts, notes=tuple(record.notes), options=options.to_dict(),
+        **numbers, num_gaussians=len(made), num_kept=0, pictures=prepared.reference.name, views={},
+        sh_degree=scene.gaussians.sh_degree, seconds=record.seconds,
+        choices=record.choices | plan.network_facts | {"world": world}, notes=tuple(notes), options=options.to_dict(),
     )  # fmt: skip
     names = prepared.input_scene.names
     views = tuple(names[prepared.repeated.index(view)] for view in range(len(pictured)))
