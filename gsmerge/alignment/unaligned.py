@@ -143,8 +143,8 @@ def choose_poses(
     """Choose the pose convention whose cameras see the most Gaussians, with the nearest colours.
 
     ``cameras`` are in the usual convention; other arguments are those of :func:`check_cameras`. Returns the poses, or
-    None if no other convention is clearly better than the usual one; the check of the chosen poses; and a note if other
-    conventions see as many.
+    None if no other convention is clearly better than the usual one; the check of the chosen poses; and a note if photos
+    fit others as well.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
@@ -158,7 +158,8 @@ def choose_poses(
     scores = [check.score for check in (usual, *(check for _, check in ranked[1:2])) if check.ok]
     if best.score >= MARGIN * max(scores, default=0.0):
         return poses, best, None
-    as_good = usual.ok and _FRAME_GAIN * best.score >= usual.score
+    # Without photos other readings see as many of any scene that lies before its cameras, which says nothing
+    as_good = usual.ok and usual.num_compared > 0 and _FRAME_GAIN * best.score >= usual.score
     note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
     return None, usual, note if as_good else None
 
