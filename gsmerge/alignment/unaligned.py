@@ -143,8 +143,8 @@ def choose_poses(
     """Choose the pose convention whose cameras see the most Gaussians, with the nearest colours.
 
     ``cameras`` are in the usual convention; other arguments are those of :func:`check_cameras`. Returns the poses, or
-    None if no other convention is clearly better than the usual one; the check of the chosen poses; and a note if photos
-    fit others as well.
+    None if no other convention is clearly better than the usual one; the check of the chosen poses; and a note if
+    photos fit others as well.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
