@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment import check_cameras
+from gsmerge.arguments import checked
 from gsmerge.compaction.estimate import estimate, estimate_lines
 from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.prepare import missing_notes
+from gsmerge.facts.prepare import views_notes, without_repeats
 from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.facts.support import count_views_in_world
 from gsmerge.frame import canonicalise
@@ -54,6 +55,7 @@ _REPEATED = "read as: "  # notes that repeat a line of their own
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}
 
 
+@checked
 def inspect(
     path: StrPath,
     *,
@@ -201,17 +203,18 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
         means = gaussians.means[np.isfinite(gaussians.means).all(1)]
         num_sky_views = len(sky_regions(means, scene.cameras, images))
-    agreement, odd = _measure_agreement(scene), unlike_captures(scene.gaussians)
+    once = without_repeats(scene)[0]  # as a run takes it
+    agreement, odd = _measure_agreement(once), unlike_captures(scene.gaussians)
     doubts = [odd, None if agreement is None else agreement.doubt]
     facts: dict[str, Any] = {
-        "notes": [*load.notes, *missing_notes(scene), *_photo_notes(scene), *filter(None, doubts)],
+        "notes": [*load.notes, *views_notes(scene), *_photo_notes(scene), *filter(None, doubts)],
         "num_views": len(load.views.used),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),
         "sight": sight and asdict(sight),
         "num_sky_views": num_sky_views,
         "compact": estimate(scene, CompactOptions()),
-        "auto": _describe_auto(scene, agreement),
+        "auto": _describe_auto(once, agreement),
         "agreement": agreement and agreement.to_dict(),
     }
     if is_result and len(scene) and load.recovery is None:  # those of views hide each other where these overlap

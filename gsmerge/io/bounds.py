@@ -109,7 +109,7 @@ def check_file(path: Path) -> int:
         reason = "no such file" if missing else f"cannot be read ({getattr(error, 'strerror', error)})"
         raise SceneError(path, reason) from error
     if stat.S_ISDIR(status.st_mode):
-        raise SceneError(path, "expected a file, found a folder")
+        raise SceneError(path, "expected a file, found a folder", "name the file in it")
     if not stat.S_ISREG(status.st_mode):
         raise SceneError(path, "expected a file, found a pipe or a device", "write its content to a file first")
     check_first_bytes(Path(path), status.st_size)

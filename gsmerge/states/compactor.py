@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gsmerge.arguments import checked
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import UsageError
@@ -79,6 +80,7 @@ class Compactor:
         self._state: State | None = None
 
     @classmethod
+    @checked
     def load(cls, path: StrPath, **settings: Unpack[StateKeywords]) -> Compactor:
         """Load a saved state; ``settings`` are for the batches to come.
 
@@ -109,6 +111,7 @@ class Compactor:
         """Numbers of every batch so far; see :class:`gsmerge.states.extend.BatchReport`."""
         return () if self._state is None else tuple(self._state.about["batches"])
 
+    @checked
     def extend(self, scene: Scene | StrPath, *, progress: Progress | None = None) -> BatchReport:
         """Add a batch of views in the world of the earlier ones; see :func:`gsmerge.states.extend.extend`.
 
@@ -130,6 +133,7 @@ class Compactor:
         """
         self._state = remove(self.state, number)
 
+    @checked
     def compact(self, *, progress: Progress | None = None, **settings: Unpack[CompactKeywords]) -> CompactResult:
         """Compact the scene of all batches so far, see :func:`gsmerge.compact`.
 
@@ -154,6 +158,7 @@ class Compactor:
             raise ValueError('expected a state begun with recipe="paper", found results; compact makes others of them')
         return decode_features(self.state.features, DecodeOptions(**settings))
 
+    @checked
     def save(self, path: StrPath, *, overwrite: bool = False) -> None:
         """Write the state to a file.
 

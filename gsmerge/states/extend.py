@@ -13,6 +13,7 @@ from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
 from gsmerge.errors import SceneError
+from gsmerge.facts.confirm_depths import CERTAIN, ENOUGH
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
 from gsmerge.geometry import camera_centres, camera_distances
@@ -28,9 +29,8 @@ from gsmerge.types import Cameras, Gaussians, Scene
 # Earlier Gaussians that are looked up in new views
 SAMPLE_GAUSSIANS = 10_000
 # How far colours of the foremost lie from the pictures, over how far from random pixels: of batches of 15 captures at
-# most .87 in one world, and .92 to 1.08 in others, where 1 is chance. Two standard errors are to lie on one side; with
-# so many Gaussians a mean's error is about normal.
-UNLIKE, CERTAIN, ENOUGH = 0.9, 2.0, 30
+# most .87 in one world, and .92 to 1.08 in others, where 1 is chance. That is to be certain.
+UNLIKE = 0.9
 SAME, ANOTHER, NOT_KNOWN = "the same", "another", "not known"  # worlds
 BATCH = "batch"  # in messages, until the file is known
 NOT_COMPARED = "the pictures of this batch show too little of the earlier Gaussians to say whether its world is theirs"

@@ -35,6 +35,7 @@ USAGE = {
     "compact room --threads 0": "--threads*1",
     "compact room --budget 5B": "budget*579*5",
     "compact room --effort slow": "--effort*'slow'*'draft'",
+    "convert alone.ply": "*alone.ply alone*gsmerge convert alone.ply x.spz",
     "compact room --effort BEST": "--effort*'BEST'*'best'*perhaps best",
     "compact room --budget quest": "budget*'quest'*perhaps quest3",
     "compact room --set match=aab": "--set match*'aab'*perhaps aabb",
