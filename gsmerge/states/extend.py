@@ -130,7 +130,7 @@ def refuse_other_world(world: str, options: ExtendOptions) -> None:
     """Raise SceneError for a batch that seems to be of another world, unless options ask for it."""
     if world == ANOTHER and not options.other_world:
         problem = "expected views in the world of the earlier batches, found pictures that do not show their Gaussians"
-        raise SceneError(BATCH, problem, "begin another .gsm with it, or add it with other_world=true")
+        raise SceneError(BATCH, problem, "begin another .gsm with it, or add it with --set other_world=true")
 
 
 def _keep_pictures(prepared: Prepared) -> Scene:
