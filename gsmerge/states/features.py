@@ -124,13 +124,9 @@ class _JoinContext(NetworkContext):
 
 
 def extend_features(
-    state: FeatureState | None,
-    scene: Scene,
-    options: CompactOptions,
-    extend_options: ExtendOptions,
-    *,
-    progress: Progress | None = None,
-) -> tuple[FeatureState, BatchReport]:
+    state: FeatureState | None, scene: Scene, options: CompactOptions, extend_options: ExtendOptions,
+    *, progress: Progress | None = None,
+) -> tuple[FeatureState, BatchReport]:  # fmt: skip
     """Add a batch of views to a state, or begin one; see :func:`gsmerge.states.extend.extend`.
 
     Raises UsageError if the settings ask for other networks than the state's, a budget, or a fit; ValueError if the
@@ -147,10 +143,7 @@ def extend_features(
     options = options.with_settings(piece_settings(CompactOptions))
     with use_threads(options.threads), record_run(progress) as record:
         prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame)
-        pictured, world = prepared.scene, NOT_KNOWN
-        if state is not None:
-            world = compare_worlds(feature_to_gaussians(state.refined), pictured, pictured.gaussians.means)
-            refuse_other_world(world, extend_options)
+        pictured, world = prepared.scene, _check_world(state, prepared.scene, extend_options)
         plan = make_plan(prepared, options, None if state is None else _own_checkpoint(state, options))
         weights = plan.networks
         if weights is None or not weights.options.encoder or not weights.options.makes_children:
@@ -185,6 +178,15 @@ def extend_features(
     views = tuple(names[prepared.repeated.index(view)] for view in range(len(pictured)))
     names = views if state is None else number_names(state.names, views)
     return replace(made, checkpoint=options.checkpoint, names=names), report
+
+
+def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
+    """Return whether a canonical scene seems to be of a state's world; SceneError for another one, unless asked for."""
+    if state is None:
+        return NOT_KNOWN
+    world = compare_worlds(feature_to_gaussians(state.refined), scene, scene.gaussians.means)
+    refuse_other_world(world, options)
+    return world
 
 
 def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
