@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,6 +167,19 @@ class Gaussians:
     def concat(parts: Sequence[Gaussians]) -> Gaussians:
         """Concatenate the rows of all parts, which must have the same SH degree."""
         return Gaussians(*(concat_rows([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
+
+
+class HasGaussians(Protocol):
+    """What :func:`gsmerge.compact` returns, as far as its Gaussians go."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """Its Gaussians."""
+
+
+def own_gaussians(value: HasGaussians | Gaussians) -> Gaussians:
+    """Return Gaussians unchanged, or those of a result."""
+    return value if isinstance(value, Gaussians) else value.gaussians
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,8 @@ class CameraCheck:
     # NaN without photos, or where the colours hardly vary
     color_ratio: float
     ok: bool  # whether these are likely the cameras of these Gaussians
+    num_compared: int = 0  # Gaussians whose colours were compared, in one picture or several
+    ratio_error: float = np.nan  # standard error of the ratio, by chance alone
 
     @property
     def score(self) -> float:
@@ -66,19 +68,24 @@ def check_cameras(
     samples: int = _SEEN_GAUSSIANS,
     *,
     foremost: bool = False,
+    hiding: np.ndarray | None = None,
 ) -> CameraCheck:
     """Measure the share of sampled Gaussians that views see, and how well colours fit ``images [c,h,w,3]``, if any.
 
-    With ``foremost`` only Gaussians that no other hides count for the colours.
+    With ``foremost`` only Gaussians that no other hides count for the colours; ``hiding``: points ``[n,3]`` that hide
+    them too.
     """
     samples = min(samples, max(_FEW_GAUSSIANS, _MAX_PROJECTED // len(cameras)))
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
     points = gaussians.means[rows].astype(np.float64)
+    if hiding is not None:
+        points = np.concatenate([points, hiding[:: max(1, len(hiding) // samples)]])
     colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
-    visible, errors, shuffled_errors = np.zeros(len(rows), bool), [], []
+    visible, compared = np.zeros((2, len(points)), bool)
+    errors, shuffled_errors = list[np.ndarray](), list[np.ndarray]()
     rng = np.random.default_rng(0)
-    at_once = 1 + _SEEN_GAUSSIANS // max(1, len(rows))
+    at_once = 1 + _SEEN_GAUSSIANS // max(1, len(points))
     for first in range(0, len(cameras), at_once):
         some = cameras[first : first + at_once]
         with np.errstate(all="ignore"):
@@ -90,16 +97,26 @@ def check_cameras(
             column, row = x[view, seen].astype(np.int64), y[view, seen].astype(np.int64)
             if foremost:
                 front = _are_foremost(column, row, depth[view, seen], cameras.width * cameras.height)
+                front &= seen < len(rows)
                 seen, column, row = seen[front], column[front], row[front]
             photo = photo_colors(images, np.full(len(seen), first + view), row, column)
             if (photo == photo[:1]).all():  # black, where a view has no photo
                 continue
+            compared[seen] = True
             errors.append(_mean_apart(colors[seen], photo))
             shuffled_errors.append(_mean_apart(colors[seen], rng.permutation(photo)))
-    share, ratio = float(visible.sum()) / max(1, len(rows)), np.nan
-    if errors and (other := float(np.concatenate(shuffled_errors).mean())) > SAME_COLORS:
-        ratio = float(np.concatenate(errors).mean()) / other
-    return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > RANDOM_SHARE)
+    share, num_compared = float(visible[: len(rows)].sum()) / max(1, len(rows)), int(compared.sum())
+    ratio, error = _color_ratio(errors, shuffled_errors, num_compared)
+    return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > RANDOM_SHARE, num_compared, error)
+
+
+def _color_ratio(errors: list[np.ndarray], others: list[np.ndarray], count: int) -> tuple[float, float]:
+    """Return the ratio of two mean differences, and its standard error of ``count`` Gaussians; NaN where none vary."""
+    if not errors or not (other := float(np.concatenate(others).mean())) > SAME_COLORS:
+        return np.nan, np.nan
+    ratio = float(np.concatenate(errors).mean()) / other
+    apart = np.concatenate(errors) - ratio * np.concatenate(others)  # of the mean 0
+    return ratio, float(np.sqrt(np.square(apart).mean() / count)) / other
 
 
 def _mean_apart(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -126,8 +143,8 @@ def choose_poses(
     """Choose the pose convention whose cameras see the most Gaussians, with the nearest colours.
 
     ``cameras`` are in the usual convention; other arguments are those of :func:`check_cameras`. Returns the poses, or
-    None if no other convention is clearly better than the usual one; the check of the chosen poses; and a note if other
-    conventions see as many.
+    None if no other convention is clearly better than the usual one; the check of the chosen poses; and a note if
+    photos fit others as well.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
@@ -141,7 +158,8 @@ def choose_poses(
     scores = [check.score for check in (usual, *(check for _, check in ranked[1:2])) if check.ok]
     if best.score >= MARGIN * max(scores, default=0.0):
         return poses, best, None
-    as_good = usual.ok and _FRAME_GAIN * best.score >= usual.score
+    # Without photos other readings see as many of any scene that lies before its cameras, which says nothing
+    as_good = usual.ok and usual.num_compared > 0 and _FRAME_GAIN * best.score >= usual.score
     note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
     return None, usual, note if as_good else None
 

@@ -40,7 +40,8 @@ def convert(args: opt.Args) -> None:
     """Write Gaussians in another format, frame or extent, as they are: nothing is merged or fitted."""
     *inputs, output = args.paths
     if not inputs:
-        raise UsageError(f"expected files to read and one to write, got {output} alone")
+        remedy = f"name what is written last, as in gsmerge convert {output} x.spz"
+        raise UsageError(f"expected files to read and one to write, got {output} alone; {remedy}")
     if output.suffix.lower() == ".npz":
         _convert_features(args, inputs, output)
         return

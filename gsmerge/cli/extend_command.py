@@ -18,8 +18,16 @@ from gsmerge.settings.reading import NONE
 
 @opt.command(
     opt.argument("state", Path, "STATE", "A .gsm file, which the first batch makes."),
-    opt.argument("scenes", list[Path], "SCENE", "Batches of new views, in order: each a scene as compact takes it."),
+    opt.argument(
+        "scenes",
+        list[Path] | None,
+        "[SCENE]...",
+        "Batches of new views, in order: each a scene as compact takes it.",
+        default=None,
+    ),
     opt.READING,
+    opt.option("remove", int, "Take a batch out again, by the number that inspect lists it with.", min=1),
+    "dry_run",
     opt.settings_option(CompactOptions, ExtendOptions, example="budget=2%"),
 )
 def extend(args: opt.Args) -> None:
@@ -27,24 +35,30 @@ def extend(args: opt.Args) -> None:
     start = perf_counter()
     if args.state.suffix.lower() != SUFFIX:
         raise UsageError(f"{args.state}: expected a state, which ends in {SUFFIX}")
-    hints = args.hints()
-    if len(args.scenes) > 1 and {args.cameras, args.images} - {None, NONE}:
+    hints, scenes = args.hints(), args.scenes or []
+    if (args.remove is None) == (not scenes):
+        raise UsageError("extend: expected either batches to add, each a scene, or --remove NUMBER")
+    if args.remove is not None:
+        _remove(args)
+        return
+    if len(scenes) > 1 and {args.cameras, args.images} - {None, NONE}:
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
     from gsmerge.states.files import batch_line, extend_file
 
     settings = args.values(CompactOptions, ExtendOptions)
-    batches = [args.files(scene) for scene in args.scenes]
+    batches = [args.files(scene) for scene in scenes]
     for files in batches:
         if any(path.resolve() == args.state.resolve() for path in input_files(files)):
             raise UsageError(f"{args.state}: expected a state other than the input; name another file")
-    documents: list[dict[str, Any]] = []
+    documents, tried = list[dict[str, Any]](), None
     for files in batches:
         before = {"import": perf_counter() - start} if not documents else {}
         with stage_progress(quiet=args.silent) as progress:
-            document = extend_file(
+            document, state = extend_file(
                 args.state, files, settings, opacity=args.opacity, hints=hints, progress=progress,
-                seconds_before=before,
+                seconds_before=before, dry_run=args.dry_run, tried=tried,
             )  # fmt: skip
+        tried = state if args.dry_run else None
         documents.append(document)
         say_notes(document["notes"], quiet=args.silent)
         if not args.silent:
@@ -53,3 +67,11 @@ def extend(args: opt.Args) -> None:
         from gsmerge.report import document_head, to_json
 
         sys.stdout.write(to_json(document_head() | {"batches": documents}))
+
+
+def _remove(args: opt.Args) -> None:
+    """Take a batch out of the state."""
+    from gsmerge.states.files import removal_line, remove_batch
+
+    document = remove_batch(args.state, args.remove, dry_run=args.dry_run)
+    print_document(document, removal_line(document), as_json=args.json, quiet=args.quiet)

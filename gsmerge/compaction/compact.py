@@ -13,6 +13,7 @@ from weakref import ReferenceType, ref
 
 import numpy as np
 
+from gsmerge.arguments import check_arguments
 from gsmerge.compaction.file_size import meet_bytes
 from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import try_new_views
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count after clean-up; more than it by so much at first
 
 
+@check_arguments
 def compact(
     scene: Scene | StrPath,
     options: CompactOptions | None = None,

@@ -14,7 +14,7 @@ from gsmerge.compaction.partition import gaussians_at_once
 from gsmerge.compaction.search import AUTO_RUNGS, LONG, RUNGS, SHORT, rungs
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.place_cameras import count_placed, placed_views
-from gsmerge.facts.prepare import missing_notes
+from gsmerge.facts.prepare import views_notes, without_repeats
 from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
@@ -63,6 +63,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
         machine has enough.
     """
+    num_input, (scene, *_) = scene.num_gaussians, without_repeats(scene)
     size = measure_size(scene)
     if (options.budget.auto or options.budget.is_limit) and scene.has_own_pixels:
         options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))
@@ -93,7 +94,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "psnr_kept": KEPT_PSNR if choices.keeps_input and size.rendered else None,
         "quality": options.budget.quality,
         "loss_kept": KEPT_LOSS if choices.keeps_input and not size.rendered else None,
-        "ratio": count / max(1, scene.num_gaussians),
+        "ratio": count / max(1, num_input),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": choices.blocks,
         "method": options.method,
@@ -151,7 +152,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
     scene, out, settings = load.scene, outputs.result, sized(settings, outputs)
     check_cameras(scene, out)
     _, unused = check_method(settings, scene)
-    notes = [*load.notes, *unused, *missing_notes(scene)]
+    notes = [*load.notes, *unused, *views_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:

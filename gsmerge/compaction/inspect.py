@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
@@ -10,17 +10,19 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment import check_cameras
+from gsmerge.arguments import check_arguments
 from gsmerge.compaction.estimate import estimate, estimate_lines
 from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.prepare import missing_notes
+from gsmerge.facts.prepare import views_notes, without_repeats
 from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.facts.support import count_views_in_world
 from gsmerge.frame import canonicalise
 from gsmerge.io import GaussianFile, file_notes, kept_comments
 from gsmerge.io.formats.arrays import read_new_views
+from gsmerge.io.formats.gsm import list_batches
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
 from gsmerge.io.photo_files import photo_array
@@ -36,6 +38,7 @@ from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.read import Loaded, align_scene, read_gaussian_file
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import PicturedScene, Scene, StrPath
@@ -52,6 +55,7 @@ _REPEATED = "read as: "  # notes that repeat a line of their own
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}
 
 
+@check_arguments
 def inspect(
     path: StrPath,
     *,
@@ -76,7 +80,8 @@ def inspect(
     Returns:
         Plain JSON types, None for what is not known. Of the file: ``path``, ``bytes``, ``bytes_by_attribute``,
         ``layout``, ``format``, ``exporter``, ``extra_columns``, ``extra_elements``, ``sh_degree``,
-        ``opacity_encoding``. Of the rows: ``count``, ``num_nonfinite``, ``num_empty``, ``num_clipped_scales``,
+        ``opacity_encoding``, ``batches`` (of a state: ``num_views``, ``num_input``, ``num_new``, and the names of its
+        ``views``). Of the rows: ``count``, ``num_nonfinite``, ``num_empty``, ``num_clipped_scales``,
         ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255), ``num_saturated``
         (within 1e-6 of 0 or 1), ``extents``. Of the views: ``cameras``, ``camera_format``, ``images``, ``num_views``,
         ``width``, ``height``, ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order),
@@ -102,7 +107,7 @@ def inspect(
         report_progress("inspect: reading", 0, 3)
         ply = read_gaussian_file(files, opacity=opacity, hints=read_hints)
         report_progress("inspect: Gaussians", 1, 3)
-        described = _describe_file(ply)
+        described = _describe_file(ply) | {"batches": list_batches(files.ply) if files.ply.suffix == SUFFIX else []}
         report_progress("inspect: views", 2, 3)
         document: dict[str, Any] = finite(described | _describe_views(ply, files, read_hints))
         document["notes"] = [*document["notes"], *degree_notes(ply.info)]
@@ -198,17 +203,18 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
         means = gaussians.means[np.isfinite(gaussians.means).all(1)]
         num_sky_views = len(sky_regions(means, scene.cameras, images))
-    agreement, odd = _measure_agreement(scene), unlike_captures(scene.gaussians)
+    once = without_repeats(scene)[0]  # as a run takes it
+    agreement, odd = _measure_agreement(once), unlike_captures(scene.gaussians)
     doubts = [odd, None if agreement is None else agreement.doubt]
     facts: dict[str, Any] = {
-        "notes": [*load.notes, *missing_notes(scene), *_photo_notes(scene), *filter(None, doubts)],
+        "notes": [*load.notes, *views_notes(scene), *_photo_notes(scene), *filter(None, doubts)],
         "num_views": len(load.views.used),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),
         "sight": sight and asdict(sight),
         "num_sky_views": num_sky_views,
         "compact": estimate(scene, CompactOptions()),
-        "auto": _describe_auto(scene, agreement),
+        "auto": _describe_auto(once, agreement),
         "agreement": agreement and agreement.to_dict(),
     }
     if is_result and len(scene) and load.recovery is None:  # those of views hide each other where these overlap
@@ -229,6 +235,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"layout     {scene['layout']}, {scene['format']}; opacity stored {_ENCODINGS[scene['opacity_encoding']]}",
         f"marks      {'; '.join(scene['marks'])}" if scene["marks"] else "",
         f"exporter   {scene['exporter']}",
+        *_batch_lines(scene["batches"]),
         f"ignored    {', '.join(ignored)}" if ignored else "",
         f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_empty']:,} empty,"
         f" {scene['num_transparent']:,} transparent,"
@@ -259,6 +266,17 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
     repeated = () if scene["alignment_problem"] is None and scene["rows"] is None else _REPEATED
     notes = [note for note in scene["notes"] if not note.startswith(repeated)]
     return [line for line in lines if line] + [f"note       {note}" for note in notes]
+
+
+def _batch_lines(batches: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Describe each batch of a state, by whose number ``extend --remove`` takes it out again."""
+    lines = []
+    for number, batch in enumerate(batches, 1):
+        count, before, after = (batch.get(name, 0) for name in ("num_views", "num_input", "num_new"))
+        names = batch["views"]
+        shown = f", {names[0]}{f' to {names[-1]}' if len(names) > 1 else ''}" if names else ""
+        lines.append(f"batch {number:<5}{count} views{shown}; {before:,} -> {after:,} Gaussians")
+    return lines
 
 
 def _ignored(scene: Mapping[str, Any]) -> list[str]:

@@ -12,6 +12,7 @@ from weakref import ReferenceType
 
 import numpy as np
 
+from gsmerge.arguments import check_arguments
 from gsmerge.compaction.new_views import SIDE, NewViews, Trial
 from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
 from gsmerge.facts.prepare import Prepared
@@ -64,6 +65,7 @@ class CompactResult:
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"scene": self.scene if isinstance(self.scene, str | PathLike) else None}
 
+    @check_arguments
     def save(self, path: StrPath, *, overwrite: bool = False) -> Path:
         """Write the result with its levels and cameras, as ``-o`` of the command does: all files, or none.
 
@@ -90,6 +92,7 @@ class CompactResult:
 
         return save_result(self, Path(path), overwrite=overwrite)
 
+    @check_arguments
     def show(self, scene: Scene | StrPath | None = None) -> Page:
         """Show the scene and the result as :func:`gsmerge.view` does, in a notebook at the end of a cell.
 

@@ -2,11 +2,12 @@
 
 Each pixel's Gaussian is looked up in the other views, and the Gaussian there is projected back: the depth is confirmed
 where the two agree, and contradicted where more views see through it than confirm it. Where no other view looks, it is
-alone.
+alone. Pixels that others see only where they have no Gaussian, as beyond a crop, say nothing and do not count.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +27,7 @@ SAME = 0.05  # logarithm of two depths of one surface
 TINY = 1e-9  # canonical units, least depth
 # Of 15 captures everything below POOR is poor, and nothing sound is; LONELY tells apart why
 POOR, LONELY = 0.5, 0.2
+CERTAIN, ENOUGH = 2.0, 30  # standard errors that chance may make; of so many samples a mean's error is about normal
 # Parts of pictures, as a range of columns and of rows in thirds; a part is poor where most of its pixels are
 THIRDS = {
     "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
@@ -40,11 +42,12 @@ MOST, FEWEST, SOUND, WRONG = 0.07, parse_share(SHARE), 0.75, 0.6
 
 @dataclass(frozen=True)
 class Agreement:
-    """Shares of the pixels of a scene by what other views say of their depth."""
+    """Shares of the pixels of a scene that say something, by what other views say of their depth."""
 
     confirmed: float  # by at least one view, and by no fewer than see through it
     contradicted: float  # more views see through it than confirm it
     alone: float  # no other view looks there
+    num_pixels: int = field(default=SAMPLE_PIXELS, compare=False)  # that were sampled and say something
     # Where most is contradicted, and where alone, as "left third of 4 of 7 views"; empty: nowhere more than elsewhere
     contradicted_part: str = field(default="", compare=False)
     alone_part: str = field(default="", compare=False)
@@ -68,7 +71,8 @@ class Agreement:
                 "the photos stand at one point, as pieces of a panorama: none can confirm another's depth, and new"
                 " views from elsewhere show what the model made of it; photos from other places would help most"
             )
-        if self.confirmed >= POOR:
+        error = math.sqrt(self.confirmed * (1 - self.confirmed) / self.num_pixels)
+        if self.confirmed + CERTAIN * error >= POOR or self.num_pixels < ENOUGH:
             return None
         problem = f"only {100 * self.confirmed:.0f} % of the pixels have a depth that another view confirms"
         if self.alone > LONELY:
@@ -83,7 +87,8 @@ class Agreement:
 def confirm_depths(scene: Scene) -> Agreement | None:
     """Measure how far the views of a scene confirm each other's depth.
 
-    None with fewer than two, or where they have no Gaussians of their own: what several share confirms itself.
+    None with fewer than two, where they have no Gaussians of their own (what several share confirms itself), or where
+    no pixel says anything.
     """
     views, pixels_of = len(scene), scene.pixels
     if views < 2 or pixels_of is None or not pixels_of.own or not pixels_of.shown.any():
@@ -110,6 +115,8 @@ def confirm_depths(scene: Scene) -> Agreement | None:
         front = fronts[other, there]
         known = front >= 0
         number, ids, other = number[known], ids[known], other[known]
+        tells = np.asarray(~inside.any(0))
+        tells[ids] = True
         surface = means.take(front[known], 0).astype(np.float64)
         (back,), (ahead,) = project(surface, cameras[[view]])
         right, down = (back - pixels[ids]).T
@@ -124,14 +131,17 @@ def confirm_depths(scene: Scene) -> Agreement | None:
             np.logical_and(*((third >= low) & (third < high) for third, (low, high) in zip(thirds, part, strict=True)))
             for part in THIRDS.values()
         ]
-        parts = [np.ones(len(rows), bool), *within]
+        parts = [part & tells for part in (np.ones(len(rows), bool), *within)]
         return np.array([[part.sum(), *((part & kind).sum() for kind in kinds)] for part in parts])
 
     counts = np.stack(parallel_map(count, range(views)))  # [v,part,4], first the whole
-    confirmed, contradicted, alone = counts[:, 0, 1:].sum(0) / counts[:, 0, 0].sum()
+    num_pixels = int(counts[:, 0, 0].sum())
+    if num_pixels == 0:
+        return None
+    confirmed, contradicted, alone = counts[:, 0, 1:].sum(0) / num_pixels
     of_wrong, of_alone = (_worst_part(counts[:, 1:, kind], counts[:, 1:, 0]) for kind in (2, 3))
     at_one = _stand_at_one_point(scene)
-    return Agreement(float(confirmed), float(contradicted), float(alone), of_wrong, of_alone, at_one)
+    return Agreement(float(confirmed), float(contradicted), float(alone), num_pixels, of_wrong, of_alone, at_one)
 
 
 def _stand_at_one_point(scene: Scene) -> bool:

@@ -128,10 +128,9 @@ def prepare(
     Raises ValueError if there is no finite Gaussian, or if there are images without cameras.
     """
     options = options or PrepareOptions()
-    given, (views, repeated) = scene, distinct_views(scene)
-    if len(views) < len(scene):
-        note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
-        scene = subset(scene, views)
+    given, (scene, repeated, said) = scene, without_repeats(scene)
+    for text in said:
+        note(text)
     scene, frame = canonicalise(add_views(scene), frame)
     prepared = _with_references(given, with_pixels(scene), frame, tuple(repeated), options)
     files = _photos_before(given, prepared)
@@ -215,11 +214,21 @@ def _with_pictures(
     return stand_in(replace(scene, images=None, large_photos=None, masks=None)), ()
 
 
-def missing_notes(scene: Scene) -> list[str]:
-    """Return the note of a run on the replacement of missing views or photos, without comparing colours."""
+def without_repeats(scene: Scene) -> tuple[Scene, list[int], list[str]]:
+    """Return a scene with each of its views once, the place there of every view, and a note on those that repeat."""
+    views, repeated = distinct_views(scene)
+    count = len(scene) - len(views)
+    if not count:
+        return scene, repeated, []
+    what = "1 view repeats another" if count == 1 else f"{count} views repeat others"
+    return subset(scene, views), repeated, [f"{what} in every pixel and count{'s' * (count == 1)} once"]
+
+
+def views_notes(scene: Scene) -> list[str]:
+    """Return the notes of a run on repeated views, and on what replaces missing ones, without comparing colours."""
     if len(scene) == 0:
         return [NO_VIEWS]
-    return [NO_PHOTOS] if _lacks_photos(scene) else []
+    return [*without_repeats(scene)[2], *([NO_PHOTOS] if _lacks_photos(scene) else [])]
 
 
 def _lacks_photos(scene: Scene) -> bool:

@@ -45,11 +45,13 @@ class ReadBudget:
         path: The file.
         file_bytes: Its bytes, with those of files that are read together with it.
         memory_per_byte: Bytes of memory for each of them.
+        remedy: What to do about a file that takes more.
     """
 
     path: StrPath
     file_bytes: int
     memory_per_byte: int = _MEMORY_PER_BYTE
+    remedy: str = ""
 
     @property
     def memory(self) -> int:
@@ -60,7 +62,7 @@ class ReadBudget:
         """Raise SceneError if ``what`` takes ``num_bytes`` at once, and the file allows less."""
         if not num_bytes <= self.memory:
             problem = f"expected at most {self.memory / 1e6:,.0f} MB of memory for a file of {self.file_bytes:,} bytes"
-            raise SceneError(self.path, f"{problem}, found {what} of {num_bytes / 1e6:,.0f} MB")
+            raise SceneError(self.path, f"{problem}, found {what} of {num_bytes / 1e6:,.0f} MB", self.remedy)
 
     def check_steps(self, count: int, what: str) -> None:
         """Raise SceneError if a loop over ``count`` of ``what`` takes longer than the file allows."""
@@ -107,7 +109,7 @@ def check_file(path: Path) -> int:
         reason = "no such file" if missing else f"cannot be read ({getattr(error, 'strerror', error)})"
         raise SceneError(path, reason) from error
     if stat.S_ISDIR(status.st_mode):
-        raise SceneError(path, "expected a file, found a folder")
+        raise SceneError(path, "expected a file, found a folder", "name the file in it")
     if not stat.S_ISREG(status.st_mode):
         raise SceneError(path, "expected a file, found a pipe or a device", "write its content to a file first")
     check_first_bytes(Path(path), status.st_size)

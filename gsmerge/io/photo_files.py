@@ -52,6 +52,7 @@ _MAX_TAGS = 1 << 16  # that are looked at; decoders read fewer
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 _FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100  # bytes of a scene's decoded photos; 0.03 bytes a pixel are few
 _WHITES = 1, 255, 65535  # of pictures of 0 and 1 or of fractions, of eight bits, of sixteen
+_SMALLER = "make it smaller: a mask to the size of its photo, a photo to about that of its view"
 _BAND = 256  # rows of a mask that are converted at once
 _PARTS = {  # of each side of a photo that is decoded
     1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
@@ -274,7 +275,7 @@ def decode_alpha(path: Path) -> np.ndarray | None:
 
 def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
     """Return the budget of a photo or a mask that is decoded by itself, with the bytes of files ``beside`` it."""
-    return ReadBudget(path, sum(map(check_file, (path, *beside))), _MEMORY_PER_BYTE)
+    return ReadBudget(path, sum(map(check_file, (path, *beside))), _MEMORY_PER_BYTE, _SMALLER)
 
 
 def _check_channels(budget: ReadBudget, image: Image.Image) -> None:

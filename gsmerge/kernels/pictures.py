@@ -102,13 +102,18 @@ def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
 
 def turn_picture(picture: Picture, turn: int) -> Picture:
     """Mirror a picture ``[h,w,...]`` left to right for turns from 4 on, and turn it counterclockwise by quarters."""
-    return np.rot90(picture[:, ::-1] if turn >= TURNS // 2 else picture, turn % (TURNS // 2))
+    return np.rot90(picture[:, ::-1] if is_mirrored(turn) else picture, turn % (TURNS // 2))
+
+
+def is_mirrored(turn: int) -> bool:
+    """Return whether a turn mirrors pictures."""
+    return turn >= TURNS // 2
 
 
 def turn_back(picture: Picture, turn: int) -> Picture:
     """Undo :func:`turn_picture`."""
     upright = np.rot90(picture, -(turn % (TURNS // 2)))
-    return upright[:, ::-1] if turn >= TURNS // 2 else upright
+    return upright[:, ::-1] if is_mirrored(turn) else upright
 
 
 def count_bars(image: np.ndarray, spread: float) -> tuple[int, int, int, int]:

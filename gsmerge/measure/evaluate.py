@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -12,6 +11,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.arguments import check_arguments
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import judged_pictures
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
@@ -27,7 +27,7 @@ from gsmerge.report import html_table
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.evaluate import EvaluateOptions
-from gsmerge.types import Cameras, Gaussians, Scene, Views, as_pictures
+from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, as_pictures, own_gaussians
 
 MENDED = (
     "the photos of the input views differ from their Gaussians or each other in tone, exposure or by what covers them,"
@@ -115,7 +115,7 @@ class Evaluation:
         >>> scene = gsmerge.read_scene("demo")
         >>> result = gsmerge.compact(scene, effort="draft", budget=300)
         >>> quick = gsmerge.EvaluateOptions(lpips=(), fog=False)
-        >>> [scores.name for scores in gsmerge.evaluate(scene, {"small": result.gaussians}, options=quick).results]
+        >>> [scores.name for scores in gsmerge.evaluate(scene, {"small": result}, options=quick).results]
         ['input', 'small']
     """
 
@@ -180,9 +180,10 @@ class _Renderer:
         return self.draw(gaussians, cameras, view)[0]
 
 
+@check_arguments
 def evaluate(
     scene: Scene,
-    results: Mapping[str, Gaussians],
+    results: Mapping[str, HasGaussians | Gaussians],
     targets: Views | None = None,
     options: EvaluateOptions | None = None,
     *,
@@ -192,7 +193,8 @@ def evaluate(
 ) -> Evaluation:
     """Measure compact results, and the scene itself, on its input views and on held-out views.
 
-    ``results`` are Gaussians by name, in the scene's world; without photos they are compared with renders of the scene.
+    ``results`` are what :func:`gsmerge.compact` returns, or Gaussians, by name, in the scene's world; without photos
+    they are compared with renders of the scene.
     ``targets`` are held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`; ``cameras``
     those of the input views by name of a result that was made with other poses, as ``CompactResult.cameras``;
     ``progress`` is called with (what is done, done, total), for each view and result with ("evaluate: NAME", ...);
@@ -207,15 +209,10 @@ def evaluate(
         >>> scene = gsmerge.read_scene("demo")
         >>> result = gsmerge.compact(scene, effort="fast", budget=600)
         >>> quick = gsmerge.EvaluateOptions(lpips=(), fog=False)
-        >>> evaluation = gsmerge.evaluate(scene, {"small": result.gaussians}, options=quick)
+        >>> evaluation = gsmerge.evaluate(scene, {"small": result}, options=quick)
         >>> evaluation.num_views
         {'context': 5}
     """
-    if isinstance(scene, str | os.PathLike):
-        raise TypeError("scene: expected a Scene, got a path; gsmerge.read_scene(path) reads it")
-    if not isinstance(results, Mapping):
-        got = type(results).__name__
-        raise TypeError(f"results: expected Gaussians by name, such as {{'small': result.gaussians}}, got {got}")
     cameras = cameras or {}
     options, lacking = _without_missing(EvaluateOptions()) if options is None else (options, ())
     if INPUT in results:
@@ -224,7 +221,7 @@ def evaluate(
         raise UsageError("expected a scene with views, got none")
     given = scene if scene.images is None else replace(scene, images=as_pictures(scene.images))
     scene, mended = judged_pictures(given)
-    inputs, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
+    inputs, after = scene.file_gaussians, {name: own_gaussians(value).numpy() for name, value in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_pictures(targets.images))
         targets = shrink_views(targets, options.photo_side)
@@ -234,9 +231,9 @@ def evaluate(
         progress("what the input views see", 0, 0)
         reference = PHOTOS if scene is given else ROW_COLORS
         splits = _splits(scene, reference, inputs, targets, renderer)
-        named = {INPUT: inputs, **results} if options.own else results
-        fogs = options.fog and bool(results)
-        fog = measure_fog(inputs, results, scene.cameras, renderer.near, progress) if fogs else {}
+        named = {INPUT: inputs, **after} if options.own else after
+        fogs = options.fog and bool(after)
+        fog = measure_fog(inputs, after, scene.cameras, renderer.near, progress) if fogs else {}
         num_pictures, numbers = len(named) * sum(len(split.views) for split in splits.values()), count(1)
 
         def keep(name: str, kind: str, view: int, image: np.ndarray) -> None:

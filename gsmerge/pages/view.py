@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, Protocol
+from typing import Any
 
+from gsmerge.arguments import check_arguments
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.formats.arrays import read_new_views
@@ -22,18 +23,10 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.scene.files import find_scene_files, scene_title
 from gsmerge.scene.read import as_scene
-from gsmerge.types import Gaussians, Scene, StrPath, Views
+from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
 
 MOST_SOLID = 600_000  # Gaussians of a scene of which a page has the stills alone: 8 MB of a notebook
 HEIGHT = 820  # pixels of a page in a notebook
-
-
-class HasGaussians(Protocol):
-    """What :func:`gsmerge.compact` returns, as far as a page needs it."""
-
-    @property
-    def gaussians(self) -> Gaussians:
-        """Its Gaussians."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,6 +54,7 @@ class Page:
         webbrowser.open(self.save(Path(mkdtemp(prefix="gsmerge-")) / "view.html").as_uri())
 
 
+@check_arguments
 def view(
     scene: Scene | StrPath,
     results: Mapping[str, HasGaussians | Gaussians | StrPath] | HasGaussians | Gaussians | StrPath | None = None,
@@ -94,7 +88,7 @@ def view(
     given = results if isinstance(results, Mapping) else {} if results is None else {"result": results}
     files = {name: read_gaussians(value) for name, value in given.items() if isinstance(value, str | PathLike)}
     loaded: dict[str, Any] = {**given, **files}
-    gaussians = {name: value if isinstance(value, Gaussians) else value.gaussians for name, value in loaded.items()}
+    gaussians = {name: own_gaussians(value) for name, value in loaded.items()}
     gains = file_gains(files) | {
         name: expected.bounds
         for name, value in given.items()
@@ -126,5 +120,5 @@ def _num_bytes(value: Any) -> int:
         return value.info.file_bytes
     if isinstance(value, str | PathLike):
         return sum(path.stat().st_size for path in find_scene_files(value).plys)
-    gaussians = value if isinstance(value, Gaussians) else value.gaussians
+    gaussians = own_gaussians(value)
     return file_bytes(len(gaussians), gaussians.sh_degree)

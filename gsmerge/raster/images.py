@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.arguments import check_arguments
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import (
     Rendering,
@@ -35,6 +36,7 @@ def _needs_gradient(gaussians: Gaussians, cameras: Cameras) -> bool:
     return torch.is_grad_enabled() and any(t.requires_grad for t in (*vars(gaussians).values(), cameras.viewmats))
 
 
+@check_arguments
 def render(
     gaussians: Gaussians,
     cameras: Cameras,

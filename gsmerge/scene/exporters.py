@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,7 +15,7 @@ from gsmerge.alignment import ESTIMATED, MAY_BE_UNALIGNED, Layout
 from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.json_files import FFGS
 from gsmerge.settings.reading import OF_SCENE, QuatChoice, ReadHints
-from gsmerge.settings.setting import join_words
+from gsmerge.settings.setting import join_words, perhaps
 
 if TYPE_CHECKING:
     from gsmerge.io.formats.read import FileInfo
@@ -34,7 +33,7 @@ def make_hints(values: dict[str, Any]) -> ReadHints:
     unknown = sorted(values.keys() - names)
     if unknown:
         known = sorted({*names, *OF_SCENE})
-        near = "".join(f"; perhaps {name}" for name in get_close_matches(unknown[0], known, 1))
+        near = perhaps(unknown[0], known)
         raise ValueError(f"expected {join_words(map(repr, known))}, got {unknown[0]!r}{near}")
     return ReadHints(**values)
 

@@ -90,6 +90,7 @@ class SceneFiles:
     parts: tuple[Path, ...] = ()  # all files whose rows the scene has, ``ply`` first; empty for one
     num_copies: int = 0  # other files of the same bytes in the folder
     named: frozenset[str] = frozenset()  # those of cameras and pictures that were not searched
+    above: tuple[Path, ...] = ()  # cameras and photos in the folder above, where none were found; never read
 
     @property
     def plys(self) -> tuple[Path, ...]:
@@ -134,12 +135,17 @@ class SceneFiles:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes that several files are read as one scene."""
+        """Notes that several files are read as one scene, and on what lies above it."""
+        notes = []
         if self.num_copies:
-            return (f"{self.num_copies + 1} files have the same bytes: {self.ply.name} is read",)
-        if not self.parts:
-            return ()
-        return (f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}",)
+            notes.append(f"{self.num_copies + 1} files have the same bytes: {self.ply.name} is read")
+        elif self.parts:
+            notes.append(f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}")
+        if self.above:
+            names = ", ".join(f"../{path.name}" for path in self.above)
+            remedy = "name that folder, or them by --images and --cameras"
+            notes.append(f"not beside the scene but one folder above, and not read: {names}; {remedy}")
+        return tuple(notes)
 
 
 def find_scene_files(
@@ -204,7 +210,7 @@ def find_scene_files(
         )
         image_path = camera_path if has_images else None
     if image_path is None and images is None:
-        folders = [root / place for root in roots for place in IMAGE_PLACES]
+        folders = [f for root in roots for place in IMAGE_PLACES if can_be_listed(f := root / place, "images")]
         # of several scenes each may have a folder of its own
         names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
         of_scene = [place / name for place in folders for name in names]
@@ -212,10 +218,37 @@ def find_scene_files(
     if masks is None:
         beside = [] if image_path is None else [image_path.parent]
         candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
-        mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
+        mask_path = next((f for f in candidates if can_be_listed(f, "masks") and list_images(f)), None)
     parts = tuple(plys) if len(plys) > 1 else ()
     pictures = image_path, mask_path, protect
-    return SceneFiles(ply, camera_path, *pictures, parts=parts, num_copies=num_copies, named=named)
+    files = SceneFiles(ply, camera_path, *pictures, parts=parts, num_copies=num_copies, named=named)
+    return files if within is not None else replace(files, above=_find_above(files, roots))
+
+
+def can_be_listed(folder: Path, option: str) -> bool:
+    """Return whether a path is a folder; SceneError, which names the ``option``, for one without the right to read."""
+    try:
+        os.scandir(folder).close()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError as error:
+        remedy = f"make it readable, name another folder with --{option}, or say --{option} none"
+        raise SceneError(folder, f"cannot be read ({error.strerror})", remedy) from error
+    return True
+
+
+def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[Path, ...]:
+    """Find the photos and cameras that a scene lacks in the folder above all that were searched, ``roots``."""
+    own = Path(os.path.realpath(files.ply))
+    folder = min((r for r in roots if own.is_relative_to(r)), default=roots[0], key=lambda r: len(r.parts))
+    places = list[Path | None]()
+    with suppress(SceneError, OSError):
+        if files.images is None and "images" not in files.named:
+            pictures = (folder.parent / place for place in IMAGE_PLACES)
+            places.append(next((f for f in pictures if f.is_dir() and f not in roots and list_images(f)), None))
+        if files.cameras is None and "cameras" not in files.named:
+            places.append(find_cameras(folder.parent))
+    return tuple(place for place in places if place is not None)
 
 
 def _search_roots(path: Path, ply: Path, within: StrPath | None) -> list[Path]:

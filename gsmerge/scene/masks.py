@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.evidence.offsets import SIDE
 from gsmerge.io.image_names import match_masks
-from gsmerge.io.photo_files import Size, decode_alpha, decode_levels, image_size, same_shape
+from gsmerge.io.photo_files import Size, decode_alpha, decode_levels, decode_small, image_size, same_shape
 from gsmerge.kernels.pictures import turn_picture
+from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.photos import ScenePhotos
@@ -20,6 +22,7 @@ from gsmerge.types import PROTECTED, Cameras
 
 _MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 _WHITE = np.uint8(255)
+_LEVEL = 1 / 255  # mean difference of pictures, or of their channels, that rounding to 8 bits may make
 _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file do
 
 
@@ -120,7 +123,32 @@ def read_masks(
     read = Masks(_stack(counts, True, shape), _stack(importance, np.float32(1), shape))
     if files.protect is not None:
         notes.append(_describe_protected(read.importance, protecting))
+    for option, given in (("masks", masks), ("protect", protecting)):
+        notes += _doubt_masks(option, given, paths)
     return read, notes
+
+
+def _doubt_masks(option: str, masks: Sequence[Path | None], photos: Sequence[Path | None]) -> list[str]:
+    """Note pictures that seem to be photos: coloured, or what their photos show."""
+
+    def is_photo(view: int) -> bool:
+        mask = masks[view]
+        if mask is None:
+            return False
+        picture = decode_small(mask, SIDE)
+        if np.ptp(picture, axis=-1).mean() > _LEVEL:
+            return True
+        photo = photos[view] if photos else None
+        shown = None if photo is None else decode_small(photo, SIDE)
+        return shown is not None and shown.shape == picture.shape and bool(np.abs(shown - picture).mean() <= _LEVEL)
+
+    answers = parallel_map(is_photo, range(len(masks)))
+    like = [mask.name for mask, answer in zip(masks, answers, strict=True) if mask is not None and answer]
+    if not like:
+        return []
+    what = "what is to be protected white, the rest black" if option == "protect" else "dark where photos do not count"
+    count = sum(mask is not None for mask in masks)
+    return [f"{option}: {len(like)} of {count} pictures look like photos, {list_some(like)}: expected {what}"]
 
 
 def _stack(values: Sequence[np.ndarray | None], usual: bool | np.float32, shape: tuple[int, int]) -> np.ndarray | None:

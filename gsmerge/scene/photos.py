@@ -41,7 +41,7 @@ from gsmerge.io.photo_files import (
     orientation_turn,
     same_shape,
 )
-from gsmerge.kernels.pictures import turn_picture
+from gsmerge.kernels.pictures import is_mirrored, turn_picture
 from gsmerge.raster.photos import row_pictures
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.record import list_some
@@ -434,14 +434,14 @@ def describe_assignment(
 ) -> tuple[list[str], list[str]]:
     """Describe how photos were assigned otherwise than their names propose: notes, and those on what is not used."""
     count, notes = len(chosen), list[str]()
-    turned = [
-        _inside(proposal.pool[each.photo], proposal)
-        for each in chosen
-        if each is not None and each.turn != proposal.tags[each.photo]
-    ]
-    if turned:
-        what = "lie otherwise in their views than their files say: they were turned"
-        notes.append(f"{len(turned)} of {count} photos {what}: {list_some(turned)}")
+    moves: dict[str, list[str]] = {"turned": [], "mirrored": []}
+    for each in chosen:
+        if each is not None and each.turn != (tag := proposal.tags[each.photo]):
+            kind = "turned" if is_mirrored(each.turn) == is_mirrored(tag) else "mirrored"
+            moves[kind].append(_inside(proposal.pool[each.photo], proposal))
+    for kind, files in moves.items():
+        what = f"lie otherwise in their views than their files say: they were {kind}"
+        notes += [f"{len(files)} of {count} photos {what}: {list_some(files)}"] * bool(files)
     moved = [
         f"{camera_file.names[view]}: {_inside(proposal.pool[each.photo], proposal)}"
         for view, each in enumerate(chosen)

@@ -23,6 +23,7 @@ from gsmerge.alignment import (
     check_pixels,
     read_rotations,
 )
+from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
 from gsmerge.geometry import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
@@ -146,6 +147,7 @@ class Loaded:
         return facts | {"num_nonfinite": info.num_nonfinite, "left_out": self.left_out}
 
 
+@check_arguments
 def read_scene(
     path: StrPath,
     *more: StrPath,
@@ -197,9 +199,6 @@ def as_scene(scene: Scene | StrPath) -> Scene:
     """Return a scene unchanged, or read it from a path; notes describe unusual content of the file."""
     if isinstance(scene, Scene):
         return scene
-    if not isinstance(scene, str | os.PathLike):
-        remedy = "write Gaussians to a file and give its path; tensors go to compact_tensors"
-        raise TypeError(f"scene: expected a Scene or a path, got {type(scene).__name__}; {remedy}")
     load = load_scene(scene)
     for text in load.notes:
         note(text)

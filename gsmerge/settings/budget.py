@@ -10,7 +10,7 @@ from decimal import Decimal
 from fractions import Fraction
 
 from gsmerge.errors import UsageError
-from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.setting import Settings, perhaps, setting
 
 SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}  # bytes
 AUTO = "auto"
@@ -115,9 +115,9 @@ def parse_quality(text: str) -> float:
     match = re.fullmatch(r"(-?)(\d*\.?\d+)\s*db", str(text).strip().lower(), re.ASCII)
     value = float(match[2]) if match else math.inf
     if match is None or not math.isfinite(value) or (value < GREY and not match[1]):
-        perhaps = f'; perhaps "{text}dB"' if re.fullmatch(r"-?\d*\.?\d+", str(text), re.ASCII) else ""
-        perhaps = f'; perhaps "-{value:g}dB"' if match is not None and 0 < value < GREY else perhaps
-        raise ValueError(f'quality: expected a PSNR as "30dB" or a loss as "-0.2dB", got {text!r}{perhaps}')
+        near = f'; perhaps "{text}dB"' if re.fullmatch(r"-?\d*\.?\d+", str(text), re.ASCII) else ""
+        near = f'; perhaps "-{value:g}dB"' if match is not None and 0 < value < GREY else near
+        raise ValueError(f'quality: expected a PSNR as "30dB" or a loss as "-0.2dB", got {text!r}{near}')
     return -value if match[1] else value
 
 
@@ -153,11 +153,11 @@ def parse_budget(budget: str | int | None, num_input: int) -> int:
     if not match:
         number = re.fullmatch(r"\d*\.\d+", text, re.ASCII)
         percent = float(text) * (100 if float(text) < 1 else 1) if number else 0.0
-        perhaps = f'; perhaps "{percent:g}%"' if 0 < percent <= 100 else ""
-        perhaps = f"; --quality {text} asks for a PSNR" if text.lower().endswith("db") else perhaps
+        near = f'; perhaps "{percent:g}%"' if 0 < percent <= 100 else perhaps(text, (AUTO, *DEVICES))
+        near = f"; --quality {text} asks for a PSNR" if text.lower().endswith("db") else near
         raise ValueError(
             f'budget: expected a number of Gaussians as "40000", a share as "2%", a size as "5MB", auto or'
-            f" {', '.join(DEVICES)}, got {text!r}{perhaps}"
+            f" {', '.join(DEVICES)}, got {text!r}{near}"
         )
     if match[1]:
         share = Fraction(match[1])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any
 
 from gsmerge.runtime import MOST_THREADS
@@ -12,7 +11,7 @@ from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.reading import OF_SCENE
-from gsmerge.settings.setting import Setting, Settings, change_settings, flat_settings, setting, settings_of
+from gsmerge.settings.setting import Setting, Settings, change_settings, flat_settings, perhaps, setting, settings_of
 from gsmerge.settings.stages import (
     BlockOptions,
     CleanOptions,
@@ -152,7 +151,7 @@ class CompactOptions(Settings):
         all_settings = flat_settings(CompactOptions)
         unknown = sorted(settings.keys() - all_settings.keys())
         if unknown:
-            near = "".join(f"; perhaps {name}" for name in get_close_matches(unknown[0], all_settings, 1))
+            near = perhaps(unknown[0], all_settings)
             if unknown[0] in OF_SCENE:
                 near = f": read_scene(path, {unknown[0]}=...) takes it"
             known = "" if near else f"; known: {', '.join(sorted(all_settings))}"

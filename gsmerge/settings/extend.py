@@ -19,6 +19,8 @@ class ExtendOptions(Settings):
     max_views: int = setting(96, "Most views that a state keeps with their pictures, the farthest apart, for the fit "
         "when it is compacted.",
         "Three bytes per pixel of each.", least=1, most=10_000)  # fmt: skip
+    other_world: bool = setting(False, "Add a batch though its pictures do not show the Gaussians of earlier batches, "
+        "as in another world.", "Without it such a batch is refused.")  # fmt: skip
 
 
 def batch_settings(settings: Mapping[str, Any]) -> tuple[CompactOptions, ExtendOptions]:

@@ -69,3 +69,4 @@ class StateKeywords(CompactKeywords, total=False):
     """Settings of :class:`gsmerge.Compactor`."""
 
     max_views: int
+    other_world: bool

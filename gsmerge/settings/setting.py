@@ -161,7 +161,8 @@ class Setting:
         if free or (self._fits(value) and self._in_range(value)):
             return
         is_number = isinstance(value, str) and re.fullmatch(r"-?\d*\.?\d+", value, re.ASCII) is not None
-        hint = f"; perhaps {value} without quotes" if is_number and {int, float} & set(self.kinds) else ""
+        plain = is_number and bool({int, float} & set(self.kinds))
+        hint = f"; perhaps {value} without quotes" if plain else perhaps(value, self.words)
         raise ValueError(f"{self.name}: expected {self.expected(value)}, got {value!r}{hint}")
 
 
@@ -237,6 +238,22 @@ def join_words(words: Iterable[str]) -> str:
     """Join words as "a, b or c"."""
     listed = list(words)
     return " or ".join(filter(None, (", ".join(listed[:-1]), *listed[-1:])))
+
+
+def near_names(word: str, names: Iterable[Any], count: int = 1, least: float = 0.6) -> list[Any]:
+    """List at most ``count`` names nearly the same as a word, the nearest first, whatever their case.
+
+    ``least``: their likeness, as difflib measures it.
+    """
+    from difflib import get_close_matches
+
+    lower = {str(name).lower(): name for name in names}
+    return [lower[near] for near in get_close_matches(word.lower(), lower, count, least)]
+
+
+def perhaps(word: Any, names: Iterable[Any]) -> str:
+    """Return the end of a message about a word that is none of the names: the one that it is near to, if any."""
+    return "".join(f"; perhaps {near}" for near in near_names(word, names)) if isinstance(word, str) else ""
 
 
 def _parts(kind: Any) -> list[Any]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Literal
 
 from gsmerge.settings.budget import AUTO, parse_share
-from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.setting import Settings, perhaps, setting
 
 Poses = Literal["auto", "fixed", "free"]
 Exposure = Literal["auto", "fixed", "per-photo"]
@@ -180,7 +179,7 @@ class CleanOptions(Settings):
             if name in self.drops[:number]:
                 raise ValueError(f"drop: expected {name} once, got {self.drop!r}")
             if name not in DROPS:
-                near = "".join(f"; perhaps {word}" for word in get_close_matches(name, DROPS, 1))
+                near = perhaps(name, DROPS)
                 raise ValueError(f"drop: expected some of {', '.join(DROPS)}, with commas between, got {name!r}{near}")
 
     @property

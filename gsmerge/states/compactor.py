@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gsmerge.arguments import check_arguments
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import UsageError
@@ -15,6 +16,7 @@ from gsmerge.settings.extend import SUFFIX, batch_settings
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.extend import BatchReport, extend
 from gsmerge.states.features import decode_features, extend_features
+from gsmerge.states.remove import remove
 from gsmerge.states.state_file import State, load_state, save_state
 from gsmerge.types import Gaussians, Scene, StrPath
 
@@ -31,7 +33,8 @@ def extend_state(
 
     ``settings``: those of a draft by default, without a fit where each Gaussian has a pixel; with
     ``recipe="paper"`` the first batch begins Feature Gaussians, and later ones go on with its networks. Raises
-    ValueError if a setting is unknown, out of range, or impossible for the state or the scene.
+    ValueError if a setting is unknown, out of range, or impossible for the state or the scene; SceneError for a scene
+    that seems to be of another world.
     """
     about = {} if state is None else dict(state.about)
     scene_before, features = (None, None) if state is None else (state.scene, state.features)
@@ -40,8 +43,8 @@ def extend_state(
         raise UsageError("recipe paper: expected a state that began with it, found results; begin another state")
     made: dict[str, Any] = {}
     if of_paper or features is not None:
-        options, _ = batch_settings({"recipe": "paper", "effort": "default"} | dict(settings))
-        made["features"], report = extend_features(features, scene, options, progress=progress)
+        options = batch_settings({"recipe": "paper", "effort": "default"} | dict(settings))
+        made["features"], report = extend_features(features, scene, *options, progress=progress)
     else:
         usual = {"fit": "none"} if scene.has_own_pixels else {}  # the photos are fitted to in the end
         made["scene"], report = extend(scene_before, scene, *batch_settings(usual | dict(settings)), progress=progress)
@@ -77,6 +80,7 @@ class Compactor:
         self._state: State | None = None
 
     @classmethod
+    @check_arguments
     def load(cls, path: StrPath, **settings: Unpack[StateKeywords]) -> Compactor:
         """Load a saved state; ``settings`` are for the batches to come.
 
@@ -107,11 +111,29 @@ class Compactor:
         """Numbers of every batch so far; see :class:`gsmerge.states.extend.BatchReport`."""
         return () if self._state is None else tuple(self._state.about["batches"])
 
+    @check_arguments
     def extend(self, scene: Scene | StrPath, *, progress: Progress | None = None) -> BatchReport:
-        """Add a batch of views in the world of the earlier ones; see :func:`gsmerge.states.extend.extend`."""
+        """Add a batch of views in the world of the earlier ones; see :func:`gsmerge.states.extend.extend`.
+
+        Raises:
+            SceneError: If the pictures of the batch do not show the earlier Gaussians, without ``other_world=True``.
+        """
         self._state, report = extend_state(self._state, as_scene(scene), self._settings, progress=progress)
         return report
 
+    def remove(self, number: int) -> None:
+        """Take a batch out again; see :func:`gsmerge.states.remove.remove`.
+
+        Args:
+            number: The batch, from 1; later ones move up.
+
+        Raises:
+            ValueError: If there is no such batch, it is the only one, or the state is of Feature Gaussians, in which
+                batches are merged.
+        """
+        self._state = remove(self.state, number)
+
+    @check_arguments
     def compact(self, *, progress: Progress | None = None, **settings: Unpack[CompactKeywords]) -> CompactResult:
         """Compact the scene of all batches so far, see :func:`gsmerge.compact`.
 
@@ -136,6 +158,7 @@ class Compactor:
             raise ValueError('expected a state begun with recipe="paper", found results; compact makes others of them')
         return decode_features(self.state.features, DecodeOptions(**settings))
 
+    @check_arguments
     def save(self, path: StrPath, *, overwrite: bool = False) -> None:
         """Write the state to a file.
 

@@ -12,6 +12,8 @@ from gsmerge.alignment import check_cameras
 from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
+from gsmerge.errors import SceneError
+from gsmerge.facts.confirm_depths import CERTAIN, ENOUGH
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
 from gsmerge.geometry import camera_centres, camera_distances
@@ -24,10 +26,14 @@ from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.setting import piece_settings
 from gsmerge.types import Cameras, Gaussians, Scene
 
-# Earlier Gaussians that are looked up in new views; share that these see at the least; and of the foremost, the most
-# that colours may differ from pictures, over that from random pixels: .4 to .7 in one world, .85 to 1.1 in others
-SAMPLE_GAUSSIANS, SEEN, UNLIKE = 10_000, 0.02, 0.8
-OTHER_WORLD = "the pictures of this batch do not show the earlier Gaussians: a .gsm is for one world, begin another"
+# Earlier Gaussians that are looked up in new views
+SAMPLE_GAUSSIANS = 10_000
+# How far colours of the foremost lie from the pictures, over how far from random pixels: of batches of 15 captures at
+# most .87 in one world, and .92 to 1.08 in others, where 1 is chance. That is to be certain.
+UNLIKE = 0.9
+SAME, ANOTHER, NOT_KNOWN = "the same", "another", "not known"  # worlds
+BATCH = "batch"  # in messages, until the file is known
+NOT_COMPARED = "the pictures of this batch show too little of the earlier Gaussians to say whether its world is theirs"
 
 
 @dataclass(frozen=True)
@@ -40,8 +46,10 @@ class BatchReport:
     num_gaussians: int  # of the state afterwards; or Feature Gaussians
     num_kept: int  # views of the state afterwards whose pictures it keeps
     pictures: str  # what the batch is fitted to: "photos", or what stands in for them
+    views: Mapping[str, str]  # of which the state keeps pictures: their names in the state -> in the batch
+    sh_degree: int  # of the batch's Gaussians
     seconds: Mapping[str, float]  # wall time of each stage
-    choices: Mapping[str, Any]  # what the stages decided
+    choices: Mapping[str, Any]  # what the stages decided; `world`: whether it seems to be that of the earlier batches
     notes: tuple[str, ...]  # warnings, one sentence each
     options: Mapping[str, Any]  # all settings, by their names in reports
 
@@ -64,21 +72,26 @@ def extend(
 
     Poses and exposures of the batch stay as they are. Returns an unaligned scene of all results, with the kept views at
     the size of the first batch's: each has its photo, mended, or what stands in for it. And the report. ValueError if a
-    setting is impossible for the scene.
+    setting is impossible for the scene, SceneError for a scene that seems to be of another world.
     """
     options = options.with_settings(piece_settings(CompactOptions))
     with use_threads(options.threads), record_run(progress):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)
+        views, world, parts = _keep_pictures(prepared), NOT_KNOWN, []
+        if before is not None:
+            world = compare_worlds(before.gaussians, views, prepared.input_scene.gaussians.means)
+            refuse_other_world(world, extend_options)
+            parts = [before.gaussians]
         result = compact_prepared(prepared, method, options)
-    gaussians, views = result.gaussians.numpy(), _keep_pictures(prepared)
     notes = [text for text in result.report.notes if text != result.report.worse]  # that is for results
+    notes += [NOT_COMPARED] if before is not None and world == NOT_KNOWN else []
+    parts.append(result.gaussians.numpy())
+    num_higher = max(part.shN.shape[1] for part in parts)
+    gaussians, names = Gaussians.concat([pad_harmonics(part, num_higher) for part in parts]), views.names
     if before is not None:
-        notes += [] if _shows(views, before.gaussians) else [OTHER_WORLD]
-        parts = before.gaussians, gaussians
-        num_higher = max(part.shN.shape[1] for part in parts)
-        gaussians = Gaussians.concat([pad_harmonics(part, num_higher) for part in parts])
         views = _join_views(before, views)
+    new_names = views.names[len(views) - len(names) :]
     joined = replace(subset(views, choose_far(views.cameras, extend_options.max_views)), gaussians=gaussians)
     report = BatchReport(
         num_views=len(scene),
@@ -87,21 +100,37 @@ def extend(
         num_gaussians=len(gaussians),
         num_kept=len(joined),
         pictures=prepared.reference.name,
+        views={new: name for new, name in zip(new_names, names, strict=True) if new in joined.names},
+        sh_degree=result.gaussians.sh_degree,
         seconds=result.report.seconds,
-        choices=result.report.choices,
+        choices=result.report.choices | {"world": world},
         notes=tuple(notes),
         options=options.to_dict() | asdict(extend_options),
     )
     return joined, report
 
 
-def _shows(views: Scene, gaussians: Gaussians) -> bool:
-    """Return whether pictures of views may show Gaussians: some see them, in about their colours."""
+def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
+    """Return whether pictures of new views show earlier Gaussians that the batch's own, at ``means``, do not hide.
+
+    In another world their colours are as those of random pixels.
+    """
     if not len(views):
-        return True
-    rows = np.ones(len(gaussians), bool)
-    check = check_cameras(gaussians, rows, views.cameras, photo_array(views.images), SAMPLE_GAUSSIANS, foremost=True)
-    return check.share_seen >= SEEN and not check.color_ratio > UNLIKE
+        return NOT_KNOWN
+    rows, hiding = np.isfinite(np.asarray(before.means)).all(1), means[np.isfinite(means).all(1)]
+    pictures = photo_array(views.images)
+    check = check_cameras(before, rows, views.cameras, pictures, SAMPLE_GAUSSIANS, foremost=True, hiding=hiding)
+    reach = CERTAIN * check.ratio_error
+    if check.num_compared < ENOUGH or not abs(check.color_ratio - UNLIKE) > reach:
+        return NOT_KNOWN
+    return SAME if check.color_ratio < UNLIKE else ANOTHER
+
+
+def refuse_other_world(world: str, options: ExtendOptions) -> None:
+    """Raise SceneError for a batch that seems to be of another world, unless options ask for it."""
+    if world == ANOTHER and not options.other_world:
+        problem = "expected views in the world of the earlier batches, found pictures that do not show their Gaussians"
+        raise SceneError(BATCH, problem, "begin another .gsm with it, or add it with --set other_world=true")
 
 
 def _keep_pictures(prepared: Prepared) -> Scene:

@@ -28,6 +28,7 @@ from gsmerge.pooling import Members, feature_to_gaussians, gaussian_members
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.setting import piece_settings
 from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
 from gsmerge.stages.assign import assign
@@ -37,7 +38,7 @@ from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
 from gsmerge.stages.segment import segment_scene
 from gsmerge.stages.superpixels import scene_saliency
-from gsmerge.states.extend import BatchReport, number_names
+from gsmerge.states.extend import NOT_COMPARED, NOT_KNOWN, BatchReport, compare_worlds, number_names, refuse_other_world
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
 
 SAMPLE_STEP = 8  # pixels between the samples of a view along each axis
@@ -123,8 +124,9 @@ class _JoinContext(NetworkContext):
 
 
 def extend_features(
-    state: FeatureState | None, scene: Scene, options: CompactOptions, *, progress: Progress | None = None
-) -> tuple[FeatureState, BatchReport]:
+    state: FeatureState | None, scene: Scene, options: CompactOptions, extend_options: ExtendOptions,
+    *, progress: Progress | None = None,
+) -> tuple[FeatureState, BatchReport]:  # fmt: skip
     """Add a batch of views to a state, or begin one; see :func:`gsmerge.states.extend.extend`.
 
     Raises UsageError if the settings ask for other networks than the state's, a budget, or a fit; ValueError if the
@@ -141,11 +143,12 @@ def extend_features(
     options = options.with_settings(piece_settings(CompactOptions))
     with use_threads(options.threads), record_run(progress) as record:
         prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame)
+        pictured, world = prepared.scene, _check_world(state, prepared.scene, extend_options)
         plan = make_plan(prepared, options, None if state is None else _own_checkpoint(state, options))
         weights = plan.networks
         if weights is None or not weights.options.encoder or not weights.options.makes_children:
             raise UsageError(f"recipe paper: expected an encoder and absolute outputs, {options.checkpoint} lacks them")
-        pictured, cameras = prepared.scene, in_float64(prepared.scene.cameras)
+        cameras = in_float64(pictured.cameras)
         segmentation = segment_scene(pictured, plan.superpixels, None)
         members = assign(pictured, segmentation.groups, by_contribution=plan.by_contribution)
         context = NetworkContext(weights, members, cameras, plan.seed)
@@ -165,14 +168,25 @@ def extend_features(
             made = _join(state, features, saliency, context, samples, plan.match)
             made = replace(made, unseen=Gaussians.concat([state.unseen, plan.unseen]))
     numbers = {"num_views": len(pictured), "num_input": scene.num_gaussians, "num_new": len(features)}
+    notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == NOT_KNOWN else [])]
     report = BatchReport(
-        **numbers, num_gaussians=len(made), num_kept=0, pictures=prepared.reference.name, seconds=record.seconds,
-        choices=record.choices | plan.network_facts, notes=tuple(record.notes), options=options.to_dict(),
+        **numbers, num_gaussians=len(made), num_kept=0, pictures=prepared.reference.name, views={},
+        sh_degree=scene.gaussians.sh_degree, seconds=record.seconds,
+        choices=record.choices | plan.network_facts | {"world": world}, notes=tuple(notes), options=options.to_dict(),
     )  # fmt: skip
     names = prepared.input_scene.names
     views = tuple(names[prepared.repeated.index(view)] for view in range(len(pictured)))
     names = views if state is None else number_names(state.names, views)
     return replace(made, checkpoint=options.checkpoint, names=names), report
+
+
+def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
+    """Return whether a canonical scene seems to be of a state's world; SceneError for another one, unless asked for."""
+    if state is None:
+        return NOT_KNOWN
+    world = compare_worlds(feature_to_gaussians(state.refined), scene, scene.gaussians.means)
+    refuse_other_world(world, options)
+    return world
 
 
 def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:

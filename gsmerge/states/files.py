@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
@@ -34,8 +34,10 @@ from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.compactor import extend_state
+from gsmerge.states.extend import BATCH
 from gsmerge.states.features import decode_features, feature_arrays
-from gsmerge.states.state_file import load_state, save_state
+from gsmerge.states.remove import remove
+from gsmerge.states.state_file import State, load_state, save_state
 
 ARRAYS = ".npz"  # ending of a file of Feature Gaussians as arrays
 
@@ -49,55 +51,107 @@ def extend_file(
     hints: ReadHints = AUTO,
     progress: Progress | None = None,
     seconds_before: Mapping[str, float] | None = None,
-) -> dict[str, Any]:
-    """Add a batch of views to the state in a file, or to a new file, and return the report as plain JSON types.
+    dry_run: bool = False,
+    tried: State | None = None,
+) -> tuple[dict[str, Any], State]:
+    """Add a batch of views to the state in a file, or to a new file; return the report as plain JSON types, and it.
 
     The file is replaced at the end, and not if anything fails or another process has changed it. If two processes end
     together, the second waits for the first and then sees its change. A batch that the state has already is left out,
     with a note. ``settings``: see :class:`gsmerge.Compactor`. ``seconds_before``: wall time by name of the caller's
-    earlier steps. Raises SceneError if a file cannot be read or written or was changed meanwhile, UsageError if a
-    setting is unknown, out of range, or requires what the state or the scene does not have.
+    earlier steps. ``dry_run``: write nothing; ``tried``: the state that an earlier one made, in place of the file's.
+    Raises SceneError if a file cannot be read or written or was changed meanwhile, or the batch seems to be of another
+    world; UsageError if a setting is unknown, out of range, or requires what the state or the scene does not have.
     """
     start, identity = perf_counter(), _file_identity(path)
     try:
         batch_settings(settings)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    state = None if identity is None else load_state(path)
+    state = tried or (None if identity is None else load_state(path))
     sha256 = content_hash(read_files(files))
     known = [] if state is None else [batch.get("sha256") for batch in state.about["batches"]]
-    document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}}
-    if sha256 in known:
-        place = {"path": str(path), "bytes": path.stat().st_size, "num_batches": len(known)}
+    document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}, "dry_run": dry_run}
+    if state is not None and sha256 in known:
         note = f"{files.ply}: left out, as all its files are batch {known.index(sha256) + 1} of {path.name} already"
-        return document | {"left_out": True, "state": place, "notes": [note]}
-    with ExitStack() as until_renamed, atomic_output(path, overwrite=True) as temporary:
+        return document | {"left_out": True, "state": _describe_file(path, state), "notes": [note]}, state
+    with _replaced(path, identity, dry_run=dry_run) as temporary:
         loaded = perf_counter()
         load = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
-        state, report = extend_state(state, load.scene, settings, progress=progress)
-        *earlier, last = state.about["batches"]
-        comments = list(dict.fromkeys([*state.about.get("comments", []), *load.comments]))
-        about = {**state.about, "batches": [*earlier, last | {"sha256": sha256}], "comments": comments}
+        try:
+            state, report = extend_state(state, load.scene, settings, progress=progress)
+        except SceneError as error:
+            raise (SceneError(files.ply, error.problem, error.remedy) if error.path == BATCH else error) from error
+        state = _note_source(state, sha256, load.comments)
         done = perf_counter()
-        save_state(temporary, replace(state, about=about), overwrite=True)
-        until_renamed.enter_context(lock_folder(path.resolve().parent))
-        if _file_identity(path) != identity:
-            raise SceneError(path, "was changed by another process meanwhile", "extend it again; it is as that left it")
+        if temporary is not None:
+            save_state(temporary, state, overwrite=True)
     seconds = {**(seconds_before or {}), "load": loaded - start, "read": read - loaded, **report.seconds}
     seconds["other"] = done - read - sum(report.seconds.values())
     numbers = {name: value for name, value in asdict(report).items() if name not in ("seconds", "notes", "options")}
     document["input"] |= load.recognised
-    return {
-        **document,
+    document |= {
         **numbers,
         "left_out": False,
-        "state": {"path": str(path), "bytes": path.stat().st_size, "num_batches": len(about["batches"])},
+        "state": _describe_file(path, state),
         "options": dict(report.options),
         **seconds_document(seconds | {"write": perf_counter() - done}),
         "peak_memory_bytes": peak_memory(),
         "notes": [*load.notes, *report.notes],
     }
+    return document, state
+
+
+def remove_batch(path: Path, number: int, *, dry_run: bool = False) -> dict[str, Any]:
+    """Take a batch, counted from 1, out of the state in a file; return what is left as plain JSON types.
+
+    The file is replaced as by :func:`extend_file`. ``dry_run``: write nothing. SceneError if the file cannot be read or
+    written or was changed meanwhile; UsageError if the batch cannot be taken out.
+    """
+    identity, before = _file_identity(path), load_state(path)
+    state = remove(before, number)
+    with _replaced(path, identity, dry_run=dry_run) as temporary:
+        if temporary is not None:
+            save_state(temporary, state, overwrite=True)
+    return {
+        **document_head(),
+        "dry_run": dry_run,
+        "removed": {"number": number, **before.about["batches"][number - 1]},
+        "num_gaussians": len(state),
+        "state": _describe_file(path, state),
+        "notes": [],
+    }
+
+
+def _note_source(state: State, sha256: str, comments: Sequence[str]) -> State:
+    """Return a state whose last batch notes its files, and the comments that results copy."""
+    *earlier, last = state.about["batches"]
+    last = last | {"sha256": sha256} | ({"comments": list(comments)} if comments else {})
+    every = list(dict.fromkeys([*state.about.get("comments", []), *comments]))
+    return replace(state, about={**state.about, "batches": [*earlier, last], "comments": every})
+
+
+@contextmanager
+def _replaced(path: Path, identity: tuple[int, int, int] | None, *, dry_run: bool) -> Iterator[Path | None]:
+    """Yield a file that takes the place of ``path`` after the block; None in a dry run.
+
+    SceneError if ``path`` is then another file than that of the ``identity``.
+    """
+    if dry_run:
+        yield None
+        return
+    with ExitStack() as until_renamed, atomic_output(path, overwrite=True) as temporary:
+        yield temporary
+        until_renamed.enter_context(lock_folder(path.resolve().parent))
+        if _file_identity(path) != identity:
+            raise SceneError(path, "was changed by another process meanwhile", "run again; it is as that left it")
+
+
+def _describe_file(path: Path, state: State) -> dict[str, Any]:
+    """Describe the file of a state, which a dry run may not have written."""
+    num_bytes = path.stat().st_size if path.exists() else 0
+    return {"path": str(path), "bytes": num_bytes, "num_batches": len(state.about["batches"])}
 
 
 def _file_identity(path: Path) -> tuple[int, int, int] | None:
@@ -111,15 +165,32 @@ def _file_identity(path: Path) -> tuple[int, int, int] | None:
 
 def batch_line(document: Mapping[str, Any]) -> str:
     """Describe the report of a batch in one line."""
-    state = document["state"]
+    state, would = document["state"], "would be " * document["dry_run"]
     if document["left_out"]:
-        number = state["num_batches"]
-        return f"{state['path']}: unchanged, {number} batch{'' if number == 1 else 'es'}"
+        return f"{state['path']}: {would}unchanged, {_count_batches(state)}"
+    size = f", {human_bytes(state['bytes'])}; {seconds_line(document)}"
+    world = f"; world: {document['choices']['world']}" if state["num_batches"] > 1 else ""
     return (
-        f"{state['path']}: batch {state['num_batches']}, {document['num_views']} views,"
-        f" {document['num_input']:,} -> {document['num_new']:,} Gaussians; {document['num_gaussians']:,} in all,"
-        f" {human_bytes(state['bytes'])}; {seconds_line(document)}"
+        f"{state['path']}: {would}batch {state['num_batches']}, {document['num_views']} views,"
+        f" {document['num_input']:,} -> {document['num_new']:,} Gaussians; {document['num_gaussians']:,} in all"
+        f"{world if would else size}"
     )
+
+
+def removal_line(document: Mapping[str, Any]) -> str:
+    """Describe the report of :func:`remove_batch` in one line."""
+    state, gone = document["state"], document["removed"]
+    would = "would be " * document["dry_run"]
+    left = f"{_count_batches(state)}, {document['num_gaussians']:,} Gaussians left"
+    size = "" if would else f", {human_bytes(state['bytes'])}"
+    return (
+        f"{state['path']}: {would}without batch {gone['number']} of {gone['num_views']} views and"
+        f" {gone['num_new']:,} Gaussians; {left}{size}"
+    )
+
+
+def _count_batches(state: Mapping[str, Any]) -> str:
+    return f"{state['num_batches']} batch{'' if state['num_batches'] == 1 else 'es'}"
 
 
 def decode_file(

@@ -84,7 +84,10 @@ def load_state(path: StrPath) -> State:
         raise file.error("about: expected a list of batches in the header, found none")
     if file.header["kind"] == FEATURES:
         return State(about, features=_read_features(file))
-    return State(about, load_scene(path).scene)
+    scene = load_scene(path).scene
+    if len(scene.gaussians) == len(file.arrays["means"]):  # as they are: scales pass through logarithms
+        scene = replace(scene, gaussians=Gaussians(*(file.arrays[f.name] for f in fields(Gaussians))))
+    return State(about, scene)
 
 
 def holds_features(path: Path) -> bool:

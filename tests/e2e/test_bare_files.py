@@ -67,7 +67,7 @@ def test_other_commands_need_none(words: str, bare: Path, tmp_path: Path, run: A
         parts = [part.replace(name, str(place)) for part in parts]
     document = report_of(run, *parts)
     assert document.get("reference", "renders of the input") == "renders of the input"
-    notes = document.get("batches", [document])[0]["notes"]
+    notes = (document.get("batches") or [document])[0]["notes"]
     expected = ("views are placed", "around") if "render" in words else PLACED
     assert sum(noted([note], *expected) for note in notes) == 1
 

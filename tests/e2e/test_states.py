@@ -26,7 +26,7 @@ from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene
-from gsmerge.states.extend import OTHER_WORLD
+from gsmerge.states.extend import NOT_COMPARED
 from gsmerge.states.state_file import load_state, save_state
 
 from .conftest import Run, assert_refused, listing
@@ -103,7 +103,7 @@ def test_json_is_all_there_is_on_stdout(walks: list[Path], tmp_path: Path, run: 
         assert one["num_input"] == num_views * 24 * 16
         assert one["options"]["superpixels"] == 60
         assert {"load", "read", "write"} <= set(one["seconds"])
-        assert [note for note in one["notes"] if "confirms" not in note and note != OTHER_WORLD] == []  # depth is made
+        assert [note for note in one["notes"] if "confirms" not in note and note != NOT_COMPARED] == []  # depth is made
     assert "import" in batches[0]["seconds"]
     assert "import" not in batches[1]["seconds"]
     kept = load_state(state).about["batches"]
@@ -117,6 +117,30 @@ def test_a_batch_is_added_once(states: list[Path], state: Path, walks: list[Path
     outcome = run("extend", state, again, *SMALL, code=0)
     assert ("batch 1 of state.gsm" in outcome.err, "unchanged" in outcome.out) == (True, True)
     assert state.read_bytes() == states[0].read_bytes()
+
+
+def test_a_dry_run_writes_nothing_and_goes_on_with_what_it_made(
+    states: list[Path], walks: list[Path], state: Path, run: Run
+) -> None:
+    outcome = run("extend", state.parent / "new.gsm", *walks, *SMALL, "--dry-run", code=0)
+    first, second = outcome.out.splitlines()
+    assert ("would be batch 1, 3 views" in first, "would be batch 2, 4 views" in second) == (True, True)
+    assert second.endswith("world: not known")
+    assert "would be without batch 2 of 4 views" in run("extend", states[1], "--remove", "2", "--dry-run", code=0).out
+    assert list(listing(state.parent)) == ["state.gsm"]
+
+
+def test_a_batch_is_taken_out_by_the_number_that_inspect_lists(
+    states: list[Path], features: Path, tmp_path: Path, run: Run
+) -> None:
+    state = Path(shutil.copy(states[1], tmp_path / "room.gsm"))
+    listed = [line for line in run("inspect", state, code=0).out.splitlines() if line.startswith("batch")]
+    assert ["3 views" in listed[0], "view_003.png; 1,536 ->" in listed[1]] == [True, True], listed
+    assert "room.gsm: without batch 2 of 4 views" in run("extend", state, "--remove", "2", code=0).out
+    assert state.read_bytes() == states[0].read_bytes()
+    assert_refused(run("extend", state, "--remove", "1"), 2, "remove 1", "delete the file")
+    assert_refused(run("extend", features, "--remove", "1"), 2, "remove 1", "Feature Gaussians")
+    assert_refused(run("extend", state), 2, "extend", "--remove NUMBER")
 
 
 def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import cv2
 import numpy as np
 
+from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
@@ -301,6 +302,7 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
     return replace(camera_file, widths=width, heights=height)
 
 
+@check_arguments
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
     """Convert to cameras of one image size (width, height) in pixels; None: the file's size.
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile
@@ -87,6 +88,7 @@ def _holds_cameras(path: Path) -> bool:
         return False
 
 
+@check_arguments
 def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None = None) -> CameraFile:
     """Read cameras from a file, or from a folder that holds one of the known kinds.
 

@@ -176,6 +176,17 @@ def _picture_notes(about: Mapping[str, Any]) -> tuple[str, ...]:
     return (f"without photos of some batches: {' and '.join(others)} stand in for them",) if others else ()
 
 
+def list_batches(path: Path) -> list[dict[str, Any]]:
+    """List from the header of a ``.gsm`` the numbers of each batch, and the names of the views that are kept of it."""
+    numbers, batches = ("num_views", "num_input", "num_new"), read_header(path)["about"].get("batches")
+    listed = []
+    for batch in filter(lambda one: isinstance(one, dict), batches if isinstance(batches, list) else ()):
+        facts: dict[str, Any] = {name: value for name in numbers if isinstance(value := batch.get(name), int)}
+        views = batch.get("views")
+        listed.append(facts | {"views": [*map(str, views.values())] if isinstance(views, dict) else []})
+    return listed
+
+
 def holds_views(path: Path) -> bool:
     """Return whether a path is a ``.gsm`` with cameras; True for a damaged one, whose reader says what is wrong."""
     try:

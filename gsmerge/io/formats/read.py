@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
 from gsmerge.geometry import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
@@ -108,6 +109,7 @@ def degree_notes(info: FileInfo) -> tuple[str, ...]:
     return (f"harmonics of degree {info.sh_degree}: splat-transform 3.7 and gsply refuse a .ply with them",)
 
 
+@check_arguments
 def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
     """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, ``filter_3D`` worked in, others unused.
 
@@ -146,6 +148,7 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
     return convert_files(paths, parts, opacity)
 
 
+@check_arguments
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
     """Read a file of Gaussians; the ending of its name tells the format.
 

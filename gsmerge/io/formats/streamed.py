@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
@@ -40,6 +41,7 @@ MAX_LEVELS = 64  # no real file has more than a dozen
 _CHUNK = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # a folder of a chunk: its level, its number, a hash
 
 
+@check_arguments
 def write_levels(
     path: StrPath, levels: Sequence[Gaussians], *, overwrite: bool = False, comments: Sequence[str] = ()
 ) -> None:

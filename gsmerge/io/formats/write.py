@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmerge.arguments import check_arguments
 from gsmerge.io.atomic import AddOutput, atomic_output
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.table import OUTPUT_FORMATS, PLY, Contents, NamedPhotos, find_format, output_format
@@ -51,6 +52,7 @@ def write_apart(add: AddOutput, path: Path, first: Path, contents: Contents) -> 
     return written
 
 
+@check_arguments
 def write_gaussians(
     path: StrPath,
     gaussians: Gaussians,
@@ -93,6 +95,7 @@ def write_gaussians(
         temporary.write_bytes(chosen.encode(gaussians, comments))
 
 
+@check_arguments
 def write_ply(
     path: StrPath,
     gaussians: Gaussians,
@@ -148,10 +151,7 @@ def _write_ply(
 
 
 def check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:
-    """Raise TypeError for what are no Gaussians, ValueError for what the readers refuse."""
-    if not isinstance(gaussians, Gaussians):
-        remedy = "; pass its .gaussians, or call its save" if hasattr(gaussians, "gaussians") else ""
-        raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}{remedy}")
+    """Raise ValueError for what the readers refuse."""
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none")
     length = sum(len(f"comment {comment}\n") for comment in comments)

@@ -17,7 +17,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats
 from gsmerge.io.photo_files import NO_IMAGES
 from gsmerge.scene.read import load_scene
-from gsmerge.types import Cameras
+from gsmerge.types import SH_C0, Cameras
 
 SMOOTH = smooth_scene(40, 30)
 
@@ -65,21 +65,28 @@ def test_the_usual_reading_is_not_doubted(tmp_path: Path) -> None:
 
 
 def test_a_tie_is_said() -> None:
-    """Cameras in the middle of a ball of Gaussians: both axes see the same number, and there are no photos."""
+    """Cameras in the middle of a ball of Gaussians: both axes see the same; where photos do, too, there is a doubt."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(4000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     tiny = make_tiny()
-    gaussians = replace(tiny.gaussians[np.arange(4000) % 840], means=points.astype(np.float32))
-    c2w = tiny.c2w.copy()
-    c2w[:, :3, 3] *= 0.1
+    columns = (3 * points[:, 0] / np.abs(points[:, 2])).clip(-10, 9.5)  # where views see them, ahead or behind
+    gaussians = replace(
+        tiny.gaussians[np.arange(4000) % 840],
+        means=points.astype(np.float32),
+        sh0=np.repeat(columns[:, None, None] / 10, 3, -1),
+    )
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    viewmats[:, 1, 3] = 0.1, 0.02, -0.1
+    viewmats[1, :3, :3] = np.diag([1, -1, -1])
     wide = np.array([[3.0, 0, 10], [0, 3, 7], [0, 0, 1]])
-    cameras = Cameras(np.linalg.inv(c2w), np.tile(wide, (3, 1, 1)), 20, 14)
-    poses, seen, said = choose_poses(gaussians, np.ones(4000, bool), cameras, NO_IMAGES, W2C_OPENCV)
-    assert poses is None
-    assert seen.ok
-    assert said is not None
-    assert "fit as well when read as" in said
+    cameras = Cameras(viewmats, np.tile(wide, (3, 1, 1)), 20, 14)
+    photos = np.broadcast_to(0.5 + SH_C0 * ((np.arange(20) - 9.5) / 10)[:, None], (3, 14, 20, 3))
+    for images, doubts in ((NO_IMAGES, False), (photos, True)):
+        poses, seen, said = choose_poses(gaussians, np.ones(4000, bool), cameras, images, W2C_OPENCV)
+        assert poses is None
+        assert seen.ok
+        assert ("fit as well when read as" in (said or "")) is doubts
 
 
 def test_one_pose_without_turn_has_fewer_readings() -> None:

@@ -6,13 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
 from exports import depth_map_mask, export_rows, save_export, smooth_scene
 from messages import names, noted
 from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, write_npz
 
-from gsmerge import compact, read_scene
+from gsmerge import CompactOptions, compact, read_scene
+from gsmerge.compaction.estimate import estimate
 from gsmerge.compaction.inspect import inspect, inspection_lines
+from gsmerge.facts.prepare import views_notes
 from gsmerge.io import read_ply, write_ply
 from gsmerge.measure.coverage import extents
 
@@ -245,3 +248,13 @@ def test_our_own_files(tmp_path: Path) -> None:
     save_export(tmp_path, SMOOTH, export_rows(SMOOTH))
     write_ply(tmp_path / "own.ply", read_ply(tmp_path / "scene.ply").gaussians[::7])
     assert said(tmp_path / "own.ply")["exporter"] == "gsmerge"
+
+
+def test_a_repeated_view_counts_once_as_in_a_run() -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3, 24, 18))
+    again, options = scenes.take_views(scene, [0, 1, 2, 2]), CompactOptions().with_settings({"effort": "draft"})
+    said = "1 view repeats another in every pixel and counts once"
+    assert said in views_notes(again)
+    assert said in compact(again, options).report.notes
+    assert views_notes(scene) == []
+    assert estimate(again, options)["num_gaussians"] == estimate(scene, options)["num_gaussians"]

@@ -174,3 +174,18 @@ def test_photos_from_one_point_are_said_to_be_pieces_of_a_panorama(wall: Scene) 
     whole = confirm_depths(wall)
     assert whole is not None
     assert not whole.from_one_point
+
+
+def test_what_lies_beyond_a_crop_contradicts_nothing(wall: Scene) -> None:
+    """Pixels without a Gaussian say nothing, and few pixels too little."""
+    whole, pixels = confirm_depths(wall), wall.get_pixels()
+    assert whole is not None
+    middle = np.linalg.norm(wall.gaussians.means - wall.gaussians.means.mean(0), axis=1)
+    for share in (0.2, 0.02):
+        inside = middle < np.quantile(middle, share)
+        cropped = replace(wall, pixels=replace(pixels, fronts=np.where(inside[pixels.fronts], pixels.fronts, -1)))
+        agreement = confirm_depths(cropped)
+        assert agreement is not None
+        assert agreement.confirmed > whole.confirmed - 0.1
+        assert agreement.doubt is None
+    assert Agreement(0.1, 0.1, 0.0, num_pixels=8).doubt is None

@@ -181,3 +181,22 @@ def test_pictures_to_protect_that_do_not_fit(tiny_folder: Path, tiny: Tiny, tmp_
     write(tmp_path / "wrong" / "sign.png", np.zeros((2, 2), np.uint8))
     with refuses(SceneError, "wrong", "2.png", "--protect"):
         read_scene(tiny_folder, protect=tmp_path / "wrong")
+
+
+@pytest.mark.parametrize("grey", [False, True])
+def test_photos_in_place_of_masks_are_doubted(grey: bool, tiny_folder: Path, tiny: Tiny) -> None:
+    """Also of grey photos, which may be masks by their looks; not of masks that are grey."""
+    if grey:
+        for path in sorted((tiny_folder / "images").rglob("*.png")):
+            write(path, cv2.cvtColor(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), cv2.COLOR_GRAY2BGR))
+    notes = load_scene(tiny_folder, protect=tiny_folder / "images").notes
+    assert any(note.startswith("protect: 3 of 3 pictures look like photos, ") for note in notes)
+    for name in tiny.names:
+        write(tiny_folder / "signs" / f"{name}.png", half(tiny).astype(np.uint8) * 200)
+    assert not any("look like photos" in note for note in load_scene(tiny_folder, protect=tiny_folder / "signs").notes)
+
+
+def test_a_picture_that_is_too_large_has_a_remedy(tmp_path: Path) -> None:
+    write(tmp_path / "a.png", np.full((4800, 6400), 255, np.uint8))
+    with refuses(SceneError, "a.png", "6400 x 4800", "a mask to the size of its photo"):
+        decode_levels(tmp_path / "a.png")

@@ -89,6 +89,15 @@ def test_photos_that_lie_on_their_side(folder: Path, truth: np.ndarray, tagged: 
     assert any("they were turned" in text and "3 of 4 photos" in text for text in loaded.notes) is not tagged
 
 
+def test_photos_that_are_mirrored(folder: Path, truth: np.ndarray) -> None:
+    for path in photos_in(folder):
+        Image.fromarray(np.ascontiguousarray((read(path) * 255).round().astype(np.uint8)[:, ::-1])).save(path)
+    loaded = load_scene(folder)
+    assert right_ones(loaded, truth) == [True] * VIEWS
+    assert any("they were mirrored" in text and "4 of 4 photos" in text for text in loaded.notes)
+    assert not any("they were turned" in text for text in loaded.notes)
+
+
 def test_tags_of_photos_that_are_upright(folder: Path, truth: np.ndarray) -> None:
     """A program has turned the pixels, and kept the tag."""
     exif = Image.Exif()

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 from messages import refuses
@@ -137,3 +139,31 @@ def test_files_beside_a_relative_path(tiny_folder: Path, monkeypatch: pytest.Mon
     actual = find_scene_files("scene.ply")
     assert actual.ply == Path("scene.ply")
     assert actual.cameras == tiny_folder.resolve() / "transforms.json"
+
+
+def test_what_lies_one_folder_above_is_named_and_not_read(tmp_path: Path, tiny: Tiny) -> None:
+    (run := tmp_path / "room/run").mkdir(parents=True)
+    write_ply(run / "x.ply", tiny.gaussians)
+    write_transforms(tmp_path / "room/transforms.json", tiny)
+    write_images(tmp_path / "room/images", tiny)
+    for path in (run, run / "x.ply"):
+        files = find_scene_files(path)
+        assert (files.cameras, files.images) == (None, None)
+        assert any("../images, ../transforms.json; name that folder" in note for note in files.notes)
+    assert find_scene_files(tmp_path / "room").notes == find_scene_files(run, cameras="none", images="none").notes == ()
+
+
+def test_a_folder_without_the_right_to_read_is_named(
+    tiny_folder: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scandir, closed = os.scandir, str(tiny_folder / "images")
+
+    def refuse(path: Any = ".") -> Any:
+        if str(path).startswith(closed):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    with refuses(SceneError, closed, "Permission denied", "--images none"):
+        find_scene_files(tiny_folder)
+    assert find_scene_files(tiny_folder, images="none").images is None

@@ -12,12 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsmerge import Cameras, Compactor, Scene, compact
-from gsmerge.errors import UsageError
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.row_colors import PHOTOS, RENDERS, ROW_COLORS
+from gsmerge.geometry import camera_centres
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene
-from gsmerge.states.extend import choose_far
+from gsmerge.states.extend import NOT_COMPARED, choose_far, compare_worlds
 
 FEW = {"superpixels": "10%", "checkpoint": "none"}
 SHAPES = {"room": scenes.room, "wall": scenes.wall, "planes": scenes.two_planes}
@@ -122,8 +123,42 @@ def test_a_batch_that_sees_nothing_of_the_others_is_noted(room: Scene) -> None:
         cameras=replace(elsewhere.cameras, viewmats=turned[:2]),
     )
     compactor = fed(scenes.take_views(room, range(3)))
-    assert "one world" not in " ".join(compactor.extend(scenes.take_views(room, range(3, 6))).notes)
-    assert "one world" in " ".join(compactor.extend(moved).notes)
+    assert compactor.extend(scenes.take_views(room, range(3, 6))).choices["world"] == "the same"
+    report = compactor.extend(moved)
+    assert (report.choices["world"], NOT_COMPARED in report.notes) == ("not known", True)
+
+
+def test_a_batch_that_shows_something_else_is_refused_unless_asked_for(room: Scene) -> None:
+    """And what the batch's own Gaussians hide says nothing: a wall before all of the earlier ones."""
+    inverse = replace(room.gaussians, sh0=-room.gaussians.sh0)
+    other = scenes.take_views(replace(room, gaussians=inverse, images=1 - room.images), range(3))
+    compactor = fed(room)
+    before = compactor.state
+    with pytest.raises(SceneError, match=r"world of the earlier batches.*other_world"):
+        compactor.extend(other)
+    assert compactor.state is before
+    assert fed(room, other, other_world=True).batches[1]["num_views"] == 3
+    views = replace(scenes.take_views(room, [0]), images=1 - room.images[:1])
+    centre = camera_centres(views.cameras.viewmats)[0]
+    rays, earlier = views.gaussians.means - centre, scene_of(compactor).gaussians
+    assert compare_worlds(earlier, views, centre + 2 * rays) == "another"
+    assert compare_worlds(earlier, views, centre + 0.5 * rays) == "not known"
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_a_state_without_a_batch_is_that_of_the_others(number: int, room: Scene, tmp_path: Path) -> None:
+    """Byte for byte, with names that are taken and harmonics of several degrees."""
+    rich = scenes.make_scene(scenes.room(), scenes.arc(2, 48, 36), degree=1)
+    parts = [scenes.take_views(room, range(3)), rich, replace(scenes.take_views(room, [5, 3]), names=room.names[1:3])]
+    compactor = Compactor(**FEW)
+    for part in parts:  # as by files, one at a time
+        compactor.extend(part)
+        compactor.save(tmp_path / "all.gsm", overwrite=True)
+        compactor = Compactor.load(tmp_path / "all.gsm", **FEW)
+    compactor.remove(number)
+    compactor.save(tmp_path / "left.gsm")
+    fed(*(part for place, part in enumerate(parts, 1) if place != number)).save(tmp_path / "alone.gsm")
+    assert (tmp_path / "left.gsm").read_bytes() == (tmp_path / "alone.gsm").read_bytes()
 
 
 def test_a_batch_without_cameras_adds_gaussians_alone(room: Scene) -> None:
@@ -201,6 +236,9 @@ def test_wrong_use(room: Scene) -> None:
     for call in (empty.compact, lambda: empty.save("a.gsm")):
         with pytest.raises(ValueError, match="at least one batch"):
             call()
+    for number in (0, 1, 2):
+        with pytest.raises(ValueError, match=f"remove {number}: expected a batch"):
+            compactor.remove(number)
     with pytest.raises(ValueError, match="recipe"):
         compactor.decode(k=1)
     with pytest.raises(ValueError, match=r"\.gsm"):

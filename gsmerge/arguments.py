@@ -1,0 +1,129 @@
+"""Check the arguments of public functions by their annotations: another type is refused in one clear line."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from typing import Any, TypeVar, cast
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+# Names in annotations, beside those of classes -> what messages call them, and whether a value is one
+KINDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
+    "None": ("", lambda value: value is None),
+    "StrPath": ("a path", lambda value: isinstance(value, str | os.PathLike)),
+    "Progress": ("a function", callable),
+    "OnImage": ("a function", callable),
+    "HasGaussians": ("a result", lambda value: hasattr(value, "gaussians")),
+}
+CLASSES = {
+    "Scene": "a Scene", "Gaussians": "Gaussians", "Cameras": "Cameras", "Views": "Views", "CameraFile": "a CameraFile",
+    "CompactOptions": "CompactOptions", "EvaluateOptions": "EvaluateOptions",
+}  # fmt: skip
+OF_SCENE = "write Gaussians to a file and give its path; tensors go to compact_tensors"
+
+
+def check_arguments(function: Function) -> Function:
+    """Decorate a public function: arguments of other types than it declares raise TypeError, as one line.
+
+    Only parameters are looked at whose annotation names nothing but :data:`KINDS` and :data:`CLASSES`, one of them or
+    several, and lists or mappings of them.
+    """
+    parameters = inspect.signature(function).parameters
+    known = {name: p for name, p in parameters.items() if isinstance(p.annotation, str) and _is_known(p.annotation)}
+    places = {name: place for place, name in enumerate(parameters)}
+
+    @wraps(function)
+    def call(*args: Any, **named: Any) -> Any:
+        for name, parameter in known.items():
+            if parameter.kind is parameter.VAR_POSITIONAL:
+                for value in args[places[name] :]:
+                    _check(name, parameter.annotation, value)
+            elif name in named:
+                _check(name, parameter.annotation, named[name])
+            elif places[name] < len(args) and parameter.kind is not parameter.KEYWORD_ONLY:
+                _check(name, parameter.annotation, args[places[name]])
+        return function(*args, **named)
+
+    return cast("Function", call)
+
+
+def _check(name: str, annotation: str, value: Any) -> None:
+    """Raise TypeError, which says what is expected, for a value of another type than an annotation's."""
+    if not _fits(annotation, value):
+        remedy = _remedy(annotation, value)
+        end = f"; {remedy}" if remedy else ""
+        raise TypeError(f"{name}: expected {_describe(annotation)}, got {_describe_value(value)}{end}")
+
+
+def _remedy(annotation: str, value: Any) -> str:
+    """Say what to pass in place of a value that may be meant; "" where that is not clear."""
+    kinds = {_split(part)[1] for part in _parts(annotation)}
+    if "Scene" in kinds:
+        is_path = KINDS["StrPath"][1](value)
+        return "gsmerge.read_scene(path) reads it" if is_path else OF_SCENE if "StrPath" in kinds else ""
+    if annotation.startswith("Mapping"):
+        return "name each, such as {'small': result}"
+    return "pass its .gaussians" if "Gaussians" in annotation and hasattr(value, "gaussians") else ""
+
+
+def _parts(annotation: str) -> list[str]:
+    """Split an annotation at each | outside of brackets."""
+    return [part.strip() for part in re.split(r"\|(?![^\[]*\])", annotation)]
+
+
+def _split(part: str) -> tuple[str, str]:
+    """Split a part of an annotation into the container, "" without one, and the annotation of what is in it."""
+    match = re.fullmatch(r"(Mapping\[str, |Sequence\[)(.*)\]", part)
+    return ("", part) if match is None else (match[1], match[2])
+
+
+def _is_known(annotation: str) -> bool:
+    split = [_split(part) for part in _parts(annotation)]
+    return all(_is_known(inner) if container else inner in KINDS or inner in CLASSES for container, inner in split)
+
+
+def _fits(annotation: str, value: Any) -> bool:
+    """Return whether a value has one of the types that an annotation names."""
+    for container, inner in map(_split, _parts(annotation)):
+        if container:
+            values = _values(container, value)
+            fits = values is not None and all(_fits(inner, each) for each in values)
+        elif inner in KINDS:
+            fits = KINDS[inner][1](value)
+        else:
+            fits = any(base.__name__ == inner for base in type(value).__mro__)
+        if fits:
+            return True
+    return False
+
+
+def _values(container: str, value: Any) -> Sequence[Any] | None:
+    """Return the values in a container; None for something else."""
+    if container.startswith("Mapping"):
+        return list(value.values()) if isinstance(value, Mapping) else None
+    return value if isinstance(value, list | tuple) else None
+
+
+def _describe(annotation: str) -> str:
+    """Say in words what an annotation names, containers last."""
+    words, several = list[str](), list[str]()
+    for container, inner in map(_split, _parts(annotation)):
+        if not container:
+            words.append(KINDS[inner][0] if inner in KINDS else CLASSES[inner])
+        elif container.startswith("Mapping"):
+            several.append(f"{_describe(inner)} by name")
+        else:
+            several.append(f"a list of {_describe(inner)}")
+    listed = [word for word in words if word]
+    listed += several if not listed else ["several by name"] * bool(several)
+    return " or ".join(filter(None, (", ".join(listed[:-1]), listed[-1])))
+
+
+def _describe_value(value: Any) -> str:
+    """Name the type of a value, and of what is in it."""
+    inside = list(value.values()) if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
+    return type(value).__name__ + (f" of {type(inside[0]).__name__}" if inside else "")

@@ -1,0 +1,50 @@
+"""Arguments of public functions of the wrong type: one clear line each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+
+import gsmerge
+
+SCENE = scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18))
+RESULT = gsmerge.compact(SCENE, budget=50, effort="draft")
+ANY: Any = gsmerge
+QUICK = gsmerge.EvaluateOptions(lpips=(), fog=False)
+CALLS: dict[str, Callable[[], Any]] = {
+    "results: expected a result or Gaussians by name, got list of Gaussians; name each": lambda: ANY.evaluate(
+        SCENE, [RESULT.gaussians]
+    ),
+    "scene: expected a Scene, got str; gsmerge.read_scene": lambda: ANY.evaluate("a.ply", {}),
+    "results: expected a result, Gaussians, a path or several by name, got list of CompactResult": lambda: ANY.view(
+        SCENE, [RESULT]
+    ),
+    "cameras: expected Cameras, got NoneType": lambda: ANY.render(SCENE.gaussians, None),
+    "gaussians: expected Gaussians, got CompactResult; pass its .gaussians": lambda: ANY.render(RESULT, SCENE.cameras),
+    "path: expected a path, got int": lambda: ANY.read_scene(3),
+    "more: expected a path, got int": lambda: ANY.read_scene("a.ply", 3),
+    "images: expected a path, got ndarray": lambda: ANY.inspect("a.ply", images=np.zeros(3)),
+    "progress: expected a function, got int": lambda: ANY.compact(SCENE, progress=3),
+    "scene: expected a Scene or a path, got Gaussians; write": lambda: ANY.compact(SCENE.gaussians),
+    "options: expected CompactOptions, got dict": lambda: ANY.compact(SCENE, {"k": 2}),
+    "path: expected a path, got Gaussians": lambda: ANY.write_ply(SCENE.gaussians, "a.ply"),
+    "levels: expected a list of Gaussians, got Gaussians": lambda: ANY.write_levels("lod-meta.json", SCENE.gaussians),
+    "scene: expected a Scene or a path, got int": lambda: ANY.Compactor().extend(3),
+}
+
+
+@pytest.mark.parametrize("line", CALLS)
+def test_another_type_is_refused_in_one_line(line: str) -> None:
+    with pytest.raises(TypeError) as caught:
+        CALLS[line]()
+    assert str(caught.value).startswith(line)
+
+
+def test_a_result_is_taken_where_its_gaussians_are_meant(tmp_path: Path) -> None:
+    of_result, plain = (gsmerge.evaluate(SCENE, {"a": each}, options=QUICK) for each in (RESULT, RESULT.gaussians))
+    assert [each.scores for each in of_result.results] == [each.scores for each in plain.results]
