@@ -8,7 +8,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
@@ -90,7 +90,7 @@ def make_app(only: str | None = None) -> typer.Typer:
             try:
                 function = load_plugin(PLUGINS, name)
             except UsageError as error:  # a package that is broken must not take the others with it
-                say(f"{PROGRAM}: warning: {error}")
+                say(str(error), kind="warning")
                 continue
             place = (
                 lab.command(name, cls=Command) if is_ours else made.command(name, cls=Command, rich_help_panel=ADDED)
@@ -245,14 +245,13 @@ def _take_progress(words: list[str]) -> tuple[list[str], list[str]]:
     return [*others, *words[end:]], values
 
 
-def _choose_style(values: Sequence[str]) -> str:
-    """Return how progress is shown; UsageError for several values or an unknown one."""
+def _check_style(values: Sequence[str]) -> None:
+    """Raise UsageError for several values of how progress is shown, or an unknown one."""
     if len(values) > 1:
         raise UsageError(f"{PROGRESS}: expected once, got it {len(values)} times")
     style = values[0] if values else STYLES[0]
     if style not in STYLES:
         raise UsageError(f"{PROGRESS}: expected {' or '.join(STYLES)}, got {style!r}")
-    return style
 
 
 def run(args: Sequence[str] | None = None) -> int:
@@ -266,8 +265,12 @@ def run(args: Sequence[str] | None = None) -> int:
             return stopped()  # libraries make errors of their own of it
         if DEBUG in arguments:
             traceback.print_exc()
-        say(f"{PROGRAM}: error: {message}")
+        with in_style():
+            say(message, kind="error")
         return code
+
+    def in_style() -> AbstractContextManager[None]:
+        return json_progress() if styles == [STYLES[1]] else nullcontext()
 
     signals: list[signal.Signals] = []
 
@@ -275,8 +278,8 @@ def run(args: Sequence[str] | None = None) -> int:
         return fail(f"ended by {signals[0].name}", 128 + signals[0]) if signals else fail("interrupted", INTERRUPTED)
 
     try:
-        style = _choose_style(styles)
-        with plain_warnings(), _orderly_stop(signals), json_progress() if style == "json" else nullcontext():
+        _check_style(styles)
+        with plain_warnings(), _orderly_stop(signals), in_style():
             _check_working_directory()
             words = [LOOK, *words] if words and _is_scene(words[0]) else words
             command = make_command(_command_of(words))

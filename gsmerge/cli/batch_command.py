@@ -140,9 +140,10 @@ def run_jobs(
 ) -> None:
     """Run jobs, show progress, and pass each record to ``add``; ``name``: key in a record with the name of its job."""
     from gsmerge.batch import run_batch
-    from gsmerge.batch.records import FAILED
+    from gsmerge.batch.records import FAILED, SKIPPED
 
-    num_failed = 0
+    num_failed, weights = 0, {job.output: 1 + job.num_gaussians for job in jobs}
+    done, every = 0, sum(weights.values())  # of what is made in this run
     with (
         separate_stdout(options.engine, quiet=args.silent),
         closing(run_batch(jobs, args.output, options)) as records,
@@ -152,7 +153,13 @@ def run_jobs(
             add(record)
             why = record["error"] or ""
             num_failed += record["status"] == FAILED
-            progress(record[name], record["status"], num_ended, why, num_failed)
+            weight = weights.get(record["output"], 0)
+            if record["status"] == SKIPPED:
+                every -= weight
+            else:
+                done += weight
+            share = done / every if every > 0 else 1.0
+            progress(record[name], record["status"], num_ended, why, num_failed, share)
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:

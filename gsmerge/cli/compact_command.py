@@ -238,7 +238,7 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
     needed = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=count - at_once)
     problem = memory_problem(needed)
     if problem is not None:
-        say(f"gsmerge: warning: {problem}", quiet=quiet)
+        say(problem, kind="warning", quiet=quiet)
 
 
 def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:

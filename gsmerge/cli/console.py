@@ -6,15 +6,20 @@ import json
 import os
 import shutil
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, Literal
 
 Progress = Callable[[str, int, int], None]
-RunProgress = Callable[[str, str, int, str, int], None]  # see total_progress
+RunProgress = Callable[[str, str, int, str, int, float], None]  # see total_progress
 
+Kind = Literal["status", "note", "warning", "error"]  # of a line on stderr
+STARTS: Mapping[Kind, str] = {
+    "status": "", "note": "note: ", "warning": "gsmerge: warning: ", "error": "gsmerge: error: ",
+}  # fmt: skip
 MAX_LINE = 5000  # characters
 SHORT = 5  # seconds: what is left is shown from so many on
 NARROW = 60  # columns below which bars are short and say less
@@ -49,14 +54,22 @@ def _erase_opening() -> None:
             print("\r" + " " * len(_opening.pop()), end="\r", file=sys.stderr, flush=True)
 
 
-def say(message: str, *, quiet: bool = False) -> None:
-    """Print one status line on stderr unless ``quiet``, wrapped in a terminal; ignore a closed stderr."""
-    if not quiet:
-        from gsmerge.report import wrap_line
+def say(message: str, *, kind: Kind = "status", quiet: bool = False) -> None:
+    """Print one line on stderr unless ``quiet``, wrapped in a terminal; ignore a closed stderr.
 
-        _erase_opening()
-        with suppress(OSError):
-            print("\n".join(wrap_line(one_line(message), terminal_columns(sys.stderr))), file=sys.stderr, flush=True)
+    Notes, warnings and errors begin with what they are. Beside progress as JSON, each is an object keyed by its kind.
+    """
+    if quiet:
+        return
+    if _as_json.get():
+        _print_event({kind: one_line(message)})
+        return
+    from gsmerge.report import wrap_line
+
+    _erase_opening()
+    text = one_line(STARTS[kind] + message)
+    with suppress(OSError):
+        print("\n".join(wrap_line(text, terminal_columns(sys.stderr))), file=sys.stderr, flush=True)
 
 
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
@@ -67,16 +80,16 @@ def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
         if WORSE in note:
             say_warning(note, quiet=quiet)
         else:
-            say(f"note: {note}", quiet=quiet)
+            say(note, kind="note", quiet=quiet)
 
 
 def say_warning(text: str, *, quiet: bool = False) -> None:
     """Print a warning on stderr unless ``quiet``, in red on terminals or with ``FORCE_COLOR``, without ``NO_COLOR``."""
     wanted = sys.stderr.isatty() or os.environ.get("FORCE_COLOR")
-    colored = not quiet and bool(wanted) and not os.environ.get("NO_COLOR")
+    colored = not (quiet or _as_json.get()) and bool(wanted) and not os.environ.get("NO_COLOR")
     with suppress(OSError):
         print("\033[31m" * colored, end="", file=sys.stderr)
-        say(f"gsmerge: warning: {text}", quiet=quiet)
+        say(text, kind="warning", quiet=quiet)
         print("\033[0m" * colored, end="", file=sys.stderr, flush=True)
 
 
@@ -107,10 +120,10 @@ def plain_warnings() -> Iterator[None]:
 
     def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         if not issubclass(category, RuntimeWarning):
-            say(f"gsmerge: warning: {message}")
+            say(str(message), kind="warning")
             return
         if not numbers:
-            say(f"note: some numbers are too large, or undefined ({message})")
+            say(f"some numbers are too large, or undefined ({message})", kind="note")
         numbers.append(str(message))
 
     with warnings.catch_warnings():
@@ -155,15 +168,20 @@ def _print_event(event: Mapping[str, Any]) -> None:
 
 def _print_stages() -> Progress:
     """Return a progress that prints each event with the seconds since the first one, and those left."""
-    from gsmerge.runtime.time_left import TimeLeft
+    from gsmerge.runtime.record import current_forecast
+    from gsmerge.runtime.time_left import Forecast
 
-    times = TimeLeft()
+    own, most = Forecast(), 0.0
 
     def move(text: str, done: int, total: int) -> None:
+        nonlocal most
         stage, _, detail = one_line(text).partition(": ")
-        left = times.move(text, done, total)
-        share = None if left is None else round(times.seconds / max(times.seconds + left, 1e-9), 3)
-        seconds = {"seconds": round(times.seconds, 2), "seconds_left": None if left is None else round(left, 1)}
+        own.move(text, done, total)
+        forecast = current_forecast()
+        left = (own if forecast is None else forecast).seconds_left
+        most = most if left is None else max(most, own.seconds / max(own.seconds + left, 1e-9))
+        share = round(most, 3) if most or left is not None else None
+        seconds = {"seconds": round(own.seconds, 2), "seconds_left": None if left is None else round(left, 1)}
         _print_event({"stage": stage, "detail": detail, "done": done, "total": total, "share": share, **seconds})
 
     return move
@@ -185,7 +203,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     from rich import progress as rich
     from rich.table import Column
 
-    from gsmerge.runtime.record import STAGES
+    from gsmerge.runtime.time_left import STAGES
 
     class TimeLeft(rich.ProgressColumn):
         max_refresh = 0.5
@@ -244,21 +262,25 @@ def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
 def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     """Show one bar for many runs on stderr, with the time left, and the last failure below it.
 
-    Without a terminal it prints a line for each run. Yields ``(name, status, done, failure, num_failed) -> None``;
-    ``failure`` is empty after a run that succeeded.
+    Without a terminal it prints a line for each run. Yields ``(name, status, done, failure, num_failed, share) ->
+    None``; ``failure`` is empty after a run that succeeded, and ``share`` of what there is to do is done, from 0 to 1.
     """
     if _as_json.get():
+        start = time.monotonic()
 
-        def print_event(name: str, status: str, done: int, failure: str, num_failed: int) -> None:
+        def print_event(name: str, status: str, done: int, failure: str, num_failed: int, share: float) -> None:
+            seconds = time.monotonic() - start
+            left = seconds * (1 - share) / share if share > 0 else None
             event = {"scene": name, "status": status, "done": done, "total": total, "failed": num_failed}
-            _print_event({**event, "error": failure or None})
+            times = {"seconds": round(seconds, 2), "seconds_left": None if left is None else round(left, 1)}
+            _print_event({**event, "error": failure or None, "share": round(share, 3), **times})
 
         yield print_event
         return
     console = _terminal(quiet=quiet)
     if console is None:
 
-        def print_run(name: str, status: str, done: int, failure: str, num_failed: int) -> None:
+        def print_run(name: str, status: str, done: int, failure: str, num_failed: int, _: float) -> None:
             text = _run_text(name, status, failure, num_failed)
             say(f"{done}/{total} {text}{f': {failure}' if failure else ''}", quiet=quiet)
 
@@ -277,7 +299,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     with Live(Group(bars, last), console=console, transient=True, refresh_per_second=5):
         task = bars.add_task("", total=total)
 
-        def move(name: str, status: str, done: int, failure: str, num_failed: int) -> None:
+        def move(name: str, status: str, done: int, failure: str, num_failed: int, _: float) -> None:
             bars.update(task, completed=done, description=one_line(_run_text(name, status, failure, num_failed)))
             if failure:
                 last.plain = one_line(f"last failure: {failure}")

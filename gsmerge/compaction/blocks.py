@@ -11,6 +11,7 @@ import numpy as np
 from gsmerge.alignment.registration.join import concat_scenes
 from gsmerge.budget import file_size
 from gsmerge.compaction.file_size import drop_to_bytes, measure_rest
+from gsmerge.compaction.forecast import AFTER, BEFORE, fit_cost
 from gsmerge.compaction.partition import (
     Block,
     Covisibility,
@@ -36,8 +37,19 @@ from gsmerge.raster.photos import Photos, blank_photos
 from gsmerge.raster.tiled_view import Splats
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages, make_array, peak_memory
-from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
+from gsmerge.runtime.record import (
+    Record,
+    add_seconds,
+    begin_part,
+    choose,
+    current_record,
+    expect_parts,
+    note,
+    record_part,
+    stage,
+)
 from gsmerge.runtime.threads import in_turn
+from gsmerge.runtime.time_left import Part
 from gsmerge.runtime.work import start_work
 from gsmerge.settings.budget import parse_share, share_text
 from gsmerge.settings.compact import CompactOptions
@@ -97,6 +109,7 @@ def compact_in_blocks(
                 free_scene(scene)
                 yield piece, block, seen, piece_options, frame
 
+        expect_parts(block_parts(scene, choices, blocks))
         parts = [part for part, _ in adopt_records(work.run("merge", start_part, count, pieces()))]
         with stage("join"):
             joined = Gaussians.concat([part.gaussians for part in parts])
@@ -133,6 +146,17 @@ def compact_in_blocks(
     return CompactResult(result, join_reports(scene, result, parts, scores, options), scene.cameras).to(device)
 
 
+def block_parts(scene: Scene, choices: SceneChoices, blocks: Sequence[Block]) -> list[Part]:
+    """Return the costs of a run in blocks, whose fits take as many steps as they have views."""
+    pixels, steps = scene.pixels_per_view, 0 if choices.fit.fit == "none" else choices.fit.steps
+    shares = [len(block.views) / len(scene) for block in blocks]
+    merges, scores = ([Part(cost * pixels * len(scene) * share) for share in shares] for cost in (BEFORE, AFTER))
+    count = choices.limits.default
+    fits = [Part(0, fit_cost(round(steps * share), pixels, count * share)) for share in shares]
+    seams = Part(0, fit_cost(max(SEAM_STEPS, SEAM_LOOKS * len(scene)), pixels, count))
+    return [*merges, *fits, *[seams] * (steps > 0), *scores]
+
+
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
     """Yield each value with the choices of its record; add the seconds and notes to the current record."""
     for value, record in outcomes:
@@ -158,6 +182,7 @@ def start_part(
     piece: Scene, block: Block, covisibility: Covisibility, options: CompactOptions, frame: Frame
 ) -> BlockStart:
     """Merge the views of a block, and keep the start Gaussians that belong to the block."""
+    begin_part()
     prepared = prepare(piece, options.prepare, frame)
     plan = make_plan(prepared, options)
     decoded = start(prepared, plan, plan.limits.count)
@@ -203,6 +228,7 @@ def fit_part(part: BlockStart, everything: tuple[Gaussians, np.ndarray], growth:
     ``everything``: canonical Gaussians of all blocks, and the block of each. ``growth``: final number of Gaussians
     divided by the number at the start.
     """
+    begin_part()
     (joined, owners), scene, plan = everything, part.prepared.scene, part.plan
     used = owners == number
     if plan.fit.fit != "none":
@@ -218,6 +244,7 @@ def fit_part(part: BlockStart, everything: tuple[Gaussians, np.ndarray], growth:
 
 def score_part(part: BlockStart, gaussians: Gaussians, _: int) -> Scores:
     """Measure the PSNR (dB) of the whole result on a block's scored photos, and what :class:`Besides` lists."""
+    begin_part()
     measured = measure_result(gaussians, part.prepared, part.plan)
     psnr = None if measured is None else measured.psnr
     return psnr, measure_besides(part.before, gaussians, part.prepared, part.plan)
@@ -232,6 +259,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[BlockStart]
     plan = next((part.plan for part in parts if part.plan.fit.fit != "none"), None)
     if plan is None:
         return joined
+    begin_part()
     with stage("join"):
         at_seam, views = find_seams(joined, owners, parts)
         if not any(views):

@@ -15,8 +15,9 @@ import numpy as np
 
 from gsmerge.arguments import check_arguments
 from gsmerge.compaction.file_size import meet_bytes
+from gsmerge.compaction.forecast import Coming
 from gsmerge.compaction.methods import Method, choose_method
-from gsmerge.compaction.new_views import try_new_views
+from gsmerge.compaction.new_views import trial_part, try_new_views
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import add_target, build_left_out, level_counts, meet, search_count
 from gsmerge.errors import DoubtWarning
@@ -26,7 +27,17 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan, choose_for_scene, make_plan, note_engine, note_surplus
-from gsmerge.runtime.record import Progress, Record, add_seconds, adopt, choose, note, record_part, record_run
+from gsmerge.runtime.record import (
+    Progress,
+    Record,
+    add_seconds,
+    adopt,
+    begin_part,
+    choose,
+    note,
+    record_part,
+    record_run,
+)
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
 from gsmerge.settings.compact import CompactOptions
@@ -110,24 +121,30 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
         add_seconds(candidate.record.seconds)  # beside those of the search
         return candidate
 
-    search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
+    coming = Coming(prepared, plan, trial_part(prepared, plan))
+    search = search_count(prepared, plan, method.build, coming)  # one count, or counts until a quality is met
     if search.left_out is None:
         uncleaned = replace(plan, clean=CleanOptions()) if plan.cleans_last else plan
-        search.run(partial(build_scored, method.build, prepared, uncleaned))
+        search.run(partial(build_scored, method.build, prepared, uncleaned), coming)
         best = clean_last(search.best, prepared, plan)
     else:
-        search.run(partial(build_left_out, method.build, search.left_out, search.left_out.plan(plan)))
+        search.run(partial(build_left_out, method.build, search.left_out, search.left_out.plan(plan)), coming)
+        coming.expect_builds(search.count)
         best = rebuild(search.count)
     best = meet_bytes(best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
-    levels = [build_scored(method.build, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
+    counts = level_counts(len(best.gaussians), plan)
+    coming.expect_end(counts)
+    levels = [build_scored(method.build, *fixed, count) for count in counts]
     trial = try_new_views(prepared, plan, method.build, len(best.gaussians))
+    begin_part()
     return make_result(best, levels, prepared, plan, search.facts(best), trial)
 
 
 @record_part()
 def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
     """Build ``count`` Gaussians with a method, clean them up as the plan says, and score them."""
+    begin_part()
     return score(count, build_cleaned(build, prepared, plan, count), prepared, plan)
 
 

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from gsmerge.compaction.forecast import AFTER, BEFORE, fit_cost
 from gsmerge.compaction.left_out import LEAST_SEEN, LeftOut, can_leave_out, choose_views, leave_out, mean_seen
 from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.arrays import ExpectedScores
@@ -18,7 +19,8 @@ from gsmerge.kernels.elementary import power
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import shrink_pictures
-from gsmerge.runtime.record import add_seconds, record_part
+from gsmerge.runtime.record import add_seconds, begin_part, record_part
+from gsmerge.runtime.time_left import Part
 from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
 from gsmerge.types import PicturedScene, Pixels
@@ -73,6 +75,26 @@ class Trial:
         return NewViews(before, after, low, high, self.views)  # as files say it
 
 
+def trial_part(prepared: Prepared, plan: Plan) -> Part | None:
+    """Return the cost of the trial on views that are left out; None where there is none."""
+    if not _has_trial(prepared, plan):
+        return None
+    scene, num_rounds = prepared.scene, len(choose_views(prepared.reference.score_views))
+    pixels = scene.pixels_per_view / _shrinking(scene) ** 2
+    fits = fit_cost(min(STEPS, plan.fit.steps), pixels, USUAL * pixels * len(scene))
+    before, after = (num_rounds * each * pixels * len(scene) for each in (BEFORE, AFTER))
+    return Part(before, num_rounds * fits, after, num_rounds)
+
+
+def _has_trial(prepared: Prepared, plan: Plan) -> bool:
+    return plan.new_views and prepared.agreement is not None and can_leave_out(prepared)
+
+
+def _shrinking(scene: PicturedScene) -> int:
+    """Return how many times smaller the pictures of the trial are."""
+    return max(1, max(scene.cameras.width, scene.cameras.height) // SIDE)
+
+
 def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> Trial | None:
     """Try what views gain that a fit of ``count`` Gaussians leaves out.
 
@@ -81,11 +103,11 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     """
     scene = prepared.scene
     pixels = scene.pixels_per_view * len(scene)
-    known = prepared.agreement is not None and count <= MOST_SHARE * pixels
-    if not (plan.new_views and known and can_leave_out(prepared)):
+    if not _has_trial(prepared, plan) or count > MOST_SHARE * pixels:
         return None
+    begin_part()
     with record_part(silent=True) as record:
-        small = shrink_scene(scene, max(1, max(scene.cameras.width, scene.cameras.height) // SIDE))
+        small = shrink_scene(scene, _shrinking(scene))
         share = min(1.0, USUAL * float(power(count / (USUAL * pixels), LESS)))
         rounds = [leave_out(small, views, prepared) for views in choose_views(prepared.reference.score_views)]
         scores = [_score_round(left_out, small, plan, build, share) for left_out in rounds if left_out is not None]

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsmerge.budget import LEVEL_FACTOR
+from gsmerge.compaction.forecast import USUALLY, Coming
 from gsmerge.compaction.left_out import (
     LEAST_SEEN,
     LEAST_VIEWS,
@@ -32,7 +33,7 @@ from gsmerge.pipeline import Build
 from gsmerge.plan import KEPT_LOSS, Plan
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
-from gsmerge.runtime.record import choose, current_record, note, record_part, report_progress, stage
+from gsmerge.runtime.record import begin_part, choose, current_record, note, record_part, report_progress, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.segment import knee_count
@@ -92,9 +93,19 @@ class CountSearch:
     most: int | None = None  # Gaussians from which on photos that are left out gain nothing; None: as the plan allows
     candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
-    def run(self, build: Callable[[int | None], Candidate]) -> None:
-        """Build a candidate for each count that the search chooses."""
-        self.candidates = meet(build, build(self.first), self.choose_next)
+    def run(self, build: Callable[[int | None], Candidate], coming: Coming | None = None) -> None:
+        """Build a candidate for each count that the search chooses, of which as many are expected as is usual."""
+        done = 0
+
+        def build_next(count: int | None) -> Candidate:
+            nonlocal done
+            if coming is not None:  # renders mostly are as good as asked for at once; photos that are left out, not
+                tries = 1 if self.plan.target_psnr is None or self.rendered > done else max(1, USUALLY - done)
+                coming.expect_builds(count, tries=tries, again=self.left_out is not None)
+            done += 1
+            return build(count)
+
+        self.candidates = meet(build_next, build_next(self.first), self.choose_next)
 
     def choose_next(self, candidates: Sequence[Candidate]) -> int | None:
         """Choose the next count by the candidates built so far; None ends the search."""
@@ -194,14 +205,14 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
     return replace(plan, before=before, target_psnr=psnr - KEPT_LOSS)
 
 
-def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
-    """Start a search for the number of Gaussians."""
+def search_count(prepared: Prepared, plan: Plan, build: Build, coming: Coming | None = None) -> CountSearch:
+    """Start a search for the number of Gaussians, and forecast its curve, if it measures one."""
     limits, left_out = plan.limits, leave_out_judges(prepared, plan)
     agreement, most = prepared.agreement, limits.max_count
     if left_out is not None and agreement is not None:
         most = max(limits.min_count, min(most, int(agreement.share * limits.num_pixels)))
     if plan.target_psnr is None:
-        return CountSearch(plan, choose_count(prepared, plan, build, left_out, most))
+        return CountSearch(plan, choose_count(prepared, plan, build, left_out, most, coming))
     first = min(max(limits.default, limits.min_count), most)
     return CountSearch(plan, first, prepared.reference.name == RENDERS, left_out, most)
 
@@ -231,13 +242,16 @@ def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | Non
     It has as many of the Gaussians as the rest has of the views.
     """
     assert count is not None
+    begin_part()
     fitted = build(left_out.rest, plan, left_out.reduce(count))
     with stage("score"):
         psnr = mean_seen(left_out.score(fitted.gaussians), left_out.shares)
     return Candidate(count, fitted, fitted.gaussians, fitted.cameras, psnr, current_record(), psnr)
 
 
-def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None, most: int) -> int | None:
+def choose_count(
+    prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None, most: int, coming: Coming | None
+) -> int | None:
     """Choose the number of Gaussians by the budget or the scene's curve; None: ``superpixels`` and K decide.
 
     ``left_out``: photos that judge the curve; ``most``: Gaussians that are tried.
@@ -249,7 +263,10 @@ def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut
         return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, most)
-        points = measure_curve(prepared, plan, build, SHORT if drop is None else LONG, counts, left_out)
+        steps = SHORT if drop is None else LONG
+        if coming is not None:
+            coming.expect_curve(counts, steps, limits.default)
+        points = measure_curve(prepared, plan, build, steps, counts, left_out)
     choose(curve=[asdict(point) for point in points])
     return curve_knee(points) if drop is None else count_within(points, drop)
 
@@ -277,6 +294,7 @@ def measure_curve(
     points: list[CurvePoint] = []
     report_progress(TRIED, 0, len(counts))
     for count in counts:
+        begin_part()
         with record_part(silent=True):
             gaussians = build(prepared, quick, left_out.reduce(count) if left_out else count).gaussians
         points.append(_point(count, gaussians, photos, weights, min_gain))

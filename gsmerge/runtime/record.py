@@ -8,22 +8,19 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any
 
 from gsmerge.runtime.memory import release_memory
+from gsmerge.runtime.time_left import STAGES, Forecast, Part
 
 Progress = Callable[[str, int, int], None]
 NAMED = 4  # items that a note lists
 # stages that leave much behind that was freed in other threads
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
-STAGES = (
-    "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
-    "cover", "decode", "join", "fit", "prune", "fill", "score", "input",
-)  # fmt: skip
 
 
 @dataclass
@@ -35,6 +32,7 @@ class Record:
     choices: dict[str, Any] = field(default_factory=dict)  # What the stages decided
     notes: list[str] = field(default_factory=list)  # Warnings and adaptations, one sentence each
     running: str | None = None  # The stage that is being timed
+    forecast: Forecast = field(default_factory=Forecast)  # Of the whole run, which its parts share
 
 
 _current: ContextVar[Record | None] = ContextVar("record", default=None)
@@ -53,6 +51,12 @@ def current_record() -> Record:
     return _current.get() or Record()
 
 
+def current_forecast() -> Forecast | None:
+    """Return the forecast of the current run; None outside of any run."""
+    record = _current.get()
+    return None if record is None else record.forecast
+
+
 @contextmanager
 def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[Record]:
     """Start a separate record for a part of the current run; ``silent``: do not report its progress.
@@ -62,7 +66,7 @@ def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[R
     progress = None if silent else current_record().progress
     if progress is not None and title is not None:
         progress = _titled(progress, title)
-    with _write_to(Record(progress)) as record:
+    with _write_to(Record(progress, forecast=current_record().forecast)) as record:
         yield record
 
 
@@ -131,8 +135,19 @@ def adopt(part: Record) -> None:
     record.notes += [text for text in part.notes if text not in record.notes]
 
 
+def expect_parts(parts: Iterable[Part]) -> None:
+    """Expect parts of the current run after the one of now, in place of those that were expected before."""
+    current_record().forecast.expect(parts)
+
+
+def begin_part() -> None:
+    """Begin the next of the parts that the current run expects."""
+    current_record().forecast.begin()
+
+
 def report_progress(text: str, done: int, total: int) -> None:
     """Report progress of a stage, or of a step as ``"stage: detail"``, to the caller of the current run."""
-    progress = current_record().progress
-    if progress is not None:
-        progress(text, done, total)
+    record = current_record()
+    record.forecast.move(text, done, total)
+    if record.progress is not None:
+        record.progress(text, done, total)

@@ -1,54 +1,127 @@
-"""Seconds that a run still takes, by the progress that it reports."""
+"""Seconds that a run still takes, by the parts that it expects and the progress that it reports."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from gsmerge.runtime.record import STAGES
+STAGES = (
+    "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
+    "cover", "decode", "join", "fit", "prune", "fill", "score", "input",
+)  # fmt: skip
+FIT = "fit"
 
-# Steps of a fit that take as long as all that follows it: scores, and in a run of many steps the trial on left-out
-# views, whose own steps are always as many
-AFTER, AFTER_FEW, MANY = 70, 5, 160
+
+@dataclass(frozen=True)
+class Part:
+    """Cost of a part of a run: of what comes before its fits, of the fits, and of what comes after them.
+
+    Costs are in any unit, since only their ratios matter: the run itself says how long they take.
+    """
+
+    before: float = 0.0
+    fit: float = 0.0  # all its fits
+    after: float = 0.0
+    num_fits: int = 1
 
 
 @dataclass
-class TimeLeft:
-    """The seconds left of one run: known once steps of its fit, or of a stage that counts them, were seen to take time.
+class Forecast:
+    """Seconds left of a run, whose parts are expected with their costs; how long costs take is measured.
 
-    Searches and blocks run several fits, of which only the one that runs is counted.
+    Fits and all other stages are measured apart, as their costs have little to do with each other. Nothing is known
+    before the first steps of a fit. What has no parts, such as drawing pictures, is forecast by the steps it counts.
     """
 
     clock: Callable[[], float] = time.monotonic
     start: float = field(init=False)
-    end: float | None = field(init=False, default=None)  # when the run is expected to end
-    _stage: str = field(init=False, default="")
-    _first: tuple[float, int] | None = field(init=False, default=None)  # time and number of the stage's first step
+    _parts: list[Part] = field(init=False, default_factory=list)  # still to come
+    _part: Part | None = field(init=False, default=None)  # of now
+    _begun: float = field(init=False, default=0.0)  # when the part, or what follows its fits, began
+    _share: float = field(init=False, default=0.0)  # of the part's fits that is done
+    _step: int | None = field(init=False, default=None)  # of the fit that runs now, the last one
+    _fit: int = field(init=False, default=-1)  # of the part, counted from 0
+    _last: float = field(init=False)  # when something was reported last
+    _seconds: dict[bool, float] = field(init=False)  # of fits (True), and of all other stages, as measured
+    _costs: dict[bool, float] = field(init=False)  # done in these seconds
+    _counted: tuple[str, float, int] | None = field(init=False, default=None)  # a stage, time and number of a step
+    _end: float | None = field(init=False, default=None)  # expected, of what has no parts
 
     def __post_init__(self) -> None:
-        self.start = self.clock()
+        self.start = self._last = self.clock()
+        self._seconds, self._costs = {True: 0.0, False: 0.0}, {True: 0.0, False: 0.0}
 
     @property
     def seconds(self) -> float:
         """Seconds since the run began."""
         return self.clock() - self.start
 
-    def move(self, text: str, done: int, total: int) -> float | None:
-        """Take what a run reports, and return its seconds left; None where they are not known yet."""
-        stage, _, detail = text.partition(": ")
-        now = self.clock()
-        if stage != self._stage:
-            self._stage, self._first = stage, None
-            self.end = now if stage == "done" else self.end if stage in STAGES else None
-        if detail or (stage not in STAGES and total > 0):
-            self._count(now, done, total)
-        return None if self.end is None else max(0.0, self.end - now)
+    def expect(self, parts: Iterable[Part]) -> None:
+        """Expect parts after the one of now, in place of those that were expected before."""
+        self._parts = list(parts)
 
-    def _count(self, now: float, done: int, total: int) -> None:
-        """Expect the end by the time that each step took since the stage's first one."""
-        time_before, done_before = self._first = self._first or (now, done)
-        if done > done_before:
-            after = 0 if self._stage != "fit" else AFTER if total >= MANY else AFTER_FEW
-            step = (now - time_before) / (done - done_before)
-            self.end = now + step * (max(0, total - done) + after)
+    def begin(self) -> None:
+        """Begin the next of the expected parts."""
+        if self._part is None:  # what came before has no cost
+            self._last = self.clock()
+        else:
+            self._spend(is_fit=False)
+            self._costs[False] += self._part.after + (0.0 if self._share else self._part.before)
+        self._part, self._share, self._step = self._parts.pop(0) if self._parts else None, 0.0, None
+        self._fit = -1
+        self._begun = self.clock()
+
+    def move(self, text: str, done: int, total: int) -> None:
+        """Take what a run reports: a stage, or a step as ``"stage: detail"``."""
+        stage, _, detail = text.partition(": ")
+        if stage == "done":
+            self._parts, self._part, self._end = [], Part(), self.clock()
+        elif self._part is not None and self._part.fit and stage == FIT and detail:
+            self._take_step(self._part, done, total)
+        else:
+            if self._step is not None:  # the fits have ended
+                self._begun, self._step = self.clock(), None
+            self._spend(is_fit=False)
+            self._count(stage, done, total, is_step=bool(detail) or (stage not in STAGES and total > 0))
+
+    def _take_step(self, part: Part, done: int, total: int) -> None:
+        is_next = self._step is not None and done >= self._step
+        if self._fit < 0:
+            self._costs[False] += part.before
+        self._spend(is_fit=is_next)
+        self._fit += not is_next
+        share = min(1.0, (self._fit + done / max(total, 1)) / part.num_fits)
+        if is_next:
+            self._costs[True] += max(0.0, share - self._share) * part.fit
+        self._share, self._step = max(share, self._share), done
+
+    def _spend(self, *, is_fit: bool) -> None:
+        now = self.clock()
+        self._seconds[is_fit] += now - self._last
+        self._last = now
+
+    def _count(self, stage: str, done: int, total: int, *, is_step: bool) -> None:
+        """Expect the end of what has no parts by the time that each step took since the stage's first one."""
+        now = self.clock()
+        if self._counted is None or self._counted[0] != stage:
+            self._end, self._counted = None, (stage, now, done) if is_step else None
+        elif is_step and done > self._counted[2]:
+            _, time_before, done_before = self._counted
+            self._end = now + (now - time_before) / (done - done_before) * max(0, total - done)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds until the run ends; None where they are not known yet."""
+        if self._part is None:
+            return None if self._end is None else max(0.0, self._end - self.clock())
+        part, coming = self._part, self._parts
+        fits = part.fit * (1 - self._share) + sum(each.fit for each in coming)
+        if fits and not self._costs[True]:
+            return None
+        rates = {kind: self._seconds[kind] / cost if cost else 0.0 for kind, cost in self._costs.items()}
+        fit_rate, rate = rates[True], rates[False] or rates[True]
+        now = part.after if self._share else part.before + part.after
+        spent = self.clock() - self._begun if self._step is None else 0.0
+        others = rate * sum(each.before + each.after for each in coming)
+        return fit_rate * fits + max(0.0, rate * now - spent) + others

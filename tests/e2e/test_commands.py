@@ -210,16 +210,34 @@ def test_shell_completion(
 
 @pytest.mark.parametrize("words", [("--progress", "json", "compact"), ("compact", "--progress=json")])
 def test_progress_is_lines_of_json(words: tuple[str, ...], small_scene: Path, tmp_path: Path, run: Run) -> None:
-    """Wherever the option stands, and whatever is quiet; notes are no JSON."""
-    call = (*words, small_scene, "-o", tmp_path / "a.ply", "--effort", "draft")
+    """Wherever the option stands, and whatever is quiet; of levels, every fit counts."""
+    call = (*words, small_scene, "-o", tmp_path / "a.ply", "--effort", "draft", "--levels", "2")
     outcome = run(*call, "--quiet", code=0)
     events = [json.loads(line) for line in outcome.err.splitlines()]
     assert [event["stage"] for event in events][-1] == "done"
     assert all(list(event) == list(events[0]) for event in events)
     assert any(event["stage"] == "fit" and event["seconds_left"] is not None for event in events)
-    assert events[-1]["share"] == 1
+    shares = [event["share"] or 0 for event in events]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1
+    first = next(event for event in events if event["stage"] == "score")  # of the first of two results
+    assert first["share"] < 0.95
     seconds = [event["seconds"] for event in events]
     assert seconds == sorted(seconds)
+
+
+def test_notes_warnings_and_errors_are_lines_of_the_same_stream(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    """Each an object of one key; without the option they are lines of text."""
+    bare = tmp_path / "bare.ply"
+    bare.write_bytes((small_scene / "scene.ply").read_bytes())
+    outcome = run("compact", bare, "--effort", "draft", "--progress", "json", code=0)
+    events = [json.loads(line) for line in outcome.err.splitlines()]
+    assert any("note" in event for event in events)
+    assert all("stage" in event or len(event) == 1 for event in events)
+    for words, code in ((("compact", tmp_path / "none.ply"), 3), (("compact", bare, "--effort", "soon"), 2)):
+        (line,) = run(*words, "--progress", "json", code=code).err.splitlines()
+        assert list(json.loads(line)) == ["error"]
+        assert run(*words, code=code).err.startswith("gsmerge: error: ")
 
 
 def test_progress_of_a_batch_names_scenes(
@@ -229,8 +247,9 @@ def test_progress_of_a_batch_names_scenes(
     (tmp_path / "bad.ply").write_bytes(b"ply")
     outcome = run("batch", small_scene, tmp_path / "bad.ply", "-o", tmp_path / "out", "--effort", "draft", "--progress",
                   "json", code=5)  # fmt: skip
-    lines = [line for line in outcome.err.splitlines() if line.startswith("{")]
-    done = [json.loads(line) for line in lines]
+    events = [json.loads(line) for line in outcome.err.splitlines()]
+    done = [event for event in events if "done" in event]
+    assert [list(event) for event in events if event not in done] == [["status"], ["error"]]
     assert [event["done"] for event in done] == [1, 2]
     assert [event["total"] for event in done] == [2, 2]
     assert sum(event["error"] is None for event in done) == 1

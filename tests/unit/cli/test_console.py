@@ -83,9 +83,9 @@ def test_bars_end_full(monkeypatch: pytest.MonkeyPatch, columns: str, bar: int) 
 def test_the_last_failure_stands_below_the_bar_of_a_batch() -> None:
     why = "scenes/room/scene.ply: truncated " + "or damaged " * 20
     with redirect_stderr(Terminal()) as terminal, total_progress(3, quiet=False) as progress:
-        progress("kitchen", "done", 1, "", 0)
-        progress("room", "failed", 2, why, 1)
-        progress("garden", "done", 3, "", 1)
+        progress("kitchen", "done", 1, "", 0, 0.3)
+        progress("room", "failed", 2, why, 1, 0.6)
+        progress("garden", "done", 3, "", 1, 1.0)
     lines = terminal.lines()
     bars = [line for line in lines if re.search(r"\d/3 ", line)]
     assert all(len(line) < 100 for line in lines)
@@ -98,26 +98,29 @@ def test_the_last_failure_stands_below_the_bar_of_a_batch() -> None:
 
 def test_without_a_terminal_each_run_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     with total_progress(2, quiet=False) as progress:
-        progress("room", "failed", 1, "no photos", 1)
-        progress("garden", "done", 2, "", 1)
+        progress("room", "failed", 1, "no photos", 1, 0.5)
+        progress("garden", "done", 2, "", 1, 1.0)
     assert capsys.readouterr().err == "1/2 room failed: no photos\n2/2 garden done, 1 failed\n"
 
 
 def test_runs_as_events_have_their_names_whole(capsys: pytest.CaptureFixture[str]) -> None:
     """Also after others have failed, and with a space in them."""
     with json_progress(), total_progress(2, quiet=True) as progress:
-        progress("my room", "failed", 1, "no photos", 1)
-        progress("garden", "done", 2, "", 1)
+        progress("my room", "failed", 1, "no photos", 1, 0.25)
+        progress("garden", "done", 2, "", 1, 1.0)
     events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert [(event["scene"], event["status"], event["error"]) for event in events] == [
         ("my room", "failed", "no photos"), ("garden", "done", None),
     ]  # fmt: skip
     assert [event["failed"] for event in events] == [1, 1]
+    assert events[0]["seconds_left"] == pytest.approx(3 * events[0]["seconds"], abs=0.1)
+    assert [event["share"] for event in events] == [0.25, 1.0]
+    assert events[1]["seconds_left"] == 0
 
 
 def test_brackets_in_names_are_no_markup_in_bars() -> None:
     with redirect_stderr(Terminal()) as terminal, total_progress(2, quiet=False) as progress:
-        progress("z[/b]", "done", 2, "", 0)
+        progress("z[/b]", "done", 2, "", 0, 1.0)
     assert "z[/b] done" in terminal.getvalue()
     with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as move:
         move("[/b]: z[/b]", 1, 2)

@@ -1,0 +1,75 @@
+"""Parts of a run and their costs, by which its seconds left are forecast.
+
+The unit is a pixel of a photo that a step of a fit draws, which takes .06 microseconds of one processor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gsmerge.budget import LEVEL_FACTOR
+from gsmerge.facts.prepare import Prepared
+from gsmerge.pipeline import POWERS
+from gsmerge.plan import Plan
+from gsmerge.runtime.record import expect_parts
+from gsmerge.runtime.time_left import Part
+
+# Costs as measured on three captures
+GAUSSIAN = 12  # of a Gaussian of the result, in a step
+BEFORE, AFTER = 6, 3  # of a pixel of all views: of superpixels to Gaussians; of pruning, filling and scores
+INPUT = 8  # of a pixel of a view in which the input is scored
+PAIRS = 45  # of a Gaussian of a scene whose neighbours are merged pair by pair
+PLACED_PIXELS = 1 << 18  # of a view that is placed, at most
+USUALLY = 3  # counts that a search builds
+
+
+@dataclass(frozen=True, eq=False)
+class Coming:
+    """What a run of a plan has yet to do."""
+
+    prepared: Prepared
+    plan: Plan
+    trial: Part | None  # on views that are left out
+
+    def expect_curve(self, counts: Sequence[int], steps: int, default: int) -> None:
+        """Expect a curve of short fits with so many ``counts``, and then the usual result."""
+        curve = [build_part(self.prepared, self.plan, count, steps=steps) for count in counts]
+        expect_parts([*curve, build_part(self.prepared, self.plan, default), *self._end(self._levels)])
+
+    def expect_builds(self, count: int | None, *, tries: int = 1, again: bool = False) -> None:
+        """Expect ``tries`` builds of a count, perhaps one of them ``again``, and what follows a result."""
+        build = build_part(self.prepared, self.plan, count)
+        expect_parts([*[build] * (tries + again), *self._end(self._levels)])
+
+    def expect_end(self, levels: Sequence[int]) -> None:
+        """Expect what follows a result: ``levels`` of detail of so many Gaussians, a trial, the scores of the input."""
+        expect_parts(self._end(levels))
+
+    @property
+    def _levels(self) -> list[int]:
+        return [self.plan.limits.default // LEVEL_FACTOR**level for level in range(1, self.plan.levels)]
+
+    def _end(self, levels: Sequence[int]) -> list[Part]:
+        scored = self.prepared.scene.pixels_per_view * len(self.plan.scored_views)
+        coarser = [build_part(self.prepared, self.plan, count) for count in levels]
+        return [*coarser, *([] if self.trial is None else [self.trial]), Part(INPUT * scored)]
+
+
+def build_part(prepared: Prepared, plan: Plan, count: int | None, *, steps: int | None = None) -> Part:
+    """Return the cost of building ``count`` Gaussians with a fit of so many ``steps``; None: as the plan says."""
+    scene = prepared.scene
+    steps = (0 if plan.fit.fit == "none" else plan.fit.steps) if steps is None else steps
+    number = min(len(scene.gaussians), plan.limits.default if count is None else count)
+    pixels, every = scene.pixels_per_view, scene.pixels_per_view * len(scene)
+    before, after, num_fits = BEFORE * every, AFTER * every, 1
+    if plan.merges_pairs:
+        before, after = PAIRS * len(scene.gaussians), 0
+        if prepared.reference.placed:
+            pixels, num_fits = min(len(scene.gaussians), PLACED_PIXELS), len(POWERS)
+    return Part(before, num_fits * fit_cost(steps, pixels, number), after, num_fits)
+
+
+def fit_cost(steps: int, pixels: float, count: float) -> float:
+    """Return the cost of ``steps`` on views of so many ``pixels``, with ``count`` Gaussians."""
+    return steps * (pixels + GAUSSIAN * count)
