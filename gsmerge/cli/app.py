@@ -17,7 +17,7 @@ import typer
 
 from gsmerge import __version__
 from gsmerge.cli import INTERRUPTED, stop_at_once
-from gsmerge.cli.console import json_progress, plain_warnings, say
+from gsmerge.cli.console import JsonLines, json_progress, plain_warnings, say
 from gsmerge.cli.usage import LAB, LOOK, PROGRAM, Command, Group, UsageErrors, expand_home, usage_message
 from gsmerge.errors import (
     DAMAGED_OPENCV,
@@ -269,8 +269,10 @@ def run(args: Sequence[str] | None = None) -> int:
             say(message, kind="error")
         return code
 
+    lines = JsonLines()
+
     def in_style() -> AbstractContextManager[None]:
-        return json_progress() if styles == [STYLES[1]] else nullcontext()
+        return json_progress(lines) if styles == [STYLES[1]] else nullcontext()
 
     signals: list[signal.Signals] = []
 

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 Progress = Callable[[str, int, int], None]
@@ -25,7 +26,36 @@ SHORT = 5  # seconds: what is left is shown from so many on
 NARROW = 60  # columns below which bars are short and say less
 OPENING = "start ..."  # on a terminal until a command has its first line or bar
 
-_as_json: ContextVar[bool] = ContextVar("as_json", default=False)  # whether progress is lines of JSON
+
+@dataclass
+class JsonLines:
+    """Lines of JSON on stderr: when they began, and how far the run is, as a share and in seconds left."""
+
+    start: float = field(default_factory=time.monotonic)
+    share: float | None = None
+    left: float | None = None
+
+    def print(self, event: Mapping[str, Any]) -> None:
+        """Print an event with the seconds since the start, and how far the run is."""
+        _erase_opening()
+        share, left = self.share, self.left
+        numbers = {"share": None if share is None else round(share, 3), "seconds": round(self.seconds, 2)}
+        numbers["seconds_left"] = None if left is None else round(left, 1)
+        with suppress(OSError):
+            print(json.dumps({**event, **numbers}), file=sys.stderr, flush=True)
+
+    def move(self, share: float | None, left: float | None) -> None:
+        """Take how far the run is; a share never goes back."""
+        self.share = share if self.share is None else max(self.share, share or 0.0)
+        self.left = left
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the start."""
+        return time.monotonic() - self.start
+
+
+_stream: ContextVar[JsonLines | None] = ContextVar("stream", default=None)  # of progress as lines of JSON
 _opening: list[str] = []  # what stands on the terminal's last line, to be erased
 
 
@@ -57,12 +87,13 @@ def _erase_opening() -> None:
 def say(message: str, *, kind: Kind = "status", quiet: bool = False) -> None:
     """Print one line on stderr unless ``quiet``, wrapped in a terminal; ignore a closed stderr.
 
-    Notes, warnings and errors begin with what they are. Beside progress as JSON, each is an object keyed by its kind.
+    Notes, warnings and errors begin with what they are. Beside progress as JSON, each is an object with that as a key.
     """
     if quiet:
         return
-    if _as_json.get():
-        _print_event({kind: one_line(message)})
+    stream = _stream.get()
+    if stream is not None:
+        stream.print({kind: one_line(message)})
         return
     from gsmerge.report import wrap_line
 
@@ -86,7 +117,7 @@ def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
 def say_warning(text: str, *, quiet: bool = False) -> None:
     """Print a warning on stderr unless ``quiet``, in red on terminals or with ``FORCE_COLOR``, without ``NO_COLOR``."""
     wanted = sys.stderr.isatty() or os.environ.get("FORCE_COLOR")
-    colored = not (quiet or _as_json.get()) and bool(wanted) and not os.environ.get("NO_COLOR")
+    colored = not (quiet or _stream.get()) and bool(wanted) and not os.environ.get("NO_COLOR")
     with suppress(OSError):
         print("\033[31m" * colored, end="", file=sys.stderr)
         say(text, kind="warning", quiet=quiet)
@@ -151,38 +182,28 @@ def _bar(console: Any) -> Any:
 
 
 @contextmanager
-def json_progress() -> Iterator[None]:
-    """Print progress in the block as lines of JSON on stderr, whatever else is quiet."""
-    token = _as_json.set(True)
+def json_progress(lines: JsonLines | None = None) -> Iterator[None]:
+    """Print progress in the block as lines of JSON on stderr, whatever else is quiet; continue ``lines`` if given."""
+    token = _stream.set(lines or JsonLines())
     try:
         yield
     finally:
-        _as_json.reset(token)
+        _stream.reset(token)
 
 
-def _print_event(event: Mapping[str, Any]) -> None:
-    _erase_opening()
-    with suppress(OSError):
-        print(json.dumps(event), file=sys.stderr, flush=True)
-
-
-def _print_stages() -> Progress:
-    """Return a progress that prints each event with the seconds since the first one, and those left."""
+def _print_stages(stream: JsonLines) -> Progress:
+    """Return a progress that prints each event with how far the run is."""
     from gsmerge.runtime.record import current_forecast
     from gsmerge.runtime.time_left import Forecast
 
-    own, most = Forecast(), 0.0
+    own = Forecast()
 
     def move(text: str, done: int, total: int) -> None:
-        nonlocal most
         stage, _, detail = one_line(text).partition(": ")
         own.move(text, done, total)
-        forecast = current_forecast()
-        left = (own if forecast is None else forecast).seconds_left
-        most = most if left is None else max(most, own.seconds / max(own.seconds + left, 1e-9))
-        share = round(most, 3) if most or left is not None else None
-        seconds = {"seconds": round(own.seconds, 2), "seconds_left": None if left is None else round(left, 1)}
-        _print_event({"stage": stage, "detail": detail, "done": done, "total": total, "share": share, **seconds})
+        left = (current_forecast() or own).seconds_left
+        stream.move(None if left is None else stream.seconds / max(stream.seconds + left, 1e-9), left)
+        stream.print({"stage": stage, "detail": detail, "done": done, "total": total})
 
     return move
 
@@ -193,8 +214,9 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
 
     Yields ``(stage, done, total) -> None``; a stage is done when the next one begins.
     """
-    if _as_json.get():
-        yield _print_stages()
+    stream = _stream.get()
+    if stream is not None:
+        yield _print_stages(stream)
         return
     console = _terminal(quiet=quiet)
     if console is None:
@@ -265,15 +287,15 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     Without a terminal it prints a line for each run. Yields ``(name, status, done, failure, num_failed, share) ->
     None``; ``failure`` is empty after a run that succeeded, and ``share`` of what there is to do is done, from 0 to 1.
     """
-    if _as_json.get():
+    stream = _stream.get()
+    if stream is not None:
         start = time.monotonic()
 
         def print_event(name: str, status: str, done: int, failure: str, num_failed: int, share: float) -> None:
             seconds = time.monotonic() - start
-            left = seconds * (1 - share) / share if share > 0 else None
+            stream.move(share, seconds * (1 - share) / share if share > 0 else None)
             event = {"scene": name, "status": status, "done": done, "total": total, "failed": num_failed}
-            times = {"seconds": round(seconds, 2), "seconds_left": None if left is None else round(left, 1)}
-            _print_event({**event, "error": failure or None, "share": round(share, 3), **times})
+            stream.print({**event, "error": failure or None})
 
         yield print_event
         return
