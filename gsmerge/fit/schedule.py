@@ -22,8 +22,8 @@ CUTS = (0.0, 0.15, 0.3, 0.5, 0.7)
 CLEARS = (0.6, 0.7, 0.8)  # and those after which faint Gaussians are dropped from runs that grow
 FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
 MANY_STEPS = 150
-# The first steps draw a sample of each photo's pixels, another one each time that they come back to it. It costs as
-# much as a photo of half the size, and shows details that this one has lost.
+# Most of the first steps draw a sample of each photo's pixels, another one each time that they come back to it. It
+# costs as much as a photo of half the size, and shows details that this one has lost.
 STRIDE = 2
 OFFSETS = ((0, 0), (1, 1), (1, 0), (0, 1))  # of the samples, columns and rows, in turn
 SAMPLED_STEPS = 30  # shorter runs see too little of what samples leave out: .07 dB less at 20, 1 dB at 7
@@ -34,14 +34,16 @@ LARGE_STEPS = (0, 2)  # of every five, look at larger photos; with more of them 
 PROBE = 6  # steps that are timed to keep to a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
-# How the steps after those draw, in turn: whether at half size, the low-pass as a share of the viewers' own, and
+# How steps draw, in turn: whether at half size, the low-pass as a share of the viewers' own, and
 # whether small Gaussians are made clearer by what it adds to them. Some viewers do that, enlarged
 # twice the low-pass is a quarter, and from afar it covers more of the scene: what was fitted to one way alone looks
-# thin or fat in the others (Mip-Splatting, Yu et al. 2024).
+# thin or fat in the others (Mip-Splatting, Yu et al. 2024). The first steps too look from near and from afar, since
+# they find the sizes of the Gaussians.
+FIRST_MODES = (0, 1.0, False), (0, 0.25, False), (0, 1.0, False), (1, 1.0, False)
 DRAW_MODES = (
     (0, 1.0, True), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
     (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (0, 1.0, False),
-    (0, 1.0, True), (1, 1.0, False), (0, 0.25, False), (0, 1.0, False),
+    (0, 1.0, True), (0, 1.0, False), (0, 0.25, False), (0, 1.0, False),
     (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
 )  # fmt: skip
 
@@ -92,8 +94,8 @@ class FitRun:
     # size not 0 on held-out patches, and larger photos count everywhere
     step_weights: tuple[list[np.ndarray], ...]
     dropout: float  # Share of the Gaussians that a step leaves out
-    half_part: float  # Share of the steps, the first ones, that draw samples of the photos
-    samples: bool = True  # Whether they do; otherwise they draw photos of half the size
+    half_part: float  # Share of the steps, the first ones, that draw a quarter of the pixels
+    samples: bool = True  # Whether most draw samples of the photos; otherwise all draw photos of half the size
     # [h,w] bool of each photo at full size: the pixels that count in the first steps; None: those of the others
     first_pixels: tuple[np.ndarray, ...] | None = None
 
@@ -114,20 +116,21 @@ class FitRun:
     def draw_mode(self, step: int, progress: float) -> DrawMode:
         """Return how step ``step`` (from 1) draws the scene.
 
-        Samples of the photos come first, then whole ones, drawn in turn in the ways of different viewers. Larger photos
-        in between show what an enlarged view shows.
+        Samples of the photos come first, then whole ones, both drawn in turn in the ways of different viewers. Larger
+        photos in between show what an enlarged view shows.
         """
-        photos = self.job.photos
-        if progress < self.half_part:
-            return DrawMode(0, photos[0].eps2d, stride=STRIDE) if self.samples else DrawMode(1, photos[1].eps2d)
-        if len(photos) > 2 and step % 5 in LARGE_STEPS:
+        photos, first = self.job.photos, progress < self.half_part
+        if first and not self.samples:
+            return DrawMode(1, photos[1].eps2d)
+        if not first and len(photos) > 2 and step % 5 in LARGE_STEPS:
             return DrawMode(2, photos[2].eps2d)
-        size, share, antialiased = DRAW_MODES[step % len(DRAW_MODES)]
+        modes = FIRST_MODES if first else DRAW_MODES
+        size, share, antialiased = modes[step % len(modes)]
         # From afar costs short runs more than it gains; beside larger photos, which are for looking
         # closely, every third such look is enough
         if not self.job.options.grows or (len(photos) > 2 and step % 3):
             size = 0
-        return DrawMode(size, share * photos[0].eps2d, antialiased)
+        return DrawMode(size, share * photos[0].eps2d, antialiased, STRIDE if first and size == 0 else 1)
 
 
 def begins(parts: Sequence[float], before: float, now: float) -> bool:
@@ -204,6 +207,7 @@ class Schedule:
     def __init__(self, run: FitRun):
         self.run, self.rng = run, np.random.default_rng(run.job.seed)
         self.queue: list[int] = []
+        self.turns = list(range(len(run.job.photos[0])))  # of the samples of each view, to begin in different ones
 
     def draw(self, number: int, progress: float, count: int) -> Step:
         """Draw step ``number`` (from 1) for ``count`` Gaussians; every view comes once per round."""
@@ -215,8 +219,10 @@ class Schedule:
             background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
             kept = self.rng.random(count, dtype=np.float32) >= self.run.dropout
-        mode, turn = self.run.draw_mode(number, progress), (number - 1) // len(job.photos[0]) + view
-        sample = WHOLE_PHOTO if mode.stride == 1 else Sample(mode.stride, *OFFSETS[turn % len(OFFSETS)])
+        mode, sample = self.run.draw_mode(number, progress), WHOLE_PHOTO
+        if mode.stride > 1:
+            sample = Sample(mode.stride, *OFFSETS[self.turns[view] % len(OFFSETS)])
+            self.turns[view] += 1
         return Step(number, progress, mode, view, background, kept, sample)
 
 

@@ -87,8 +87,8 @@ class FitOptions(Settings):
     dropout: float | None = setting(None, "Share of the Gaussians that a step leaves out.",
         "By default 0.1 for at most five views and at least 150 steps, 0.05 from 600 steps and 30 looks at each view "
         "on, otherwise 0.", least=0, below=1)  # fmt: skip
-    half_res_share: float | None = setting(None, "Share of the steps, the first ones, that draw every second pixel of "
-        "every second row.", "By default 0.7, from 600 steps on 0.5, below 20 all; less for more than 4.4 % of the "
+    half_res_share: float | None = setting(None, "Share of the steps, the first ones, that draw a quarter of the "
+        "pixels.", "By default 0.7, from 600 steps on 0.5, below 20 all; less for more than 4.4 % of the "
         "Gaussians.", least=0, most=1)  # fmt: skip
     holdout: float = setting(0.05, "Share of the photos' patches that decides whether a fit is accepted.", above=0,
         below=1)  # fmt: skip

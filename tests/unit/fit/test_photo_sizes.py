@@ -154,12 +154,13 @@ def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
     options = FitOptions(fit_steps=200, photo_scale=2)
     run = prepare_fit(FitJob(fit_photos(with_large(scene, 2), options), options))
     modes = [run.draw_mode(step + 1, step / 200) for step in range(200)]
-    assert [mode.stride for mode in modes] == [2] * 140 + [1] * 60
+    assert [mode.stride for mode in modes] == [2 if mode.size == 0 else 1 for mode in modes[:140]] + [1] * 60
+    assert [mode.size for mode in modes[:140]].count(1) == 12
     sizes = [mode.size for mode in modes[140:]]
-    assert [sizes.count(size) for size in (1, 0, 2)] == [2, 34, 24]
+    assert [sizes.count(size) for size in (1, 0, 2)] == [1, 35, 24]
     usual = prepare_fit(FitJob(scenes.pair_of(scene), options))
     sizes = [usual.draw_mode(step + 1, step / 200).size for step in range(200)]
-    assert [sizes[140:].count(size) for size in (0, 1)] == [49, 11]
+    assert [sizes[140:].count(size) for size in (0, 1)] == [52, 8]
 
 
 def test_the_users_share_of_half_size_steps_stays(scene: Scene) -> None:
