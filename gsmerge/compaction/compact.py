@@ -15,7 +15,7 @@ import numpy as np
 
 from gsmerge.arguments import check_arguments
 from gsmerge.compaction.file_size import meet_bytes
-from gsmerge.compaction.forecast import Coming
+from gsmerge.compaction.forecast import RunForecast
 from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import trial_part, try_new_views
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
@@ -121,20 +121,20 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
         add_seconds(candidate.record.seconds)  # beside those of the search
         return candidate
 
-    coming = Coming(prepared, plan, trial_part(prepared, plan))
-    search = search_count(prepared, plan, method.build, coming)  # one count, or counts until a quality is met
+    forecast = RunForecast(prepared, plan, trial_part(prepared, plan))
+    search = search_count(prepared, plan, method.build, forecast)  # one count, or counts until a quality is met
     if search.left_out is None:
         uncleaned = replace(plan, clean=CleanOptions()) if plan.cleans_last else plan
-        search.run(partial(build_scored, method.build, prepared, uncleaned), coming)
+        search.run(partial(build_scored, method.build, prepared, uncleaned), forecast)
         best = clean_last(search.best, prepared, plan)
     else:
-        search.run(partial(build_left_out, method.build, search.left_out, search.left_out.plan(plan)), coming)
-        coming.expect_builds(search.count)
+        search.run(partial(build_left_out, method.build, search.left_out, search.left_out.plan(plan)), forecast)
+        forecast.expect_builds(search.count)
         best = rebuild(search.count)
     best = meet_bytes(best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     counts = level_counts(len(best.gaussians), plan)
-    coming.expect_end(counts)
+    forecast.expect_end(counts)
     levels = [build_scored(method.build, *fixed, count) for count in counts]
     trial = try_new_views(prepared, plan, method.build, len(best.gaussians))
     begin_part()

@@ -21,11 +21,11 @@ BEFORE, AFTER = 6, 3  # of a pixel of all views: of superpixels to Gaussians; of
 INPUT = 8  # of a pixel of a view in which the input is scored
 PAIRS = 45  # of a Gaussian of a scene whose neighbours are merged pair by pair
 PLACED_PIXELS = 1 << 18  # of a view that is placed, at most
-USUALLY = 3  # counts that a search builds
+USUAL_TRIES = 3  # counts that a search builds
 
 
 @dataclass(frozen=True, eq=False)
-class Coming:
+class RunForecast:
     """What a run of a plan has yet to do."""
 
     prepared: Prepared

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsmerge.budget import LEVEL_FACTOR
-from gsmerge.compaction.forecast import USUALLY, Coming
+from gsmerge.compaction.forecast import USUAL_TRIES, RunForecast
 from gsmerge.compaction.left_out import (
     LEAST_SEEN,
     LEAST_VIEWS,
@@ -93,15 +93,15 @@ class CountSearch:
     most: int | None = None  # Gaussians from which on photos that are left out gain nothing; None: as the plan allows
     candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
-    def run(self, build: Callable[[int | None], Candidate], coming: Coming | None = None) -> None:
+    def run(self, build: Callable[[int | None], Candidate], forecast: RunForecast | None = None) -> None:
         """Build a candidate for each count that the search chooses, of which as many are expected as is usual."""
         done = 0
 
         def build_next(count: int | None) -> Candidate:
             nonlocal done
-            if coming is not None:  # renders mostly are as good as asked for at once; photos that are left out, not
-                tries = 1 if self.plan.target_psnr is None or self.rendered > done else max(1, USUALLY - done)
-                coming.expect_builds(count, tries=tries, again=self.left_out is not None)
+            if forecast is not None:  # renders mostly are as good as asked for at once; photos that are left out, not
+                tries = 1 if self.plan.target_psnr is None or self.rendered > done else max(1, USUAL_TRIES - done)
+                forecast.expect_builds(count, tries=tries, again=self.left_out is not None)
             done += 1
             return build(count)
 
@@ -205,14 +205,14 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
     return replace(plan, before=before, target_psnr=psnr - KEPT_LOSS)
 
 
-def search_count(prepared: Prepared, plan: Plan, build: Build, coming: Coming | None = None) -> CountSearch:
+def search_count(prepared: Prepared, plan: Plan, build: Build, forecast: RunForecast | None = None) -> CountSearch:
     """Start a search for the number of Gaussians, and forecast its curve, if it measures one."""
     limits, left_out = plan.limits, leave_out_judges(prepared, plan)
     agreement, most = prepared.agreement, limits.max_count
     if left_out is not None and agreement is not None:
         most = max(limits.min_count, min(most, int(agreement.share * limits.num_pixels)))
     if plan.target_psnr is None:
-        return CountSearch(plan, choose_count(prepared, plan, build, left_out, most, coming))
+        return CountSearch(plan, choose_count(prepared, plan, build, left_out, most, forecast))
     first = min(max(limits.default, limits.min_count), most)
     return CountSearch(plan, first, prepared.reference.name == RENDERS, left_out, most)
 
@@ -250,7 +250,7 @@ def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | Non
 
 
 def choose_count(
-    prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None, most: int, coming: Coming | None
+    prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None, most: int, forecast: RunForecast | None
 ) -> int | None:
     """Choose the number of Gaussians by the budget or the scene's curve; None: ``superpixels`` and K decide.
 
@@ -264,8 +264,8 @@ def choose_count(
     with stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, most)
         steps = SHORT if drop is None else LONG
-        if coming is not None:
-            coming.expect_curve(counts, steps, limits.default)
+        if forecast is not None:
+            forecast.expect_curve(counts, steps, limits.default)
         points = measure_curve(prepared, plan, build, steps, counts, left_out)
     choose(curve=[asdict(point) for point in points])
     return curve_knee(points) if drop is None else count_within(points, drop)
