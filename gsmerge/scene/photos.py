@@ -279,6 +279,8 @@ def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[Camer
     Returns their cameras and photos, and a note on the others.
     """
     paths = [None if photo is None else proposal.pool[photo] for photo in proposal.named]
+    if not any(paths):
+        return None
     stored = zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)
     sizes = [size if path is None else image_size(path) for path, size in zip(paths, stored, strict=True)]
     usual = Counter(size for size, path in zip(sizes, paths, strict=True) if path is not None).most_common(1)[0][0]

@@ -16,6 +16,7 @@ from messages import names
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
+from gsmerge.errors import SceneError
 from gsmerge.scene.read import Loaded, load_scene
 
 VIEWS = 4
@@ -182,6 +183,18 @@ def test_one_photo_of_another_shape(folder: Path, truth: np.ndarray, sizes: str)
     assert loaded.left_out is not None
     assert names(loaded.left_out, "1 of 4 views", path.name)
     assert not any("without a camera" in note for note in loaded.notes)
+
+
+def test_photos_that_no_camera_names_beside_rows_of_nothing(folder: Path) -> None:
+    """Are refused with the reason why the cameras are."""
+    name_frames(folder, lambda view, name: f"elsewhere/{view}.png")
+    photos_in(folder)[0].unlink()
+    data = PlyData.read(str(folder / "scene.ply"), mmap=False)
+    data["vertex"].data = data["vertex"].data[:50]
+    data["vertex"].data["z"] += 1e6
+    data.write(str(folder / "scene.ply"))
+    with pytest.raises(SceneError):
+        load_scene(folder, cameras=folder / "transforms.json", images=folder / "images")
 
 
 @pytest.mark.parametrize("view", [0, 2, 3])
