@@ -113,8 +113,10 @@ def match_masks(folder: Path, names: Sequence[str], option: str = "--masks") -> 
     by_ending = _by_ending(folder, files)
     masks = [_lookup(folder, by_ending, name, option) for name in names]
     if not any(masks):
-        problem = f"expected masks named as the photos, such as {PurePath(names[0]).stem}.png, found none of them"
-        raise SceneError(folder, problem, f"rename them, or name another folder with {option}")
+        rename = "none of them", f"rename them, or name another folder with {option}"
+        what, remedy = (None if files else _find_unread(walk_files(folder))) or rename
+        problem = f"expected masks named as the photos, such as {PurePath(names[0]).stem}.png, found {what}"
+        raise SceneError(folder, problem, remedy)
     unused = [file.relative_to(folder).as_posix() for file in files if file not in masks]
     some = ", ".join(unused[:3]) + ", ..." * (len(unused) > 3)
     note = f"{option.removeprefix('--')}: {len(unused)} of {folder} have the name of no photo: {some}"

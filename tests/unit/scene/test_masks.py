@@ -13,6 +13,7 @@ from messages import refuses
 from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
+from gsmerge.io.image_names import match_masks
 from gsmerge.facts.views import subset
 from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.scene.read import load_scene, read_scene
@@ -93,6 +94,12 @@ def test_bars_around_photos_are_cut_off(tiny_folder: Path, tiny: Tiny) -> None:
     load = load_scene(tiny_folder)
     assert np.array_equal((load.scene.images * 255).round(), tiny.images)
     assert "the photos of 20 x 21 have bars around pictures of 20 x 14: they are cut off" in load.notes
+
+
+def test_a_folder_of_masks_in_a_format_that_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "0.tga").write_bytes(b"")
+    with refuses(SceneError, tmp_path, "0.png", "1 .tga", "convert"):
+        match_masks(tmp_path, ["0.jpg"])
 
 
 def test_masks_of_many_bits_and_of_transparency(tmp_path: Path) -> None:
