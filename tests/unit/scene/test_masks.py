@@ -13,8 +13,8 @@ from messages import refuses
 from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
-from gsmerge.io.image_names import match_masks
 from gsmerge.facts.views import subset
+from gsmerge.io.image_names import match_masks
 from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.scene.read import load_scene, read_scene
 
