@@ -122,7 +122,9 @@ class FitRun:
         photos, first = self.job.photos, progress < self.half_part
         if first and not self.samples:
             return DrawMode(1, photos[1].eps2d)
-        if not first and len(photos) > 2 and step % 5 in LARGE_STEPS:
+        if len(photos) > 2 and first:  # from near the larger ones show it
+            return DrawMode(0, photos[0].eps2d, stride=STRIDE)
+        if len(photos) > 2 and step % 5 in LARGE_STEPS:
             return DrawMode(2, photos[2].eps2d)
         modes = FIRST_MODES if first else DRAW_MODES
         size, share, antialiased = modes[step % len(modes)]

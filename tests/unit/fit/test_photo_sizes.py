@@ -16,7 +16,7 @@ from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions, fit, fit_photos
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale
-from gsmerge.fit.schedule import affordable_steps, prepare_fit
+from gsmerge.fit.schedule import DrawMode, affordable_steps, prepare_fit
 from gsmerge.geometry import project
 from gsmerge.raster.photos import EPS2D, MASKED, score_photos
 from gsmerge.runtime.record import record_run
@@ -154,8 +154,8 @@ def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
     options = FitOptions(fit_steps=200, photo_scale=2)
     run = prepare_fit(FitJob(fit_photos(with_large(scene, 2), options), options))
     modes = [run.draw_mode(step + 1, step / 200) for step in range(200)]
-    assert [mode.stride for mode in modes] == [2 if mode.size == 0 else 1 for mode in modes[:140]] + [1] * 60
-    assert [mode.size for mode in modes[:140]].count(1) == 12
+    assert [mode.stride for mode in modes] == [2] * 140 + [1] * 60
+    assert set(modes[:140]) == {DrawMode(0, EPS2D, stride=2)}
     sizes = [mode.size for mode in modes[140:]]
     assert [sizes.count(size) for size in (1, 0, 2)] == [1, 35, 24]
     usual = prepare_fit(FitJob(scenes.pair_of(scene), options))
