@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.errors import UsageError
+from gsmerge.facts.holes import usual_opacity
 from gsmerge.facts.views import take_rows
 from gsmerge.frame import canonicalise
 from gsmerge.geometry import Region, rgb_to_sh0, turn_by
@@ -58,7 +59,7 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
 
 
 def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:
-    """Return a mask ``[v,h,w]`` of the pixels that show Gaussians of the mask ``rows [n]`` more than others."""
+    """Return a mask ``[v,h,w]`` of the pixels that show Gaussians of the mask ``rows [n]`` more than all else."""
     canonical, _ = canonicalise(scene)
     colors = np.ones((len(rows), 1, 3), np.float32)  # what is inside; all
     colors[~rows, :, 0] = 0
@@ -70,7 +71,9 @@ def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:
                     gaussians,
                     canonical.cameras,
                     at_once=threads,
-                    convert=lambda image: image[..., 0] > MOSTLY * image[..., 1],
+                    convert=lambda image: (
+                        image[..., 0] > MOSTLY * np.maximum(image[..., 1], usual_opacity(image[..., 1]))
+                    ),
                 )
             )
         )

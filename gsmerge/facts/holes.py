@@ -50,12 +50,15 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
 
     ``shown [v,h,w]``: pixels whose picture says what is there. The new Gaussians follow the others. None is added where
     most of the pixels are empty: the scene may be a part of what the photos show. Large connected parts of a view
-    without Gaussians stay empty, unless ``everywhere``: the scene was cut out, or its model left out the sky.
+    without Gaussians stay empty, unless ``everywhere``: the scene was cut out, or its model left out the sky. Of a
+    cropped scene all stays empty that it does not cover.
     """
-    fronts = scene.get_pixels().fronts
+    fronts, is_cropped = scene.get_pixels().fronts, scene.region is not None
     free, bare = shown & (fronts < 0), (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)
     gaps = [
-        view for view in range(len(scene)) if free[view].any() or (not everywhere and large_parts(bare[view]).any())
+        view
+        for view in range(len(scene))
+        if is_cropped or free[view].any() or (not everywhere and large_parts(bare[view]).any())
     ]
     if not gaps:
         return scene
@@ -65,11 +68,14 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     def find(view: int, tiled: TiledView) -> None:
         depths, left = blend_depths(tiled)
         covered = left <= 1 - EMPTY
-        if not everywhere:
-            opacity = 1 - left
-            usual = (opacity * opacity).sum() / max(float(opacity.sum()), 1e-6)  # mean where there is something to see
-            sparse = blur(opacity, gap / 4) < SPARSE * usual  # single Gaussians at the edges of what was cut out
-            empty[view] = large_parts((opacity < NOTHING * usual) & sparse)
+        opacity = 1 - left
+        nothing = opacity < NOTHING * usual_opacity(opacity)
+        if is_cropped:
+            beside = np.ones((3, 3), np.uint8)  # no Gaussian ends between two pixels
+            empty[view] = cv2.erode((nothing & ~shown[view]).astype(np.uint8), beside) > 0
+        elif not everywhere:
+            sparse = blur(opacity, gap / 4) < SPARSE * usual_opacity(opacity)  # at the edges of what was cut out
+            empty[view] = large_parts(nothing & sparse)
         bare[view] = ~covered & ~empty[view]
         holes[view] = free[view] & bare[view]
         if empty[view].any():  # the edges of what was cut out are no holes
@@ -86,6 +92,11 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     return _leave_empty(filled, empty)
 
 
+def usual_opacity(opacity: np.ndarray) -> float:
+    """Return the mean of a picture's opacities where there is something to see: that weighted by themselves."""
+    return float((opacity * opacity).sum() / max(float(opacity.sum()), 1e-6))
+
+
 @dataclass(frozen=True, eq=False)
 class _Edges:
     """Depths in a view around its n holes."""
@@ -98,9 +109,14 @@ def _add_holes(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edg
     """Add Gaussians to a scene in the ``holes [v,h,w]`` of views with ``edges``, with a note."""
     views = sorted(edges)
     added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), views))
-    note(f"{len(added):,} pixels that Gaussians hardly cover, or not at all, get the colours of their pictures")
     holes[[view for view in range(len(scene)) if view not in edges]] = False
-    return fill_pixels(scene, added, np.flatnonzero(holes))
+    places = np.flatnonzero(holes)
+    if scene.region is not None:
+        inside = scene.region.contains(added.means)
+        added, places = added[inside], places[inside]
+    if len(places):
+        note(f"{len(added):,} pixels that Gaussians hardly cover, or not at all, get the colours of their pictures")
+    return fill_pixels(scene, added, places)
 
 
 def large_parts(empty: np.ndarray) -> np.ndarray:

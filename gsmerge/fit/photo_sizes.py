@@ -106,18 +106,34 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
 
 
 def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.ndarray:
-    """Return the training weights ``[h,w]`` float32 of one view; see :func:`training_weights`."""
+    """Return the training weights ``[h,w]`` float32 of one view; see :func:`training_weights`.
+
+    Of patches in which the photo counts somewhere at least one is held out.
+    """
     size = max(1, min(PATCH, min(photos.height, photos.width) // 4))
     rows, columns = -(-photos.height // size), -(-photos.width // size)
     random = np.random.default_rng([seed, view])
-    patches = random.random((rows, columns)) < share
-    if not patches.any():
-        patches[random.integers(rows), random.integers(columns)] = rows * columns > 1
+    counting = np.ones((rows, columns), bool) if photos.weights is None else _counting_patches(photos, view, size)
+    patches = (random.random((rows, columns)) < share) & counting
+    if counting.any() and not patches.any():
+        places = np.argwhere(counting)
+        chosen = (random.integers(rows), random.integers(columns)) if counting.all() else random.choice(places)
+        patches[tuple(chosen)] = len(places) > 1
     full = np.repeat(np.repeat(~patches, size, 0), size, 1)[: photos.height, : photos.width]
     if photos.weights is None:
         return full.astype(np.float32)
     weights = photos.weights[view]
     return np.where(weights == 1, full.astype(np.float32), np.maximum(weights, HIDDEN))
+
+
+def _counting_patches(photos: Photos, view: int, size: int) -> np.ndarray:
+    """Return a mask ``[r,c]`` of the patches in which the photo counts fully somewhere, and shows the scene."""
+    assert photos.weights is not None
+    counts = photos.weights[view] == 1
+    if photos.empty is not None:
+        counts &= photos.empty[view] == 0
+    rows, columns = (np.arange(0, side, size) for side in counts.shape)
+    return np.asarray(np.logical_or.reduceat(np.logical_or.reduceat(counts, rows, 0), columns, 1))
 
 
 def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:

@@ -15,10 +15,10 @@ from gsmerge import Gaussians, Scene, compact
 from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions, fit, fit_photos
 from gsmerge.fit.full import fit_full
-from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale
+from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale, training_weights
 from gsmerge.fit.schedule import DrawMode, affordable_steps, prepare_fit
 from gsmerge.geometry import project
-from gsmerge.raster.photos import EPS2D, MASKED, score_photos
+from gsmerge.raster.photos import EPS2D, MASKED, scene_photos, score_photos
 from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import LargePhotos, PicturedScene
@@ -218,3 +218,19 @@ def test_a_run_says_at_what_scale_it_looked(scene: Scene) -> None:
     report = compact(with_large(scene, 2), superpixels="10%", fit_steps=30, photo_scale=1).report
     assert "photo_scale" not in report.choices
     assert not [note for note in report.notes if "photo_scale" in note]
+
+
+def test_what_is_held_out_is_what_counts(scene: Scene) -> None:
+    """Of a small part, at least one patch of each view; none of what is to stay empty."""
+    photos = scene_photos(scene)
+    weights = np.full((len(photos), photos.height, photos.width), MASKED, np.float32)
+    weights[:, 16:28, 16:28] = 1
+    empty = np.zeros_like(weights)
+    empty[:, :, :20] = 1
+    for seed in range(20):
+        cut_out = replace(photos, weights=np.maximum(weights, empty), empty=empty)
+        parts = (replace(photos, weights=weights), weights == 1), (cut_out, weights * (1 - empty) == 1)
+        for part, counts in parts:
+            for view, weight in enumerate(training_weights(part, 0.02, seed)):
+                held_out = weight == 0
+                assert 0 < (held_out & counts[view]).sum() < counts[view].sum()

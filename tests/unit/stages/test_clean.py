@@ -160,6 +160,9 @@ def test_what_the_cropped_scene_shows_opaque_stays_opaque(shape: str) -> None:
     shown, fitted = (render(some, scene.cameras, background=0.0) for some in (inside.gaussians, result.gaussians))
     opaque = shown.alphas[..., 0] > 0.98
     assert (fitted.alphas[..., 0][opaque] < 0.5).mean() < 0.005
+    clear = shown.alphas[..., 0] < 0.02  # not what the photos show behind
+    assert (fitted.alphas[..., 0][clear] > 0.6).sum() < 0.02 * opaque.sum()
+    assert fitted.alphas[..., 0][clear].mean() < 0.02
     assert inside.images is not None
     assert decibels(np.square(fitted.images - inside.images)[opaque & inside.masks].mean()) > 30
 
