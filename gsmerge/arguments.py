@@ -15,6 +15,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 KINDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "None": ("", lambda value: value is None),
     "StrPath": ("a path", lambda value: isinstance(value, str | os.PathLike)),
+    "int": ("a whole number", lambda value: hasattr(value, "__index__") and not isinstance(value, bool)),
     "Progress": ("a function", callable),
     "OnImage": ("a function", callable),
     "HasGaussians": ("a result", lambda value: hasattr(value, "gaussians")),

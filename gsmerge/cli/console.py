@@ -17,9 +17,9 @@ from typing import Any, Literal
 Progress = Callable[[str, int, int], None]
 RunProgress = Callable[[str, str, int, str, int, float], None]  # see total_progress
 
-Kind = Literal["status", "note", "warning", "error"]  # of a line on stderr
+Kind = Literal["info", "note", "warning", "error"]  # of a line on stderr
 STARTS: Mapping[Kind, str] = {
-    "status": "", "note": "note: ", "warning": "gsmerge: warning: ", "error": "gsmerge: error: ",
+    "info": "", "note": "note: ", "warning": "gsmerge: warning: ", "error": "gsmerge: error: ",
 }  # fmt: skip
 MAX_LINE = 5000  # characters
 SHORT = 5  # seconds: what is left is shown from so many on
@@ -84,7 +84,7 @@ def _erase_opening() -> None:
             print("\r" + " " * len(_opening.pop()), end="\r", file=sys.stderr, flush=True)
 
 
-def say(message: str, *, kind: Kind = "status", quiet: bool = False) -> None:
+def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
     """Print one line on stderr unless ``quiet``, wrapped in a terminal; ignore a closed stderr.
 
     Notes, warnings and errors begin with what they are. Beside progress as JSON, each is an object with that as a key.

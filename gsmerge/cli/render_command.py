@@ -31,8 +31,8 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_views(text: str) -> int | str:
-    """Parse ``--views``: a number, or the name of a view."""
-    if not re.fullmatch(r"[+-]?[\d.]+", text):
+    """Parse ``--views``: a number, or the name of a view; digits that begin with 0 are a name."""
+    if not re.fullmatch(r"[+-]?[\d.]+", text) or re.fullmatch(r"0\d+", text):
         return text
     count = int(text[:MAX_DIGITS]) if text.isdecimal() else 0
     if count < 1:
@@ -71,7 +71,7 @@ def parse_background(text: str) -> float | str:
         opt.option("frames", int, "Frames of a clip, 30 a second, or 12.5 of a GIF.",
                    wording="6 seconds of a turntable, else 4", min=2, max=100_000),
         opt.option("views", str, "Views at most, at equal intervals; or the name of one, which the picture of one "
-                   "scene shows alone.", metavar="NUMBER|NAME", parser=parse_views,
+                   "scene shows alone: 00006, or 6.jpg, as 6 is a number.", metavar="NUMBER|NAME", parser=parse_views,
                    wording="4 on a panel, else all; the first of a picture with alpha, opacity or depth"),
         opt.option("overlay", ("support",), "Colour what one view of the scene alone shows, and what none does: "
                    "yellow, red."),

@@ -145,7 +145,8 @@ def describe_unread(folder: Path, places: Sequence[str]) -> list[str]:
     """Describe in a note the pictures and films in a folder, and in those of its ``places``, that are not read."""
     for place in (*(folder / name for name in places), folder):
         with suppress(OSError):
-            unread = _find_unread([path for path in place.iterdir() if path.is_file()])
+            files = (path for path in place.iterdir() if path.is_file())
+            unread = _find_unread([path for path in files if path.suffix.lower() != ".gif"])  # which are clips
             if unread is not None:
                 return [f"{place} has {unread[0]}, which is not read: {unread[1]}"]
     return []

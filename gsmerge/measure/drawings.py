@@ -207,7 +207,8 @@ def prepare_panel(options: DrawOptions) -> Drawing:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         plain = options.overlay is None
         rows = view_pictures(parts, cameras[ids], shown, ids, scored=plain, background=options.grey)
-        outside = outside_pictures(parts, cameras, photos=shown is not None, background=options.grey)
+        around = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]  # not from inside
+        outside = outside_pictures(parts, around, photos=shown is not None, background=options.grey)
         yield contact_sheet([*rows, outside])
 
     facts = {"scenes": group.counts(), "views": ids, "photos": len(pictured) > 0, "notes": group.notes}

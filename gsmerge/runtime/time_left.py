@@ -117,11 +117,11 @@ class Forecast:
             return None if self._end is None else max(0.0, self._end - self.clock())
         part, later = self._part, self._parts
         fits = part.fit * (1 - self._share) + sum(each.fit for each in later)
-        if fits and not self._costs[True]:
-            return None
         rates = {kind: self._seconds[kind] / cost if cost else 0.0 for kind, cost in self._costs.items()}
         fit_rate, rate = rates[True], rates[False] or rates[True]
         now = part.after if self._share else part.before + part.after
+        others = sum(each.before + each.after for each in later)
+        if (fits and not fit_rate) or (now + others > 0 and not rate):
+            return None  # not measured yet
         spent = self.clock() - self._begun if self._step is None else 0.0
-        others = rate * sum(each.before + each.after for each in later)
-        return fit_rate * fits + max(0.0, rate * now - spent) + others
+        return fit_rate * fits + max(0.0, rate * now - spent) + rate * others

@@ -66,6 +66,7 @@ _USUAL_END = re.compile(
 )
 # what files are called that have a view or a part each
 _PARTS = {"view", "chunk", "part", "block", "tile"}
+_LEVEL = re.compile(r"\.level\d+(?=\.)")  # in the name of a level of detail, as :func:`level_output` makes it
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 _PACKED = {*SCENE_SUFFIXES} - {".ply", DEPTHS.ending}
 _MAX_HEADERS = 1_000  # of a folder that are read; the other files are taken for scenes
@@ -142,7 +143,7 @@ class SceneFiles:
         elif self.parts:
             notes.append(f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}")
         if self.above:
-            names = ", ".join(f"../{path.name}" for path in self.above)
+            names = " and ".join(map(str, self.above))
             remedy = "name that folder, or them by --images and --cameras"
             notes.append(f"not beside the scene but one folder above, and not read: {names}; {remedy}")
         return tuple(notes)
@@ -283,9 +284,10 @@ def scene_title(ply: Path) -> str:
 
 
 def result_cameras(ply: Path) -> Path | None:
-    """Find the cameras that ``compact`` wrote beside a result; None without them."""
-    beside = viewer_cameras_path(ply)
-    return beside if beside.is_file() else None
+    """Find the cameras that ``compact`` wrote beside a result, or one of its levels of detail; None without them."""
+    names = ply.name, _LEVEL.sub("", ply.name)
+    beside = (viewer_cameras_path(ply.with_name(name)) for name in names)
+    return next((path for path in beside if path.is_file()), None)
 
 
 def named_path(path: StrPath | None) -> Path | None:

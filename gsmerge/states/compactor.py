@@ -121,6 +121,7 @@ class Compactor:
         self._state, report = extend_state(self._state, as_scene(scene), self._settings, progress=progress)
         return report
 
+    @check_arguments
     def remove(self, number: int) -> None:
         """Take a batch out again; see :func:`gsmerge.states.remove.remove`.
 

@@ -250,7 +250,7 @@ def test_progress_of_a_batch_names_scenes(
                   "json", code=5)  # fmt: skip
     events = [json.loads(line) for line in outcome.err.splitlines()]
     done = [event for event in events if "done" in event]
-    assert [next(iter(event)) for event in events if event not in done] == ["status", "error"]
+    assert [next(iter(event)) for event in events if event not in done] == ["info", "error"]
     assert [event["done"] for event in done] == [1, 2]
     assert [event["total"] for event in done] == [2, 2]
     assert sum(event["error"] is None for event in done) == 1

@@ -186,7 +186,9 @@ def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason:
         plan_of(unaligned_scenes.without_order(replace(scene, images=None)), **settings)
 
 
-@pytest.mark.parametrize("settings", [{}, {"budget": "auto"}, {"effort": "draft"}, {"crop": "sphere:0,0,0,1"}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"budget": "auto"}, {"effort": "draft"}, {"crop": "sphere:0,0,0,1e4"}], ids=str
+)
 def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     kept = plan_of(rows, **settings)
