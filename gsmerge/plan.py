@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gsmerge.budget import FileSize, exact_count, file_size, max_allowed
 from gsmerge.errors import UsageError
 from gsmerge.facts.confirm_depths import FEWEST, Agreement
@@ -105,6 +107,8 @@ class Plan:
     free_poses: bool = False  # Whether cameras are asked to move, and not only where that is needed
     new_views: bool = False  # Whether the quality of new views is estimated
     before: PhotoScore | None = None  # Of the input, where photos and not pixels decide the count
+    # [h,w] bool of each scored view: the pixels that the input covers, where renders of it judge; None: nearly all
+    covered: tuple[np.ndarray, ...] | None = None
 
     @property
     def networks(self) -> NetworkWeights | None:

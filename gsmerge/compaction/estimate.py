@@ -64,9 +64,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
         machine has enough.
     """
-    num_input, (scene, *_) = scene.num_gaussians, without_repeats(scene)
     if options.clean.crop is not None:
         scene = crop_scene(scene.numpy(), options.clean.crop)
+    num_input, (scene, *_) = scene.num_gaussians, without_repeats(scene)
     size = measure_size(scene)
     if (options.budget.auto or options.budget.is_limit) and scene.has_own_pixels:
         options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))

@@ -199,9 +199,15 @@ def covers_all(before: PhotoScore | None) -> bool:
 
 @stage("score")
 def _fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
-    """Measure the mean PSNR (dB), at most 120, of canonical Gaussians against renders of the input."""
+    """Measure the mean PSNR (dB), at most 120, of canonical Gaussians against renders of the input, where it covers."""
+    measured = measure_renders(gaussians, prepared, plan)
+    return measured.psnr if plan.covered is None else measured.covered_psnr
+
+
+def measure_renders(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PhotoScore:
+    """Score canonical Gaussians against renders of the input in the scored views."""
     views = [prepared.repeated[view] for view in plan.scored_views] if prepared.repeated else plan.scored_views
-    return score_photos(gaussians, scene_photos(prepared.scene), views).psnr
+    return score_photos(gaussians, scene_photos(prepared.scene), views, covered=plan.covered)
 
 
 def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:

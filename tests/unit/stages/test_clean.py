@@ -167,6 +167,19 @@ def test_what_the_cropped_scene_shows_opaque_stays_opaque(shape: str) -> None:
     assert decibels(np.square(fitted.images - inside.images)[opaque & inside.masks].mean()) > 30
 
 
+def test_what_a_small_part_covers_decides_how_many_show_it() -> None:
+    """Without photos: of pictures that are mostly empty nearly every result is like its input."""
+    whole = scenes.make_scene(scenes.room(), scenes.arc(4, 96, 72), noise=0.01)
+    bare = replace(whole, images=None, pixels=None, masks=None)
+    crop = sphere_in(bare, 0.1)
+    inside = bare.gaussians[inside_crop(bare.gaussians.means, crop)]
+    result = compact(bare, crop=crop, effort="draft")
+    shown, merged = (render(some, whole.cameras, background=0.0) for some in (inside, result.gaussians))
+    covered = shown.alphas[..., 0] > 0.5
+    assert covered.mean() < 0.3
+    assert decibels(np.square(shown.images - merged.images)[covered].mean()) > 31  # of 32.5 on the scored views
+
+
 def test_a_crop_leaves_what_shows_it(scene: Scene) -> None:
     """Pixels count whose own Gaussian is inside, but for borders; without pixels the same photos count."""
     crop = sphere_in(scene, 0.5)
