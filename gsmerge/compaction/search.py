@@ -237,6 +237,8 @@ def leave_out_judges(prepared: Prepared, plan: Plan) -> LeftOut | None:
                 return left_out
     if prepared.reference.name == PHOTOS and not plan.auto_count:
         why = f"there are fewer than {LEAST_VIEWS} photos, or others see nothing of what these show"
+        if not prepared.scene.has_own_pixels:
+            why = "views have no Gaussians of their own, which could be left out with the photos"
         note(f"quality: judged by photos that the fit has seen, as {why}: new views look worse")
     return None
 
