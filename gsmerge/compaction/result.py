@@ -28,6 +28,7 @@ from gsmerge.raster.metrics import describe_distance, describe_loss
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE, PhotoScore, scene_photos, score_photos
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
+from gsmerge.stages.prune import ROUNDING
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath, to_float32
 
 if TYPE_CHECKING:
@@ -206,8 +207,17 @@ def _fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
 
 def measure_renders(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PhotoScore:
     """Score canonical Gaussians against renders of the input in the scored views."""
-    views = [prepared.repeated[view] for view in plan.scored_views] if prepared.repeated else plan.scored_views
-    return score_photos(gaussians, scene_photos(prepared.scene), views, covered=plan.covered)
+    return score_photos(gaussians, scene_photos(prepared.scene), _rendered_views(prepared, plan), covered=plan.covered)
+
+
+def may_leave_gaps(prepared: Prepared, plan: Plan) -> bool:
+    """Return whether renders of the input are black, as where it covers nothing, in more than a few scored pixels."""
+    pictures = (prepared.scene.images[view] for view in _rendered_views(prepared, plan))
+    return bool(np.mean([(picture.max(-1) > ROUNDING).mean() for picture in pictures]) < WHOLE)
+
+
+def _rendered_views(prepared: Prepared, plan: Plan) -> Sequence[int]:
+    return [prepared.repeated[view] for view in plan.scored_views] if prepared.repeated else plan.scored_views
 
 
 def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:

@@ -24,7 +24,7 @@ from gsmerge.compaction.left_out import (
     leave_out,
     mean_seen,
 )
-from gsmerge.compaction.result import Candidate, covers_all, measure_input, measure_renders
+from gsmerge.compaction.result import Candidate, covers_all, may_leave_gaps, measure_input, measure_renders
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import PHOTOS, RENDERS
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
@@ -200,7 +200,7 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
 
     Of renders of the input the pixels judge that it covers: any result looks like it where both are empty.
     """
-    if prepared.reference.name == RENDERS:
+    if prepared.reference.name == RENDERS and may_leave_gaps(prepared, plan):
         shown = measure_renders(prepared.scene.gaussians, prepared, plan)
         plan = plan if covers_all(shown) else replace(plan, covered=shown.covered)
     if not plan.keeps_input or plan.target_psnr is not None:
