@@ -39,7 +39,7 @@ LINE = 120  # characters of a line of the page
 WATCHED = {
     "gsmerge.scene.read": ("align",),
     "gsmerge.compaction.compact": ("make_plan", "make_result"),
-    "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene", "finish"),
+    "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene", "prune_and_fill"),
 }
 ZOOM, STRIP, GAP = 4, 22, 6  # of the picture: its pixels for each of a photo, for a title, between panels
 DARK, BORDER = 0.45, (255, 255, 255)  # how much of the photo is left under ellipses; colours are RGB
@@ -126,7 +126,7 @@ class Run:
     def written(self) -> int:
         """The first of these in the result: others are left out."""
         means = self.made["fit_scene"].gaussians.means[self.fitted]
-        of_result = [mean.tobytes() for mean in self.made["finish"].gaussians.means]
+        of_result = [mean.tobytes() for mean in self.made["prune_and_fill"].gaussians.means]
         return next(of_result.index(mean.tobytes()) for mean in means if mean.tobytes() in of_result)
 
 
@@ -346,7 +346,7 @@ def build_section(run: Run) -> str:
     size = int(np.diff(features.starts)[at])
     own = np.flatnonzero(matches.clusters == matches.clusters[at])
     faint = int((features.gains < 1).sum())
-    report, written = fitted.report, made["finish"].gaussians
+    report, written = fitted.report, made["prune_and_fill"].gaussians
     before, after = ({mean.tobytes() for mean in some.means} for some in (fitted.gaussians, written))
     others = [row for row, mean in enumerate(written.means) if mean.tobytes() not in before]
     return "\n\n".join([
@@ -365,7 +365,7 @@ def build_section(run: Run) -> str:
             entry("merge: features.means", merged.means, run.merged),
             entry("decode_merged: gaussians.scales", decoded.gaussians.scales, run.merged, 4),
             entry("fit_scene: gaussians.scales", fitted.gaussians.scales, children[0], 4),
-            *[entry("finish: gaussians.means", written.means, row) + " (a new one)" for row in others[:1]],
+            *[entry("prune_and_fill: gaussians.means", written.means, row) + " (a new one)" for row in others[:1]],
         ]),
         text(
             "**Superpixels** follow colour borders in the photo, because a Gaussian has one colour.",
@@ -401,7 +401,7 @@ def build_section(run: Run) -> str:
             ),
         ),
         text(
-            f"**`finish`** leaves out {len(before - after)} Gaussians that no photo shows, and puts {len(others)}",
+            f"**`prune_and_fill`** leaves out {len(before - after)} Gaussians that no photo shows, and puts {len(others)}",
             "others where cameras between photos see nothing.",
         ),
     ])  # fmt: skip

@@ -1,6 +1,6 @@
 """The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
 
-:func:`make_plan` settles every choice once. Each stage is handed its own part of the plan, and no
+:func:`settle` and :func:`decide` make every choice once. Each stage is handed its own part of the plan, and no
 stage knows the options of another.
 """
 
@@ -20,9 +20,9 @@ from gsmerge.facts.row_colors import RENDERS
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
-from gsmerge.runtime.record import note, stage
+from gsmerge.runtime.record import note
 from gsmerge.settings.budget import AUTO, BudgetOptions
-from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
+from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.fit import STEPS, USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
     AUTO_SHARE,
@@ -34,8 +34,7 @@ from gsmerge.settings.stages import (
     MatchOptions,
     SegmentOptions,
 )
-from gsmerge.stages.assign import merge_unseen
-from gsmerge.stages.segment import CountLimits, SuperpixelChoices, count_limits, has_few_rows, scene_tree
+from gsmerge.stages.segment import CountLimits, SharedTree, SuperpixelChoices, count_limits, has_few_rows
 from gsmerge.types import Gaussians, Scene
 
 if TYPE_CHECKING:
@@ -136,6 +135,11 @@ class Plan:
         return self.keeps_input and self.clean.asked
 
     @property
+    def prunes(self) -> bool:
+        """Whether Gaussians that no photo shows are dropped after the fit."""
+        return self.fit.min_contribution > 0 and not self.merges_pairs
+
+    @property
     def limits(self) -> CountLimits:
         """Limits of the number of Gaussians."""
         return self.superpixels.limits
@@ -149,59 +153,65 @@ class Plan:
         return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=1.0))
 
 
-def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
-    """Make all decisions that the options leave open; raise UsageError if scene or checkpoint do not allow them.
+@dataclass(frozen=True)
+class Settled:
+    """Options in which the scene has filled what they left open."""
 
-    ``checkpoint``: networks to use instead of those that the options name.
-    """
-    scene, size = prepared.scene, prepared.size
-    _check_photos(prepared, options)
-    keeps = keeps_input(size, options)
-    target = KEPT_PSNR if keeps and size.rendered else options.budget.target_psnr
-    cuts = options.method == OURS and size.num_views > 0  # views into superpixels
-    with stage("prepare"):
-        if checkpoint is None and cuts:  # baselines learn nothing
-            checkpoint = load_networks(options, size)
-        elif checkpoint is None and options.checkpoint not in CHECKPOINTS:  # a file that is named must be one
-            from gsmerge.networks.checkpoint import load_checkpoint
+    asked: CompactOptions  # As they were given
+    options: CompactOptions  # With the budget that the scene bears, and K
+    segment: SegmentOptions  # With numbers that depend on effort and scene
+    clean: CleanOptions  # Without what no photo can decide
 
-            load_checkpoint(options.checkpoint)
-        agreement = prepared.agreement
-        asked, options = options, resolve_budget(size, options, agreement)
-        segment = _resolve_superpixels(options.segment, agreement, EFFORTS[options.effort])
-        clean_options = _resolve_clean(options.clean, prepared)
-        decode = resolve_decode(options, size)
-        if decode.k != options.decode.k and decode.max_k > USUAL_K:
-            note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
-        options = replace(options, decode=decode)
-        unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
-        counted = replace(options, segment=replace(options.segment, superpixels=segment.superpixels))
-        choices = choose_for_scene(size, counted, num_input=num_input, num_reserved=len(unseen), keeps=keeps)
-        limits, pairs = choices.limits, checkpoint is None and choices.may_merge_pairs
-        fit = _fit_photos(prepared, options, choices.fit)
-        fit = _fit_renders(prepared, options, fit) if pairs else fit
+    @property
+    def counted(self) -> CompactOptions:
+        """The options by which Gaussians are counted."""
+        superpixels = replace(self.options.segment, superpixels=self.segment.superpixels)
+        return replace(self.options, segment=superpixels)
+
+
+def settle(prepared: Prepared, options: CompactOptions) -> Settled:
+    """Fill in what options leave open and the scene decides; notes give the reasons."""
+    size, agreement = prepared.size, prepared.agreement
+    filled = resolve_budget(size, options, agreement)
+    segment = _resolve_superpixels(filled.segment, agreement, EFFORTS[options.effort])
+    clean = _resolve_clean(filled.clean, prepared)
+    decode = resolve_decode(filled, size)
+    if decode.k != filled.decode.k and decode.max_k > USUAL_K:
+        note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
+    return Settled(options, replace(filled, decode=decode), segment, clean)
+
+
+def decide(prepared: Prepared, settled: Settled, checkpoint: Checkpoint | None, unseen: Gaussians) -> Plan:
+    """Make all decisions about a run; ``unseen`` are the merged Gaussians that no view sees."""
+    size, asked, options, segment = prepared.size, settled.asked, settled.options, settled.segment
+    keeps = keeps_input(size, asked)
+    target = KEPT_PSNR if keeps and size.rendered else asked.budget.target_psnr
+    choices = choose_for_scene(
+        size, settled.counted, num_input=count_input(prepared), num_reserved=len(unseen), keeps=keeps
+    )
+    limits, pairs = choices.limits, checkpoint is None and choices.may_merge_pairs
+    fit = _fit_photos(prepared, options, choices.fit)
+    fit = _fit_renders(prepared, options, fit) if pairs else fit
     if keeps and has_few_rows(size):
         few = f"superpixels: the {size.num_gaussians:,} Gaussians are few, so {segment.superpixels} is a share of"
         note(f"{few} the photos' pixels, up to half of the Gaussians")
-    tree = None
     budget = options.budget
     searches = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
-    if cuts and not pairs and (searches or limits.count is not None):
-        tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
+    shares_tree = cuts_views(options, size) and not pairs and (searches or limits.count is not None)
     return Plan(
-        superpixels=SuperpixelChoices(segment, limits, start_share(fit), tree),
+        superpixels=SuperpixelChoices(segment, limits, start_share(fit), SharedTree() if shares_tree else None),
         match=replace(options.match, match=choices.match),
         decode=options.decode,
         fit=fit,
         merges_pairs=pairs,
-        clean=clean_options,
+        clean=settled.clean,
         unseen=unseen,
         target_psnr=target,
         keeps_input=keeps,
-        max_drop=options.budget.max_drop,
-        auto_count=options.budget.auto,
-        levels=options.budget.levels,
-        output=options.budget.output,
+        max_drop=budget.max_drop,
+        auto_count=budget.auto,
+        levels=budget.levels,
+        output=budget.output,
         size=file_size(asked.budget),
         scored_views=_choose_scored_views(prepared, None if keeps or target is not None else EFFORTS[options.effort]),
         seed=options.seed,
@@ -211,6 +221,29 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         # without a fit no photo has been seen, and what own photos say is true of others
         new_views=fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views,
     )
+
+
+def cuts_views(options: CompactOptions, size: SceneSize) -> bool:
+    """Return whether a run cuts views into superpixels, which networks can correct; baselines learn nothing."""
+    return options.method == OURS and size.num_views > 0
+
+
+def count_input(prepared: Prepared) -> int | None:
+    """Return the number of Gaussians that shares of a budget refer to; None: those of the prepared scene."""
+    if len(prepared.unseen):
+        return prepared.size.num_gaussians + len(prepared.unseen)
+    return prepared.input_scene.num_gaussians if len(prepared.scene) < len(prepared.input_scene) else None
+
+
+def count_unseen(prepared: Prepared, settled: Settled) -> int:
+    """Return the number of Gaussians of the result that no view sees, at their share of the input."""
+    options, num_unseen = settled.options, len(prepared.unseen)
+    if num_unseen == 0:
+        return 0
+    num_input = prepared.size.num_gaussians + num_unseen
+    exact = exact_count(options.budget, num_input, prepared.unseen.sh_degree)
+    rate = settled.segment.share * options.decode.mean_k if exact is None else exact / num_input
+    return int(rate * num_unseen)
 
 
 @dataclass(frozen=True)
@@ -332,7 +365,7 @@ def keeps_input(scene: SceneSize, options: CompactOptions) -> bool:
     return not asked and (scene.rendered or not (scene.is_dense or budget.auto))
 
 
-def _check_photos(prepared: Prepared, options: CompactOptions) -> None:
+def check_pictures(prepared: Prepared, options: CompactOptions) -> None:
     """Raise UsageError for settings that need photos if there are none."""
     if prepared.reference.name != RENDERS:
         return
@@ -369,23 +402,13 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     return "shipped" if (size.has_own_pixels and (unfitted or not photos)) or (photos and unfitted) else "none"
 
 
-def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
-    """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone.
+def heads_alone(options: CompactOptions) -> bool:
+    """Return whether only the heads of networks run: those that ``auto`` chose, at an effort that saves the rest."""
+    return options.checkpoint == "auto" and not EFFORTS[options.effort].refines
 
-    SceneError if it is required and cannot be used, UsageError if it does not fit.
-    """
-    name = choose_networks(options, size)
-    if name == "none":
-        return None
-    from gsmerge.networks.checkpoint import find_checkpoint
 
-    checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
-    for text in notes:
-        note(text)
-    if checkpoint is None:
-        return None
-    if options.checkpoint == "auto" and not EFFORTS[options.effort].refines:
-        checkpoint = replace(checkpoint, networks=checkpoint.networks.heads_alone())
+def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
+    """Raise UsageError if networks do not fit the options."""
     outputs = checkpoint.networks.options.outputs
     if options.recipe == "paper" and outputs != "absolute":
         raise UsageError(
@@ -393,7 +416,6 @@ def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None
             " gsmerge lab train --preset paper makes them"
         )
     require_children("k", options.decode.max_k, checkpoint)
-    return checkpoint
 
 
 def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> None:
@@ -454,30 +476,6 @@ def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
     note("drop sky: no photo is used that could say where the sky is, so it stays")
     left = ",".join(name for name in options.drops if name != "sky")
     return replace(options, drop=left or None)
-
-
-def _merge_unseen(
-    prepared: Prepared, options: CompactOptions, segment: SegmentOptions, clean_options: CleanOptions
-) -> tuple[Gaussians, int | None]:
-    """Merge and clean the unseen Gaussians; return them, and the number that shares of a budget refer to, or None."""
-    scene, unseen = prepared.scene, prepared.unseen
-    num_input = prepared.input_scene.num_gaussians if len(scene) < len(prepared.input_scene) else None
-    if len(unseen) == 0:
-        return unseen, num_input
-    num_input = prepared.size.num_gaussians + len(unseen)
-    exact = exact_count(options.budget, num_input, unseen.sh_degree)
-    rate = segment.share * options.decode.mean_k if exact is None else exact / num_input
-    visible = unseen[unseen.opacities >= options.decode.min_opacity]
-    count = min(len(visible), int(rate * len(unseen)))
-    if count == 0:
-        return unseen[:0], num_input
-    merged = merge_unseen(visible, scene, count)
-    if clean_options.asked:
-        from gsmerge.stages.clean import clean
-
-        rows, _ = clean(merged, clean_options, scene.cameras, scene.images, prepared.frame.leave)
-        merged = merged[rows]
-    return merged, num_input
 
 
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:

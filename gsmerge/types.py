@@ -591,4 +591,4 @@ class Decoded:
     count: int  # Number to which the fit may grow
     exact: bool  # Whether that number is to be met
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that the fit leaves as they are; None: none
-    kept: bool = False  # Whether these are all of the scene, as they were
+    is_input: bool = False  # Whether these are all Gaussians of the scene, unchanged

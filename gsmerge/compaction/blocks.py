@@ -29,8 +29,8 @@ from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.frame import Frame, scene_frame
-from gsmerge.pipeline import start
-from gsmerge.plan import WHOLE_GAUSSIANS, Plan, SceneChoices, make_plan
+from gsmerge.pipeline import decode_views, make_plan
+from gsmerge.plan import WHOLE_GAUSSIANS, Plan, SceneChoices
 from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import Photos, blank_photos
@@ -185,7 +185,7 @@ def start_part(
     begin_part()
     prepared = prepare(piece, options.prepare, frame)
     plan = make_plan(prepared, options)
-    decoded = start(prepared, plan, plan.limits.count)
+    decoded = decode_views(prepared, plan, plan.limits.count)
     keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
     before = score_input(prepared, plan)
     count, prepared = round(keep.sum() / max(1, len(keep)) * decoded.count), without_gaussians(prepared)

@@ -25,8 +25,8 @@ from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
-from gsmerge.pipeline import Build
-from gsmerge.plan import Plan, choose_for_scene, make_plan, note_engine, note_surplus
+from gsmerge.pipeline import Build, make_plan
+from gsmerge.plan import Plan, choose_for_scene, note_engine, note_surplus
 from gsmerge.runtime.record import (
     Progress,
     Record,

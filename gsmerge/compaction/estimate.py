@@ -21,15 +21,8 @@ from gsmerge.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.plan import (
-    KEPT_LOSS,
-    KEPT_PSNR,
-    SceneChoices,
-    choose_for_scene,
-    load_networks,
-    resolve_budget,
-    stands_alone,
-)
+from gsmerge.pipeline import load_networks
+from gsmerge.plan import KEPT_LOSS, KEPT_PSNR, SceneChoices, choose_for_scene, resolve_budget, stands_alone
 from gsmerge.report import document_head
 from gsmerge.runtime.estimate import (
     TRIED,

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 from gsmerge.budget import LEVEL_FACTOR
 from gsmerge.facts.prepare import Prepared
-from gsmerge.pipeline import POWERS
 from gsmerge.plan import Plan
 from gsmerge.runtime.record import expect_parts
 from gsmerge.runtime.time_left import Part
+from gsmerge.stages.pair_merge import POWERS
 
 # Costs as measured on three captures
 GAUSSIAN = 12  # of a Gaussian of the result, in a step

@@ -48,7 +48,7 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
     """Return all Gaussians of a scene if at least as many are asked for; otherwise None."""
     if count is None or count < len(scene.gaussians):
         return None
-    return Decoded(scene.gaussians, len(scene.gaussians), exact=True, kept=True)
+    return Decoded(scene.gaussians, len(scene.gaussians), exact=True, is_input=True)
 
 
 @stage("decode")

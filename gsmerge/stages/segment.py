@@ -47,7 +47,21 @@ class SuperpixelChoices:
     options: SegmentOptions  # Method and number
     limits: CountLimits  # Limits of the number of Gaussians
     start_share: float  # Share of the Gaussians to start with; a fit adds the others
-    tree: RegionTree | None  # All coarser superpixels, where a count is asked for
+    shared: SharedTree | None  # The region tree of all counts of a run; None: each count builds its own
+
+
+@dataclass(eq=False)
+class SharedTree:
+    """The region tree that all counts of a run are cut from; the first one builds it."""
+
+    tree: RegionTree | None = None
+
+    def get(self, scene: PicturedScene, choices: SuperpixelChoices) -> RegionTree:
+        """Return the tree of a scene, fine enough for the count that the budget asks for."""
+        if self.tree is None:
+            limits = choices.limits
+            self.tree = scene_tree(scene, choices.options, limits, limits.exact or limits.default)
+        return self.tree
 
 
 @stage("segment")
@@ -71,7 +85,7 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
         if count <= limits.max_count:
             return Segmentation(groups, count, exact=False)
         count = limits.max_count
-    tree = choices.tree
+    tree = choices.shared.get(scene, choices) if choices.shared else None
     first = max(views, int(count * choices.start_share))
     if tree is None or first > len(tree):
         tree = scene_tree(scene, options, limits, count)
@@ -94,8 +108,8 @@ def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimit
 
 def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
     """Find the number of Gaussians at the knee of the scene's distortion curve, within the limits."""
-    limits = choices.limits
-    tree = choices.tree or scene_tree(scene, choices.options, limits, limits.default)
+    limits, shared = choices.limits, choices.shared or SharedTree()
+    tree = shared.get(scene, choices)
     usable = tree.counts >= tree.min_regions  # none larger than MAX_EXTENT
     return max(limits.min_count, min(knee(tree.counts[usable], tree.distortions[usable]), limits.max_count))
 

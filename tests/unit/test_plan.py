@@ -24,6 +24,7 @@ from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.fit import Fitted
 from gsmerge.frame import canonicalise
 from gsmerge.networks.checkpoint import IN_PACKAGE
+from gsmerge.pipeline import make_plan
 from gsmerge.plan import (
     EFFORTS,
     KEPT_LOSS,
@@ -31,7 +32,6 @@ from gsmerge.plan import (
     Plan,
     choose_for_scene,
     choose_networks,
-    make_plan,
     resolve_budget,
     resolve_fit,
     steps_for,
@@ -160,7 +160,7 @@ def test_a_long_fit_begins_with_a_share(scene: Scene) -> None:
     ("settings", "has_tree"), [({}, False), ({"budget": 90}, True), ({"levels": 2}, True), ({"quality": "20dB"}, True)]
 )
 def test_counts_are_cut_from_a_tree(settings: dict[str, Any], has_tree: bool, scene: Scene) -> None:
-    assert (plan_of(scene, **settings).superpixels.tree is not None) == has_tree
+    assert (plan_of(scene, **settings).superpixels.shared is not None) == has_tree
 
 
 def test_a_budget_counts_repeated_views(scene: Scene) -> None:

@@ -19,8 +19,8 @@ from gsmerge.fit import Fitted
 from gsmerge.fit.outside import HIGH, LOW, outside_cameras
 from gsmerge.fit.report import FitReport
 from gsmerge.geometry import camera_centres
-from gsmerge.pipeline import build
-from gsmerge.plan import choose_for_scene, make_plan
+from gsmerge.pipeline import build, make_plan
+from gsmerge.plan import choose_for_scene
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Decoded, Gaussians
 
@@ -78,7 +78,7 @@ def test_a_refused_fit_leaves_all_that_was_merged(scene: Scene, monkeypatch: pyt
         report = FitReport("none", False, 1, math.nan, math.nan, "worse")
         return Fitted(decoded.gaussians[:10], around.cameras, report)
 
-    monkeypatch.setattr("gsmerge.pipeline.fit_scene", fail)
+    monkeypatch.setattr("gsmerge.stages.fit_pairs.fit_scene", fail)
     assert len(compact(scene, budget=300).gaussians) == 300
 
 

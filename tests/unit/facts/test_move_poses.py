@@ -16,7 +16,7 @@ from gsmerge.facts.prepare import prepare
 from gsmerge.fit import Fitted
 from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
 from gsmerge.geometry import without_common_motion as without_common
-from gsmerge.plan import make_plan
+from gsmerge.pipeline import make_plan
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
 from gsmerge.runtime.threads import use_threads

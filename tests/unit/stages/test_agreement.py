@@ -13,7 +13,7 @@ import gsmerge
 from gsmerge import Scene
 from gsmerge.facts.confirm_depths import FEWEST, MOST, confirm_depths
 from gsmerge.facts.prepare import prepare
-from gsmerge.plan import make_plan
+from gsmerge.pipeline import make_plan
 from gsmerge.pooling import scene_members
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import CompactOptions

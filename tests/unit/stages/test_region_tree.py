@@ -19,6 +19,7 @@ from gsmerge.stages.segment import (
     CountLimits,
     RegionTree,
     SegmentOptions,
+    SharedTree,
     SuperpixelChoices,
     cut_tree,
     front_depths,
@@ -185,7 +186,7 @@ def test_knee_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
 
     def count(tree: RegionTree, most: int = 1000) -> int:
         limits = CountLimits(1, 1, min_count=1, max_count=most, exact=None, num_pixels=1, num_input=1000, most=1000)
-        return knee_count(scene, SuperpixelChoices(SegmentOptions(), limits, 1.0, tree))
+        return knee_count(scene, SuperpixelChoices(SegmentOptions(), limits, 1.0, SharedTree(tree)))
 
     assert count(wall) == wall.min_regions < 150
     assert count(wall, most=5) == 5

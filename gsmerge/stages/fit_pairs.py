@@ -1,0 +1,82 @@
+"""Merged pairs -> fitted: the fit of a scene that no photo shows, to renders of the scene itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.facts.place_cameras import placed_views
+from gsmerge.facts.prepare import Prepared
+from gsmerge.fit import Fitted, fit_scene
+from gsmerge.raster.photos import scene_photos, score_photos
+from gsmerge.runtime.record import note, stage
+from gsmerge.settings.fit import FitOptions
+from gsmerge.types import Decoded, Gaussians
+
+# dB that a fit may lose in a view that it was not trained on, for each of the powers of masses in
+# :data:`gsmerge.stages.pair_merge.POWERS`: few people look at an object from within
+TOLERANCES = 0.0, 3.0
+NEAR_INPUT = 36.0  # dB from renders of the input; nobody sees what a fit gains beyond it
+
+
+def fit_pairs(starts: Sequence[Decoded], prepared: Prepared, options: FitOptions, seed: int, target: float) -> Fitted:
+    """Fit the best of several starts to renders of the input, unless it looks like the input already.
+
+    ``starts`` were merged by the powers of masses in :data:`gsmerge.stages.pair_merge.POWERS`, in their order. Where
+    the scene has no views of its own, each start is fitted, and the best result is returned. ``target`` is the PSNR
+    (dB) that was asked for.
+    """
+    photos, views = scene_photos(prepared.scene), prepared.reference.score_views
+    psnrs = [score_photos(start.gaussians, photos, views, quarter=True).psnr for start in starts]
+    best = int(np.argmax(psnrs))
+    if options.fit == "none":
+        return unfitted(starts[best], prepared)
+    if psnrs[best] >= max(NEAR_INPUT, target):
+        note("nothing is fitted: merged Gaussians look as the input")
+        return unfitted(starts[best], prepared)
+    if prepared.reference.placed:
+        return fit_to_placed(starts, best, prepared, options, seed)
+    return fit_around(starts[best], prepared, options, seed)
+
+
+def unfitted(start: Decoded, prepared: Prepared) -> Fitted:
+    """Return a start as the result of a fit that was not made."""
+    return Fitted(start.gaussians, prepared.scene.cameras, None)
+
+
+def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
+    """Fit a start to renders of the scene's own views, and in a long fit to renders from around them."""
+    scene = prepared.scene_around if options.grows else prepared.scene
+    fitted = fit_scene(start, scene, range(len(scene)), options, seed, num_judged=len(prepared.scene))
+    accepted = fitted.report is not None and fitted.report.accepted
+    gaussians = fitted.gaussians if accepted else start.gaussians
+    return replace(fitted, gaussians=gaussians, cameras=prepared.scene.cameras)
+
+
+@stage("fit")
+def fit_to_placed(starts: Sequence[Decoded], best: int, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
+    """Fit each start to renders from placed views, and return the result with the best score in held-out views.
+
+    ``best`` is the start with the best score before the fits. It is returned with a note where no fit was accepted; so
+    is another start whose own fit lowers the score of a held-out view by more than its tolerance.
+    """
+    scene = prepared.scene_placed(placed_views(options.steps))
+    placed = range(len(prepared.scene), len(scene))
+    fits = [fit_scene(start, scene, placed, options, seed, num_judged=len(placed)) for start in starts]
+    accepted = [fit.report is not None and fit.report.accepted for fit in fits]
+    after = [score_views(fit.gaussians, prepared) for fit in fits]
+    if any(accepted):
+        best = int(np.argmax([psnrs.mean() for psnrs in after]))
+    gains = after[best] - score_views(starts[best].gaussians, prepared)
+    if accepted[best] and gains.mean() > 0 and gains.min() >= -TOLERANCES[best]:
+        return replace(fits[best], cameras=prepared.scene.cameras)
+    note("nothing is fitted: a fit to placed views shows others worse; with cameras it is fitted to theirs")
+    return unfitted(starts[best], prepared)
+
+
+def score_views(gaussians: Gaussians, prepared: Prepared) -> np.ndarray:
+    """Return the PSNR (dB) of each view that scores are taken in, ``[v]``."""
+    photos = scene_photos(prepared.scene)
+    return np.array([score_photos(gaussians, photos, [view]).psnr for view in prepared.reference.score_views])
