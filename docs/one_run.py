@@ -401,8 +401,8 @@ def build_section(run: Run) -> str:
             ),
         ),
         text(
-            f"**`prune_and_fill`** leaves out {len(before - after)} Gaussians that no photo shows, and puts {len(others)}",
-            "others where cameras between photos see nothing.",
+            f"**`prune_and_fill`** leaves out {len(before - after)} Gaussians that no photo shows, and puts",
+            f"{len(others)} others where cameras between photos see nothing.",
         ),
     ])  # fmt: skip
 

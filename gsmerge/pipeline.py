@@ -4,27 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
-from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import Fitted, fit_scene
-from gsmerge.plan import (
-    Plan,
-    Settled,
-    check_networks,
-    check_pictures,
-    choose_networks,
-    count_unseen,
-    cuts_views,
-    decide,
-    heads_alone,
-    settle,
-)
-from gsmerge.runtime.record import choose, note, stage
-from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
-from gsmerge.stages.assign import assign, merge_unseen
+from gsmerge.plan import Plan
+from gsmerge.runtime.record import choose
+from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_corrector
 from gsmerge.stages.fill import fill_between
@@ -36,61 +22,8 @@ from gsmerge.stages.prune import split_unseen
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded, Gaussians
 
-if TYPE_CHECKING:
-    from gsmerge.networks.checkpoint import Checkpoint
-
 # Prepared scene, plan and count -> canonical Gaussians, as many as the count; None: as many as the plan gives
 Build = Callable[[Prepared, Plan, int | None], Fitted]
-
-
-def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
-    """Make all decisions that the options leave open, and what they need: networks, and merged Gaussians out of sight.
-
-    ``checkpoint``: networks to use instead of those that the options name. Raises UsageError if the scene or the
-    networks do not allow what the options ask for.
-    """
-    check_pictures(prepared, options)
-    with stage("prepare"):
-        checkpoint = checkpoint or load_networks(options, prepared.size)
-        settled = settle(prepared, options)
-        return decide(prepared, settled, checkpoint, merge_hidden(prepared, settled))
-
-
-def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
-    """Load the networks that a run uses; None: it uses closed formulas alone.
-
-    Raises SceneError if networks are required and cannot be used, UsageError if they do not fit the options.
-    """
-    from gsmerge.networks.checkpoint import find_checkpoint, load_checkpoint
-
-    if not cuts_views(options, size):
-        if options.checkpoint not in CHECKPOINTS:  # a damaged file is refused, although nothing uses it
-            load_checkpoint(options.checkpoint)
-        return None
-    checkpoint, notes = find_checkpoint(choose_networks(options, size), required=options.require_checkpoint)
-    for text in notes:
-        note(text)
-    if checkpoint is not None:
-        if heads_alone(options):
-            checkpoint = replace(checkpoint, networks=checkpoint.networks.heads_alone())
-        check_networks(checkpoint, options)
-    return checkpoint
-
-
-def merge_hidden(prepared: Prepared, settled: Settled) -> Gaussians:
-    """Merge the Gaussians that no view sees into their share of the result, and clean them up."""
-    scene, unseen = prepared.scene, prepared.unseen
-    visible = unseen[unseen.opacities >= settled.options.decode.min_opacity]
-    count = min(len(visible), count_unseen(prepared, settled))
-    if count == 0:
-        return unseen[:0]
-    merged = merge_unseen(visible, scene, count)
-    if settled.clean.asked:
-        from gsmerge.stages.clean import clean
-
-        rows, _ = clean(merged, settled.clean, scene.cameras, scene.images, prepared.frame.leave)
-        merged = merged[rows]
-    return merged
 
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:

@@ -12,6 +12,7 @@ from gsmerge.alignment.registration.join import concat_scenes
 from gsmerge.budget import file_size
 from gsmerge.compaction.file_size import drop_to_bytes, measure_rest
 from gsmerge.compaction.forecast import AFTER, BEFORE, fit_cost
+from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.partition import (
     Block,
     Covisibility,
@@ -29,7 +30,7 @@ from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.frame import Frame, scene_frame
-from gsmerge.pipeline import decode_views, make_plan
+from gsmerge.pipeline import decode_views
 from gsmerge.plan import WHOLE_GAUSSIANS, Plan, SceneChoices
 from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.raster.metrics import describe_loss

@@ -16,6 +16,7 @@ import numpy as np
 from gsmerge.arguments import check_arguments
 from gsmerge.compaction.file_size import meet_bytes
 from gsmerge.compaction.forecast import RunForecast
+from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import trial_part, try_new_views
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
@@ -25,7 +26,7 @@ from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
-from gsmerge.pipeline import Build, make_plan
+from gsmerge.pipeline import Build
 from gsmerge.plan import Plan, choose_for_scene, note_engine, note_surplus
 from gsmerge.runtime.record import (
     Progress,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.compaction.files import Outputs, check_cameras, sized
+from gsmerge.compaction.make_plan import load_networks
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.partition import gaussians_at_once
 from gsmerge.compaction.search import AUTO_RUNGS, LONG, RUNGS, SHORT, rungs
@@ -21,7 +22,6 @@ from gsmerge.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.pipeline import load_networks
 from gsmerge.plan import KEPT_LOSS, KEPT_PSNR, SceneChoices, choose_for_scene, resolve_budget, stands_alone
 from gsmerge.report import document_head
 from gsmerge.runtime.estimate import (

@@ -13,6 +13,7 @@ from typing import cast
 import numpy as np
 
 from gsmerge import __version__
+from gsmerge.compaction.make_plan import make_plan
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.views import concat_cameras, in_float64, resize_cameras
@@ -23,7 +24,6 @@ from gsmerge.networks.checkpoint import Checkpoint
 from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group_features
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.pipeline import make_plan
 from gsmerge.pooling import Members, feature_to_gaussians, gaussian_members
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads

@@ -15,6 +15,7 @@ from scenes import psnr_of
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.estimate import estimate
+from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.result import score
 from gsmerge.compaction.search import MAX_RUNS, add_target
 from gsmerge.errors import UsageError
@@ -24,7 +25,6 @@ from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.fit import Fitted
 from gsmerge.frame import canonicalise
 from gsmerge.networks.checkpoint import IN_PACKAGE
-from gsmerge.pipeline import make_plan
 from gsmerge.plan import (
     EFFORTS,
     KEPT_LOSS,

@@ -12,6 +12,7 @@ import unaligned_scenes
 
 from gsmerge import Cameras, CompactOptions, Scene, compact, render
 from gsmerge.compaction.estimate import estimate
+from gsmerge.compaction.make_plan import make_plan
 from gsmerge.facts.place_cameras import FEW_VIEWS, MOST_OUTSIDE, OUTSIDE, between_cameras, draw_around, draw_pictures
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
@@ -19,7 +20,7 @@ from gsmerge.fit import Fitted
 from gsmerge.fit.outside import HIGH, LOW, outside_cameras
 from gsmerge.fit.report import FitReport
 from gsmerge.geometry import camera_centres
-from gsmerge.pipeline import build, make_plan
+from gsmerge.pipeline import build
 from gsmerge.plan import choose_for_scene
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Decoded, Gaussians

@@ -11,12 +11,12 @@ import scenes
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.compact import build_cleaned
+from gsmerge.compaction.make_plan import make_plan
 from gsmerge.facts.move_poses import move_poses
 from gsmerge.facts.prepare import prepare
 from gsmerge.fit import Fitted
 from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
 from gsmerge.geometry import without_common_motion as without_common
-from gsmerge.pipeline import make_plan
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
 from gsmerge.runtime.threads import use_threads

@@ -9,9 +9,9 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, Scene
+from gsmerge.compaction.make_plan import make_plan
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
-from gsmerge.pipeline import make_plan
 from gsmerge.stages.segment import SuperpixelChoices, count_limits, default_count, largest_count, segment_scene
 
 ADAPTIVE = {"segmentation": "bass-adaptive", "superpixels": "5%"}

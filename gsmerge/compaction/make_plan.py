@@ -1,0 +1,78 @@
+"""Prepared scene and options -> plan: the work that decisions need, and then the decisions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.scene_size import SceneSize
+from gsmerge.plan import (
+    Plan,
+    Settled,
+    check_networks,
+    check_pictures,
+    choose_networks,
+    count_unseen,
+    cuts_views,
+    decide,
+    heads_alone,
+    settle,
+)
+from gsmerge.runtime.record import note, stage
+from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
+from gsmerge.stages.assign import merge_unseen
+from gsmerge.types import Gaussians
+
+if TYPE_CHECKING:
+    from gsmerge.networks.checkpoint import Checkpoint
+
+
+def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
+    """Make all decisions that the options leave open, and what they need: networks, and merged Gaussians out of sight.
+
+    ``checkpoint``: networks to use instead of those that the options name. Raises UsageError if the scene or the
+    networks do not allow what the options ask for.
+    """
+    check_pictures(prepared, options)
+    with stage("prepare"):
+        checkpoint = checkpoint or load_networks(options, prepared.size)
+        settled = settle(prepared, options)
+        return decide(prepared, settled, checkpoint, merge_hidden(prepared, settled))
+
+
+def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
+    """Load the networks that a run uses; None: it uses closed formulas alone.
+
+    Raises SceneError if networks are required and cannot be used, UsageError if they do not fit the options.
+    """
+    from gsmerge.networks.checkpoint import find_checkpoint, load_checkpoint
+
+    if not cuts_views(options, size):
+        if options.checkpoint not in CHECKPOINTS:  # a damaged file is refused, although nothing uses it
+            load_checkpoint(options.checkpoint)
+        return None
+    checkpoint, notes = find_checkpoint(choose_networks(options, size), required=options.require_checkpoint)
+    for text in notes:
+        note(text)
+    if checkpoint is not None:
+        if heads_alone(options):
+            checkpoint = replace(checkpoint, networks=checkpoint.networks.heads_alone())
+        check_networks(checkpoint, options)
+    return checkpoint
+
+
+def merge_hidden(prepared: Prepared, settled: Settled) -> Gaussians:
+    """Merge the Gaussians that no view sees into their share of the result, and clean them up."""
+    scene, unseen = prepared.scene, prepared.unseen
+    visible = unseen[unseen.opacities >= settled.options.decode.min_opacity]
+    count = min(len(visible), count_unseen(prepared, settled))
+    if count == 0:
+        return unseen[:0]
+    merged = merge_unseen(visible, scene, count)
+    if settled.clean.asked:
+        from gsmerge.stages.clean import clean
+
+        rows, _ = clean(merged, settled.clean, scene.cameras, scene.images, prepared.frame.leave)
+        merged = merged[rows]
+    return merged
