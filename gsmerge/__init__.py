@@ -14,6 +14,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from gsmerge.version import __version__
+
 if TYPE_CHECKING:
     from gsmerge import integrations as integrations
     from gsmerge.compaction.compact import compact as compact
@@ -46,8 +48,6 @@ if TYPE_CHECKING:
     from gsmerge.types import Gaussians as Gaussians
     from gsmerge.types import Scene as Scene
     from gsmerge.types import Views as Views
-
-__version__ = "0.5.0.dev0"
 
 _PUBLIC = {
     "compaction.compact": ("compact",),

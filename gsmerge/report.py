@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsmerge import __version__
+from gsmerge.version import __version__
 
 SCHEMA_VERSION = 1
 MAX_WIDTH = 10_000  # columns of a table in a pipe

@@ -10,7 +10,6 @@ from pathlib import Path
 from string import Formatter
 from typing import Any, Protocol
 
-from gsmerge import __version__
 from gsmerge.batch.find import find_named_scenes, main_file, scene_plys
 from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.errors import SceneError, UsageError
@@ -28,6 +27,7 @@ from gsmerge.settings.reading import NONE, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import Engine
 from gsmerge.types import StrPath
+from gsmerge.version import __version__
 
 FIELDS = ("stem", "parent", "index", "k")
 PLACES = ("cameras", "images", "masks", "protect")  # of what is beside a scene

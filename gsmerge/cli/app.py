@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gsmerge import __version__
 from gsmerge.cli import INTERRUPTED, stop_at_once
 from gsmerge.cli.console import JsonLines, json_progress, plain_warnings, say
 from gsmerge.cli.usage import LAB, LOOK, PROGRAM, Command, Group, UsageErrors, expand_home, usage_message
@@ -33,6 +32,7 @@ from gsmerge.errors import (
 )
 from gsmerge.runtime.plugins import COMMANDS as PLUGINS
 from gsmerge.runtime.plugins import find_plugins, load_plugin
+from gsmerge.version import __version__
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
-from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import ReadBudget, parse_json, read_budget
@@ -20,6 +19,7 @@ from gsmerge.io.tensor_file import read_tensors
 from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.types import StrPath
+from gsmerge.version import __version__
 
 SCHEMA = 2  # version of the tensors' names and of the tokens that they were trained on
 FORMAT = "gsmerge-networks"

@@ -12,7 +12,6 @@ from typing import cast
 
 import numpy as np
 
-from gsmerge import __version__
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
@@ -40,6 +39,7 @@ from gsmerge.stages.segment import segment_scene
 from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.states.extend import NOT_COMPARED, NOT_KNOWN, BatchReport, compare_worlds, number_names, refuse_other_world
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
+from gsmerge.version import __version__
 
 SAMPLE_STEP = 8  # pixels between the samples of a view along each axis
 

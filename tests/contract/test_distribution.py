@@ -107,7 +107,7 @@ def test_metadata(built: Path, root: Path, project: dict[str, Any]) -> None:
             file.read(next(name for name in file.namelist() if name.endswith(".dist-info/METADATA")))
         )
     assert metadata["Version"] == gsmerge.__version__
-    assert "version" not in project  # which stands in gsmerge/__init__.py alone
+    assert "version" not in project  # which stands in gsmerge/version.py alone
     assert "Typing :: Typed" in metadata.get_all("Classifier", [])
     assert [line for line in metadata.get_all("Requires-Dist", []) if "matplotlib" in line] == ["matplotlib<4,>=3.8"]
     assert not re.search(r"file://|/work/|/root/|/tmp/|/home/", metadata.as_string())

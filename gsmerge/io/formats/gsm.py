@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
-from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_pixels, parse_json, read_budget
@@ -27,6 +26,7 @@ from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_count, 
 from gsmerge.io.tensor_file import read_tensors
 from gsmerge.kernels.elementary import log
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath, as_array
+from gsmerge.version import __version__
 
 SCHEMA = 3  # of the whole file; those before were states of 0.3.0 and before
 HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; the second of 0.1

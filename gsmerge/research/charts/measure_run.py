@@ -19,7 +19,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gsmerge import __version__
 from gsmerge.batch.records import DONE, FAILED, RECORDS
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.left_out import LEAST_VIEWS
@@ -40,6 +39,7 @@ from gsmerge.scene.held_out import HeldOutViews, read_held_out
 from gsmerge.scene.read import load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians, Scene, Views
+from gsmerge.version import __version__
 
 HELD_OUT = "without --targets no run sees these photos, by which all are judged"
 RECORD_VERSION = 2  # of what a run records; another version is run again

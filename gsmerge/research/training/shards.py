@@ -27,7 +27,6 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.pooling import Members
@@ -39,6 +38,7 @@ from gsmerge.runtime.threads import work_alone
 from gsmerge.scene.content_hash import content_hash, digest, read_files
 from gsmerge.scene.files import find_scene_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
+from gsmerge.version import __version__
 
 Report = Callable[[str, int, int], None]  # what is done, step, steps
 LAYOUT = 7  # version of the files and of what is in them
