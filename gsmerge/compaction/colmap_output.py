@@ -33,7 +33,7 @@ def note_photos(points: Path, photos: NamedPhotos) -> list[str]:
 def write_output(add: AddOutput, path: Path, points: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write a model, as :data:`gsmerge.io.formats.table.WriteOutput`; its photos are linked unless their folder exists.
 
-    ``photos`` are those of :func:`gsmerge.compaction.placement.name_photos`.
+    ``photos`` are those of :func:`gsmerge.compaction.outputs.name_photos`.
     """
     gaussians, cameras = contents.levels[0], contents.cameras
     files, place = [points, *map(add, files_beside(path, apart=False))], photo_folder(path)

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.compaction.placement import NUM_FULL, add_views, find_placement, name_photos, pad_harmonics, place
+from gsmerge.compaction.outputs import add_views, name_photos
+from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.frame import scene_frame

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.placement import add_views, name_photos, named_cameras, other_cameras
+from gsmerge.compaction.outputs import add_views, name_photos, named_cameras, other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import DoubtWarning, SceneError, UsageError

@@ -14,6 +14,7 @@ import numpy as np
 
 from gsmerge.arguments import check_arguments
 from gsmerge.compaction.new_views import SIDE, NewViews, Trial
+from gsmerge.compaction.outputs import write_result
 from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
@@ -89,9 +90,9 @@ class CompactResult:
             >>> result.save("demo/small.sog", overwrite=True).name
             'small.sog'
         """
-        from gsmerge.compaction.placement import save_result
-
-        return save_result(self, Path(path), overwrite=overwrite)
+        cameras, levels = self.cameras.numpy(), [level.gaussians for level in (self, *self.coarser)]
+        names = self.names or tuple(f"view {view}" for view in range(len(cameras)))
+        return write_result(Path(path), levels, cameras, names, self.report.new_views, overwrite=overwrite)
 
     @check_arguments
     def show(self, scene: Scene | StrPath | None = None) -> Page:

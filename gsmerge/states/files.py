@@ -14,7 +14,7 @@ from zipfile import ZipFile
 import numpy as np
 
 from gsmerge.compaction.files import read_input
-from gsmerge.compaction.placement import add_views, name_photos
+from gsmerge.compaction.outputs import add_views, name_photos
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_output, atomic_outputs, output_format
 from gsmerge.io.archives import new_member

@@ -1,0 +1,96 @@
+"""Write Gaussians with their cameras: all files of an output, or none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import output_format
+from gsmerge.io.atomic import AddOutput, atomic_outputs
+from gsmerge.io.cameras.camera_file import to_cameras
+from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path
+from gsmerge.io.formats.arrays import RESULT_COMMENT, ExpectedScores, new_views_comment
+from gsmerge.io.formats.table import FOLDERS, Contents, NamedPhotos
+from gsmerge.io.image_names import match_images
+from gsmerge.types import Cameras, Gaussians
+
+SAME = 1e-5  # relative difference up to which cameras are the same; pixels by a hundred times as much
+
+
+def add_views(add: AddOutput, path: Path, cameras: Cameras, names: Sequence[str], *, overwrite: bool) -> None:
+    """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has others.
+
+    A file with these cameras, to within rounding, is left as it is: results in several formats share it.
+    """
+    if overwrite or not path.exists():
+        add(path).write_bytes(viewer_cameras(cameras, names).encode())
+    elif not _has_cameras(path, cameras, names):
+        raise other_cameras(path)
+
+
+def named_cameras(path: Path, names: Sequence[str]) -> Cameras | None:
+    """Read the cameras of a file if they have these names; None for any other file."""
+    with suppress(SceneError):
+        stored = read_cameras(path)
+        return to_cameras(stored) if list(stored.names) == list(names) else None
+    return None
+
+
+def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> bool:
+    """Return whether a file holds these cameras under these names, to within rounding."""
+    found, reach = named_cameras(path, names), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
+    if found is None or (found.width, found.height) != (cameras.width, cameras.height):
+        return False
+    same_place = np.allclose(found.viewmats, cameras.viewmats, rtol=0, atol=SAME * reach)
+    return same_place and np.allclose(found.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME)
+
+
+def other_cameras(path: Path) -> UsageError:
+    """Make the error for an existing file of cameras that belongs to another result."""
+    remedy = "name another output, or pass --overwrite to replace it"
+    return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
+
+
+def name_photos(photos: Path | None, names: Sequence[str]) -> NamedPhotos:
+    """Name views by their files in a folder of photos, as COLMAP does; otherwise by their names in the camera file.
+
+    Returns each name and its photo, None where that is in no folder.
+    """
+    if photos is not None and photos.is_dir():
+        with suppress(SceneError):
+            return [(file.relative_to(photos).as_posix(), file) for file in match_images(photos, names)]
+    return [(name.removeprefix("./").removeprefix("images/"), None) for name in names]  # as a transforms.json has them
+
+
+def write_result(
+    path: Path,
+    levels: Sequence[Gaussians],
+    cameras: Cameras,
+    names: Sequence[str],
+    new_views: ExpectedScores | None,
+    *,
+    overwrite: bool,
+) -> Path:
+    """Write the levels of a result, the finest first, with its cameras; return the path of the main file.
+
+    The name chooses the format. UsageError if it has another ending, or the format needs cameras and there are none.
+    """
+    row = FOLDERS.get(path.name)
+    out = path if row is None else path / row.place / row.ending
+    chosen = output_format(out, levels=True, cameras=True)
+    if not len(cameras) and chosen.cameras == "needed":
+        raise UsageError(f"{out}: expected a scene with cameras, got none")
+    comments = [RESULT_COMMENT, *([] if new_views is None else [new_views_comment(new_views)])]
+    written = [level.numpy() for level in (levels if chosen.levels else levels[:1])]
+    contents = Contents(written, comments, cameras, name_photos(None, names), out.stem)
+    with atomic_outputs(overwrite=overwrite) as add:
+        chosen.write(add, out, add(out), contents)
+        if len(cameras) and not chosen.cameras:
+            add_views(add, viewer_cameras_path(out), cameras, names, overwrite=overwrite)
+    chosen.finish(out)
+    return out
