@@ -19,13 +19,13 @@ from gsmerge.version import __version__
 if TYPE_CHECKING:
     from gsmerge import integrations as integrations
     from gsmerge.compaction.compact import compact as compact
-    from gsmerge.compaction.inspect import inspect as inspect
     from gsmerge.compaction.report import CompactReport as CompactReport
     from gsmerge.compaction.result import CompactResult as CompactResult
     from gsmerge.compaction.tensors import compact_tensors as compact_tensors
     from gsmerge.errors import DoubtWarning as DoubtWarning
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
+    from gsmerge.inspection.inspect import inspect as inspect
     from gsmerge.io import read_cameras as read_cameras
     from gsmerge.io import read_gaussians as read_gaussians
     from gsmerge.io import read_ply as read_ply
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 _PUBLIC = {
     "compaction.compact": ("compact",),
-    "compaction.inspect": ("inspect",),
+    "inspection.inspect": ("inspect",),
     "compaction.report": ("CompactReport",),
     "compaction.result": ("CompactResult",),
     "compaction.tensors": ("compact_tensors",),

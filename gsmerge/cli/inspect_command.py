@@ -17,7 +17,7 @@ from gsmerge.errors import SceneError, UsageError
 )  # fmt: skip
 def inspect(args: opt.Args) -> None:
     """Read files to their ends, and say what they hold and what compact would make, or refuse, of each scene."""
-    from gsmerge.file_checks import holds_scene
+    from gsmerge.inspection.file_checks import holds_scene
     from gsmerge.io.formats.table import INDEX
 
     path = args.paths[0]
@@ -31,9 +31,9 @@ def inspect(args: opt.Args) -> None:
 
 def _inspect_scene(args: opt.Args, path: Path) -> None:
     """Describe a scene at length; SceneError if ``compact`` refuses it."""
-    from gsmerge.compaction.inspect import inspect as inspect_scene
-    from gsmerge.compaction.inspect import inspection_lines
-    from gsmerge.file_checks import check_content, damage
+    from gsmerge.inspection.file_checks import check_content, damage
+    from gsmerge.inspection.inspect import inspect as inspect_scene
+    from gsmerge.inspection.inspect import inspection_lines
     from gsmerge.io.formats.table import INDEX
     from gsmerge.report import document_head
     from gsmerge.runtime.record import record_run
@@ -53,7 +53,7 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
 
 def _check_files(args: opt.Args) -> None:
     """Print a line for each file; SceneError if ``compact`` refuses one."""
-    from gsmerge.file_checks import FileCheck, check_content
+    from gsmerge.inspection.file_checks import FileCheck, check_content
     from gsmerge.report import document_head
 
     checks, hints = list[FileCheck](), args.hints()

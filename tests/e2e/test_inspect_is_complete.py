@@ -22,7 +22,7 @@ from messages import says
 from tiny_scene import make_tiny
 
 from gsmerge.cli import main
-from gsmerge.file_checks import check_content
+from gsmerge.inspection.file_checks import check_content
 
 COUNT, MANY = 2, 20  # mutations of a kind
 FEWER = 10  # of kinds that take one or two seconds for each mutation: their rows have to be placed

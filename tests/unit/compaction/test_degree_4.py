@@ -12,7 +12,7 @@ from tiny_scene import Tiny
 
 import gsmerge
 from gsmerge.compaction.files import Outputs, compact_files
-from gsmerge.file_checks import check_content
+from gsmerge.inspection.file_checks import check_content
 from gsmerge.io import read_gaussians, write_ply
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.scene.files import find_scene_files

@@ -15,7 +15,7 @@ from gsmerge.batch.find import find_scenes
 from gsmerge.cli import main
 from gsmerge.compaction.files import Outputs, compact_files, read_input
 from gsmerge.errors import SceneError
-from gsmerge.file_checks import check_content
+from gsmerge.inspection.file_checks import check_content
 from gsmerge.io import read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import file_bytes, header_content

@@ -22,8 +22,8 @@ from tiny_scene import (
     write_transforms,
 )
 
-from gsmerge.compaction.inspect import inspect
 from gsmerge.errors import SceneError
+from gsmerge.inspection.inspect import inspect
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_file import make_lens, select_views, undistort_photos
 from gsmerge.kernels import elementary

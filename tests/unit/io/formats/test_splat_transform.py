@@ -23,7 +23,7 @@ from splat_transform_programs import (
 
 from gsmerge import Gaussians, Scene, read_gaussians
 from gsmerge.errors import GsmergeError, SceneError, UsageError
-from gsmerge.file_checks import check_content
+from gsmerge.inspection.file_checks import check_content
 from gsmerge.io import write_ply
 from gsmerge.io.formats import splat_transform
 from gsmerge.io.formats.arrays import to_columns

@@ -14,8 +14,8 @@ from tiny_scene import Tiny, write_npz
 
 from gsmerge import CompactOptions, compact, read_scene
 from gsmerge.compaction.estimate import estimate
-from gsmerge.compaction.inspect import inspect, inspection_lines
 from gsmerge.facts.prepare import views_notes
+from gsmerge.inspection.inspect import inspect, inspection_lines
 from gsmerge.io import read_ply, write_ply
 from gsmerge.measure.coverage import extents
 
