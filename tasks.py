@@ -1,17 +1,33 @@
-"""The checks of this project, one command each: python tasks.py TASK... (CONTRIBUTING.md says when).
+"""The tasks of this project, one word each: python3 tasks.py TASK... (CONTRIBUTING.md says when each is needed).
 
-The tools run from the environment of this Python; the first failure stops. Options, and what follows them, are passed
-to the last task: python tasks.py fuzz --minutes 30.
+``demo`` and ``setup`` install the package into ``.venv``, and the tasks after them use what is installed there. Without
+them the tools of this Python's own environment are used. The first failure stops. Options, and what follows them, are
+passed to the last task: python tasks.py fuzz --minutes 30.
 """
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
-ROOT, TOOLS = Path(__file__).parent, Path(sys.executable).parent
-TASKS = {
+ROOT, TOOLS = Path(__file__).resolve().parent, Path(sys.executable).parent
+INSTALLED = (
+    ROOT / ".venv" / ("Scripts" if os.name == "nt" else "bin")
+)  # programs of what ``demo`` and ``setup`` install
+MAKE_VENV = ("python", "-m", "venv", ".venv")
+INSTALL = ("pip", "install", "-q", "-c", "constraints.txt", "-e")
+ROOM = ("demo", "--width", "480", "--height", "320", "--seed", "20")
+TASKS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "demo": (
+        MAKE_VENV,
+        (*INSTALL, "."),
+        ("python", "examples/01_make_scene.py", *ROOM),
+        ("gsmerge", "compact", "demo", "--overwrite"),
+        ("gsmerge", "render", "demo/scene.ply", "demo/scene.compact.ply", "-o", "demo/preview.png", "--overwrite"),
+    ),
+    "setup": (MAKE_VENV, (*INSTALL, ".[test]")),
     "native": (("python", "gsmerge/kernels/build.py"),),
     "tests": (("python", "-m", "pytest"),),
     "sweeps": (("python", "-m", "pytest", "-m", "slow"),),
@@ -40,12 +56,15 @@ def main(names: list[str]) -> int:
         print(f"usage: python tasks.py TASK...\ntasks: check (all of {' '.join(CHECKS)}), {', '.join(TASKS)}")
         return 2
     calls = [call for name in names for call in TASKS[name]]
-    for tool, *arguments in (*calls[:-1], (*calls[-1], *options)):
-        print("+", tool, *arguments, flush=True)
-        program = sys.executable if tool == "python" else str(TOOLS / tool)
+    programs = TOOLS
+    for call in (*calls[:-1], (*calls[-1], *options)):
+        print("+", *call, flush=True)
+        tool, *arguments = call
+        program = sys.executable if tool == "python" and programs == TOOLS else str(programs / tool)
         code = subprocess.run([program, *arguments], cwd=ROOT, check=False).returncode
         if code:
             return code
+        programs = INSTALLED if call == MAKE_VENV else programs
     return 0
 
 

@@ -1,6 +1,6 @@
 """Prints the block of shell commands in README.md that has some words in it, to be run as a whole.
 
-bash -euo pipefail -c "$(python3 tools/readme_block.py "-m pytest")"
+bash -euo pipefail -c "$(python3 tools/readme_block.py "tasks.py setup tests")"
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -58,6 +59,39 @@ def test_the_commands_that_test_run_as_a_whole(tmp_path: Path) -> None:
     assert tested == "python -m pytest"
 
 
+def calls_of(*tasks: str) -> list[str]:
+    """The commands of tasks, as :func:`run_block` notes them."""
+    calls = [call for task in tasks for call in load_script(ROOT / "tasks.py").TASKS[task]]
+    return [" ".join(call).replace("python -m venv", "python3 -m venv") for call in calls]
+
+
+@pytest.mark.parametrize(
+    ("line", "steps", "tasks"),
+    [
+        ("python3 tasks.py setup tests\n", "-m pytest", ("setup", "tests")),
+        ("python3 tasks.py demo\n", "examples/01_make_scene.py", ("demo",)),
+    ],
+)
+def test_one_line_runs_the_lines_below_it(line: str, steps: str, tasks: tuple[str, ...], tmp_path: Path) -> None:
+    assert find_block(line.strip()) == line
+    assert run_block(find_block(steps), tmp_path) == calls_of(*tasks)
+
+
+def test_tasks_use_what_setup_installs(monkeypatch: pytest.MonkeyPatch) -> None:
+    tasks, programs = load_script(ROOT / "tasks.py"), []
+
+    def run(call: list[str], **_: object) -> SimpleNamespace:
+        programs.append(call[0])
+        return SimpleNamespace(returncode=len(programs) == 3)
+
+    monkeypatch.setattr(tasks.subprocess, "run", run)
+    assert tasks.main(["setup", "tests", "lint"]) == 1  # the tests fail, and lint is not run
+    assert programs == [sys.executable, str(tasks.INSTALLED / "pip"), str(tasks.INSTALLED / "python")]
+    programs.clear()
+    assert tasks.main(["tests"]) == 0
+    assert programs == [sys.executable]
+
+
 def test_the_commands_that_test_stop_where_one_fails(tmp_path: Path) -> None:
     assert run_block(find_block("-m pytest"), tmp_path, failing="pip")[-1].startswith("pip install")
 
@@ -80,7 +114,7 @@ def test_blocks_are_found_by_their_words(tmp_path: Path) -> None:
 
 def test_ci_runs_that_block() -> None:
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-    assert 'commands=$(python3 tools/readme_block.py "-m pytest")' in script
+    assert 'commands=$(python3 tools/readme_block.py "tasks.py setup tests")' in script
     assert 'bash -euo pipefail -c "$commands"' in script
     assert "run: .ci/run" in (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
 

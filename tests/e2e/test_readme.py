@@ -36,7 +36,7 @@ def find_block(root: Path, words: str) -> str:
 
 
 def test_one_minute_and_then_python(root: Path, project: Path) -> None:
-    run(find_block(root, "examples/01_make_scene.py"), project)
+    run(find_block(root, "tasks.py demo"), project)
     assert (project / "demo" / "preview.png").exists()
     (code,) = re.findall(r"^```python\n(.*?)^```$", (root / "README.md").read_text(), re.DOTALL | re.MULTILINE)
     subprocess.run([project / ".venv" / "bin" / "python", "-c", code], cwd=project, check=True)
