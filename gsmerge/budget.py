@@ -1,14 +1,19 @@
-"""Numbers of Gaussians that budgets, file sizes and devices ask for or allow."""
+"""Numbers of Gaussians: what superpixels and K give, and what budgets, file sizes and devices ask for or allow."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from gsmerge.errors import UsageError
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
+from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 
 LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
+MAX_ADAPTED = 4  # most times more or fewer superpixels than bass-adaptive starts with
+FEW_PIXELS = 1 << 18  # of a few small photos
+FEW = 0.5  # times the photos' pixels, up to those: of fewer Gaussians a share is one of pixels, and this one at most
 
 
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
@@ -52,3 +57,112 @@ def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
     """Return the largest number of Gaussians that budget, file size or device allow, at most that of the input."""
     limits = DEVICES.get(str(options.budget)), exact_count(options, num_input, sh_degree), options.most
     return min([num_input, *(limit for limit in limits if limit is not None)])
+
+
+@dataclass(frozen=True)
+class CountLimits:
+    """Limits on the number of Gaussians that follow from the options."""
+
+    per_view: int  # Superpixels of each view that the options ask for
+    default: int  # Gaussians that `superpixels` and K ask for
+    min_count: int  # Fewest Gaussians that the scene can be cut to: one for each view
+    max_count: int  # Most Gaussians that a budget, a size or a device allows
+    exact: int | None  # Gaussians that a budget or a size asks for; None without either
+    num_pixels: int  # Of all views
+    num_input: int  # Gaussians that the count is one of
+    most: int  # Most Gaussians of those that the scene bears, where that is known
+
+    @property
+    def count(self) -> int | None:
+        """Number of Gaussians set by a budget, a size or a device; None if ``superpixels`` and K decide."""
+        if self.exact is not None:
+            return self.exact
+        return self.max_count if self.default > self.max_count else None
+
+    @property
+    def share(self) -> float:
+        """Gaussians per pixel."""
+        return (self.count or self.default) / max(1, self.num_pixels)
+
+
+def count_limits(
+    scene: SceneSize,
+    segment: SegmentOptions,
+    decode: DecodeOptions,
+    budget: BudgetOptions,
+    *,
+    num_input: int | None = None,
+    num_reserved: int = 0,
+) -> CountLimits:
+    """Compute the limits on the number of Gaussians.
+
+    ``num_input``: number that shares of a budget refer to; None: that of the scene. ``num_reserved``: Gaussians of the
+    result that are fixed already, such as those that no view sees. Raises UsageError if more superpixels are requested
+    than there are pixels, or fewer Gaussians than views.
+    """
+    count, views = scene.num_gaussians, scene.num_views
+    exact = exact_count(budget, count if num_input is None else num_input, scene.sh_degree)
+    if exact is not None:
+        exact = min(max(1, exact - num_reserved), count)
+    max_count = min(max_allowed(budget, count, scene.sh_degree), count if exact is None else exact)
+    if max_count < min(views, count):
+        perhaps = f'; {max_count} % is "{max_count}%"' if max_count <= 100 else ""
+        raise UsageError(f"budget: expected at least {views}, one for each view, got {max_count}{perhaps}")
+    return CountLimits(
+        per_view=superpixels_per_view(scene, segment) if views else 0,
+        default=default_count(scene, segment, decode),
+        min_count=max(1, views),
+        max_count=max_count,
+        exact=exact,
+        num_pixels=views * scene.pixels_per_view,
+        num_input=count,
+        most=count if budget.most is None else min(count, budget.most),
+    )
+
+
+def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
+    """Return the superpixels per view; a share is one of the Gaussians if they are fewer than pixels, but not few."""
+    per_view = count_for(segment, scene.height, scene.width)
+    if scene.has_own_pixels or segment.per_view is not None:
+        return per_view
+    count = segment.share * scene.num_gaussians
+    if has_few_rows(scene):
+        count = max(count, min(segment.share * _few_pixels(scene), FEW * scene.num_gaussians))
+    return max(1, min(per_view, int(count / scene.num_views)))
+
+
+def has_few_rows(scene: SceneSize) -> bool:
+    """Return whether Gaussians without pixels, such as tokens, are too few for a share of them to show the photos."""
+    shown = scene.pictures == "photos" and not scene.has_own_pixels
+    return shown and scene.num_gaussians < FEW * _few_pixels(scene)
+
+
+def _few_pixels(scene: SceneSize) -> int:
+    return min(FEW_PIXELS, scene.num_views * scene.pixels_per_view)
+
+
+def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptions) -> int:
+    """Return the number of Gaussians that ``superpixels`` and K give; without views, a share of the Gaussians."""
+    count, views = scene.num_gaussians, scene.num_views
+    if views == 0:
+        return round(max(1, int(segment.share * count)) * decode.mean_k)
+    per_view = superpixels_per_view(scene, segment)
+    total = per_view * count // scene.pixels_per_view if scene.has_own_pixels else per_view * views
+    return round(max(views, total) * decode.mean_k)
+
+
+def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:
+    """Return the largest number of Gaussians that a run can give; adaptive superpixels may exceed the request."""
+    if limits.count is not None:
+        return limits.count
+    return min(MAX_ADAPTED * limits.default, limits.max_count) if segment.adapts else limits.default
+
+
+def count_for(options: SegmentOptions, height: int, width: int) -> int:
+    """Return the number of superpixels per view; UsageError if it exceeds the number of pixels."""
+    if options.per_view is not None:
+        if options.per_view > height * width:
+            limit = f"{height * width}, one per pixel of {width} x {height}"
+            raise UsageError(f"superpixels: expected at most {limit}, got {options.per_view}")
+        return options.per_view
+    return max(1, int(options.share * height * width))

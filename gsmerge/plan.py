@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmerge.budget import FileSize, exact_count, file_size, max_allowed
+from gsmerge.budget import CountLimits, FileSize, count_limits, exact_count, file_size, has_few_rows, max_allowed
 from gsmerge.errors import UsageError
 from gsmerge.facts.confirm_depths import FEWEST, Agreement
 from gsmerge.facts.prepare import Prepared
@@ -34,7 +34,7 @@ from gsmerge.settings.stages import (
     MatchOptions,
     SegmentOptions,
 )
-from gsmerge.stages.segment import CountLimits, SharedTree, SuperpixelChoices, count_limits, has_few_rows
+from gsmerge.stages.segment import SharedTree, SuperpixelChoices
 from gsmerge.types import Gaussians, Scene
 
 if TYPE_CHECKING:
@@ -274,7 +274,7 @@ def choose_for_scene(
 ) -> SceneChoices:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
-    ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`. ``keeps``: of options as they
+    ``num_input``, ``num_reserved``: as of :func:`gsmerge.budget.count_limits`. ``keeps``: of options as they
     were given, None: of these.
     """
     keeps = keeps_input(scene, options) if keeps is None else keeps

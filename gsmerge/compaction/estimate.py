@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.budget import largest_count
 from gsmerge.compaction.files import Outputs, check_cameras, sized
 from gsmerge.compaction.make_plan import load_networks
 from gsmerge.compaction.methods import check_method
@@ -38,7 +39,6 @@ from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import available_threads
 from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import OURS, CompactOptions
-from gsmerge.stages.segment import largest_count
 from gsmerge.types import Scene
 
 COARSER = 0.5  # of the time of a result, that each coarser level takes

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.budget import exact_count, max_allowed
-from gsmerge.errors import UsageError
-from gsmerge.facts.scene_size import SceneSize
+from gsmerge.budget import CountLimits
 from gsmerge.geometry import camera_depths
 from gsmerge.kernels.elementary import log, log10
 from gsmerge.kernels.superpixels.merge_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
@@ -22,9 +20,8 @@ from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.budget import BudgetOptions
-from gsmerge.settings.stages import DecodeOptions, SegmentOptions
-from gsmerge.stages.superpixels import MAX_FACTOR, count_for, segment
+from gsmerge.settings.stages import SegmentOptions
+from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups, PicturedScene, Scene, Segmentation
 
 DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median
@@ -33,8 +30,6 @@ COMPACTNESS = 1e-5  # of squared pixels against squared colours; without it regi
 # Largest side of a region, as a share of the image's longer side: the rasterizer's affine approximation bends larger
 # Gaussians. Exceeded only where the budget leaves no other choice.
 MAX_EXTENT = 1 / 8
-FEW_PIXELS = 1 << 18  # of a few small photos
-FEW = 0.5  # times the photos' pixels, up to those: of fewer Gaussians a share is one of pixels, and this one at most
 KNEE_STEP = 1.25  # the slope of the curve is taken over this factor of the count
 KNEE_SLOPE = 1.0  # dB of predicted quality per relative increase of the count: below it, more are not worth it
 KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (noise, views that disagree)
@@ -112,105 +107,6 @@ def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
     tree = shared.get(scene, choices)
     usable = tree.counts >= tree.min_regions  # none larger than MAX_EXTENT
     return max(limits.min_count, min(knee(tree.counts[usable], tree.distortions[usable]), limits.max_count))
-
-
-@dataclass(frozen=True)
-class CountLimits:
-    """Limits on the number of Gaussians that follow from the options."""
-
-    per_view: int  # Superpixels of each view that the options ask for
-    default: int  # Gaussians that `superpixels` and K ask for
-    min_count: int  # Fewest Gaussians that the scene can be cut to: one for each view
-    max_count: int  # Most Gaussians that a budget, a size or a device allows
-    exact: int | None  # Gaussians that a budget or a size asks for; None without either
-    num_pixels: int  # Of all views
-    num_input: int  # Gaussians that the count is one of
-    most: int  # Most Gaussians of those that the scene bears, where that is known
-
-    @property
-    def count(self) -> int | None:
-        """Number of Gaussians set by a budget, a size or a device; None if ``superpixels`` and K decide."""
-        if self.exact is not None:
-            return self.exact
-        return self.max_count if self.default > self.max_count else None
-
-    @property
-    def share(self) -> float:
-        """Gaussians per pixel."""
-        return (self.count or self.default) / max(1, self.num_pixels)
-
-
-def count_limits(
-    scene: SceneSize,
-    segment: SegmentOptions,
-    decode: DecodeOptions,
-    budget: BudgetOptions,
-    *,
-    num_input: int | None = None,
-    num_reserved: int = 0,
-) -> CountLimits:
-    """Compute the limits on the number of Gaussians.
-
-    ``num_input``: number that shares of a budget refer to; None: that of the scene. ``num_reserved``: Gaussians of the
-    result that are fixed already, such as those that no view sees. Raises UsageError if more superpixels are requested
-    than there are pixels, or fewer Gaussians than views.
-    """
-    count, views = scene.num_gaussians, scene.num_views
-    exact = exact_count(budget, count if num_input is None else num_input, scene.sh_degree)
-    if exact is not None:
-        exact = min(max(1, exact - num_reserved), count)
-    max_count = min(max_allowed(budget, count, scene.sh_degree), count if exact is None else exact)
-    if max_count < min(views, count):
-        perhaps = f'; {max_count} % is "{max_count}%"' if max_count <= 100 else ""
-        raise UsageError(f"budget: expected at least {views}, one for each view, got {max_count}{perhaps}")
-    return CountLimits(
-        per_view=superpixels_per_view(scene, segment) if views else 0,
-        default=default_count(scene, segment, decode),
-        min_count=max(1, views),
-        max_count=max_count,
-        exact=exact,
-        num_pixels=views * scene.pixels_per_view,
-        num_input=count,
-        most=count if budget.most is None else min(count, budget.most),
-    )
-
-
-def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
-    """Return the superpixels per view; a share is one of the Gaussians if they are fewer than pixels, but not few."""
-    per_view = count_for(segment, scene.height, scene.width)
-    if scene.has_own_pixels or segment.per_view is not None:
-        return per_view
-    count = segment.share * scene.num_gaussians
-    if has_few_rows(scene):
-        count = max(count, min(segment.share * _few_pixels(scene), FEW * scene.num_gaussians))
-    return max(1, min(per_view, int(count / scene.num_views)))
-
-
-def has_few_rows(scene: SceneSize) -> bool:
-    """Return whether Gaussians without pixels, such as tokens, are too few for a share of them to show the photos."""
-    shown = scene.pictures == "photos" and not scene.has_own_pixels
-    return shown and scene.num_gaussians < FEW * _few_pixels(scene)
-
-
-def _few_pixels(scene: SceneSize) -> int:
-    return min(FEW_PIXELS, scene.num_views * scene.pixels_per_view)
-
-
-def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptions) -> int:
-    """Return the number of Gaussians that ``superpixels`` and K give; without views, a share of the Gaussians."""
-    count, views = scene.num_gaussians, scene.num_views
-    if views == 0:
-        return round(max(1, int(segment.share * count)) * decode.mean_k)
-    per_view = superpixels_per_view(scene, segment)
-    total = per_view * count // scene.pixels_per_view if scene.has_own_pixels else per_view * views
-    return round(max(views, total) * decode.mean_k)
-
-
-def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:
-    """Return the largest number of Gaussians that a run can give; adaptive superpixels may exceed the request."""
-    if limits.count is not None:
-        return limits.count
-    return min(MAX_FACTOR * limits.default, limits.max_count) if segment.adapts else limits.default
 
 
 @dataclass(frozen=True, eq=False)

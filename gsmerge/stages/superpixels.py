@@ -19,7 +19,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from gsmerge.errors import UsageError
+from gsmerge.budget import MAX_ADAPTED, count_for
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels, refine
 from gsmerge.kernels.superpixels.seeds import (
@@ -40,17 +40,6 @@ BLOCK = 32  # side of the squares that the cutting starts from, pixels
 PIXEL_START = 0.45  # above this many rectangles per pixel, merging starts from the pixels themselves
 RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
 SLIC_COMPACTNESS = 10  # scikit-image's default
-MAX_FACTOR = 4  # most times more or fewer superpixels than bass-adaptive starts with
-
-
-def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Return the number of superpixels per view; UsageError if it exceeds the number of pixels."""
-    if options.per_view is not None:
-        if options.per_view > height * width:
-            limit = f"{height * width}, one per pixel of {width} x {height}"
-            raise UsageError(f"superpixels: expected at most {limit}, got {options.per_view}")
-        return options.per_view
-    return max(1, int(options.share * height * width))
 
 
 def segment(
@@ -217,7 +206,7 @@ def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None
     colours = _lab_colours(pixels)
     labels = pad_labels(voronoi(seeds, height, width))
     if segmentation == "bass-adaptive":
-        return adapt_labels(labels, colours, count, MAX_FACTOR, adapt)[0]
+        return adapt_labels(labels, colours, count, MAX_ADAPTED, adapt)[0]
     return infer_labels(labels, colours, count)
 
 

@@ -9,6 +9,7 @@ import unaligned_scenes
 from messages import noted, refuses
 
 from gsmerge import Scene, compact
+from gsmerge.budget import FEW_PIXELS, superpixels_per_view
 from gsmerge.errors import UsageError
 from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.place_cameras import add_views
@@ -21,7 +22,6 @@ from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.assign import assign, find_owners, merge_unseen, middle_pixels, owner_pixels
 from gsmerge.stages.encode import encode, member_rows
-from gsmerge.stages.segment import FEW_PIXELS, superpixels_per_view
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups
 

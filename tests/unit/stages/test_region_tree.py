@@ -10,15 +10,14 @@ import scenes
 from messages import refuses
 
 from gsmerge import Scene
+from gsmerge.budget import CountLimits
 from gsmerge.pooling import Members, scene_members
-from gsmerge.settings.stages import DecodeOptions
+from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 from gsmerge.stages import segment as module
 from gsmerge.stages.decode import decode, split_counts
 from gsmerge.stages.encode import encode
 from gsmerge.stages.segment import (
-    CountLimits,
     RegionTree,
-    SegmentOptions,
     SharedTree,
     SuperpixelChoices,
     cut_tree,
@@ -26,8 +25,8 @@ from gsmerge.stages.segment import (
     knee,
     knee_count,
     region_tree,
-    segment,
 )
+from gsmerge.stages.superpixels import segment
 from gsmerge.types import FeatureGaussians, Groups, PicturedScene
 
 HEIGHT, WIDTH = 40, 60

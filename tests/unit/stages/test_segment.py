@@ -9,10 +9,11 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, Scene
+from gsmerge.budget import count_limits, default_count, largest_count
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
-from gsmerge.stages.segment import SuperpixelChoices, count_limits, default_count, largest_count, segment_scene
+from gsmerge.stages.segment import SuperpixelChoices, segment_scene
 
 ADAPTIVE = {"segmentation": "bass-adaptive", "superpixels": "5%"}
 

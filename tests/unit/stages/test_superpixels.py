@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from messages import refuses
 
+from gsmerge.budget import count_for
 from gsmerge.kernels.superpixels.seeds import seed_density, seeds_from_density
-from gsmerge.settings.stages import SEGMENTATIONS
-from gsmerge.stages.segment import SegmentOptions, count_for, segment
-from gsmerge.stages.superpixels import saliency, superpixels
+from gsmerge.settings.stages import SEGMENTATIONS, SegmentOptions
+from gsmerge.stages.superpixels import saliency, segment, superpixels
 
 
 def random_image(height: int, width: int, seed: int = 0) -> np.ndarray:
