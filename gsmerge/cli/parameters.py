@@ -33,7 +33,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, FileHints, OpacityChoice, ReadHints
-from gsmerge.settings.setting import Setting, change_settings, flat_settings, join_words, near_names, perhaps
+from gsmerge.settings.setting import Setting, change_settings, find_near_names, flat_settings, join_words, suggest_name
 from gsmerge.settings.stages import CROP_FILES, Engine
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
         if not sign:
             raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}")
         if name not in settings:
-            near = join_words(near_names(name, settings, 3, 0.5))
+            near = join_words(find_near_names(name, settings, 3, 0.5))
             near = f"; perhaps {near}" if near else ""
             more = f"{flag} {LIST} lists all" if flag == "--set" else f"expected {join_words(settings)}"
             raise UsageError(f"{flag} {name}: unknown{near}; {more}")
@@ -173,7 +173,7 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
             readings.append([_read_value(part.strip())[0] for part in text.split(",")])
         fitting = [value for value in readings if settings[name].fits(value)]
         if not fitting:
-            expected, near = settings[name].expected(readings[0], null=True), perhaps(text, settings[name].words)
+            expected, near = settings[name].expected(readings[0], null=True), suggest_name(text, settings[name].words)
             raise UsageError(f"{flag} {name}: expected {expected}, got {text!r}{near}")
         values[name] = fitting[0]
     return values

@@ -14,7 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 from gsmerge.cli.parameters import listed_settings
 from gsmerge.errors import UsageError
 from gsmerge.settings.reading import FileHints
-from gsmerge.settings.setting import flat_settings, near_names, perhaps
+from gsmerge.settings.setting import find_near_names, flat_settings, suggest_name
 
 PROGRAM = "gsmerge"
 LAB, LOOK = "lab", "look"  # the group of research commands, and compact with a page, which a scene's name alone calls
@@ -121,7 +121,7 @@ def usage_message(error: Any, make_command: Callable[[], Any]) -> str:
         suggestion = _suggest(error.option_name, error.ctx.command, place, make_command)
         message = suggestion or f"No such option: {error.option_name}"
     elif match := re.search(r": '(.*)' is not one of (.*)", message):
-        message += perhaps(match[1], re.findall("'([^']*)'", match[2]))
+        message += suggest_name(match[1], re.findall("'([^']*)'", match[2]))
     elif message.startswith("Got unexpected extra argument") and has_output:
         message += "; name what is written with -o"
     elif match := re.match(r"No such command '(\w+)'", message):
@@ -162,7 +162,7 @@ def _suggest(option: str, command: Any, place: str, make_command: Callable[[], A
         return f"{option} is no option: the name of -o decides{example}"
     begun = [known for known in names if len(name) > 2 and known.startswith(name)]
     near = [known for known in same if known in names] or (begun if len(begun) == 1 else [])
-    near = near or near_names(name, names, least=_NEAR)
+    near = near or find_near_names(name, names, least=_NEAR)
     if near and not name.startswith("no_"):
         return f"{option} is no option: use {names[near[0]]}"
     owner = None if positive in names else _owner({name, positive, *same}, make_command())
