@@ -1,4 +1,4 @@
-"""The Typer application; it turns exceptions into a line and an exit code."""
+"""The Typer application: build the commands, run one, and turn exceptions into a line and an exit code."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ if TYPE_CHECKING:
 DEBUG = "--debug"
 PROGRESS, STYLES = "--progress", ("bar", "json")
 
-# Panel of the help -> commands, each the function of its name in the module of its name; others are plugins
+# Panel of the help -> commands. A command NAME is the function NAME of the module NAME_command; others are plugins
 COMMANDS = {
     "Compact": ("compact", "convert"),
     "Many scenes, and views in batches": ("batch", "extend"),
     "Look and measure": ("inspect", "view", "render", "evaluate"),
 }
 OWN_COMMANDS = {name for names in COMMANDS.values() for name in names}
-ADDED = "Added by other packages"
-# In 40 columns
-OPENING = """\
+PLUGIN_PANEL = "Added by other packages"
+# Printed by gsmerge without arguments; 40 columns wide
+OVERVIEW = """\
 gsmerge scene.ply   compact it and look
 gsmerge COMMAND -h  what a command takes
 
@@ -65,7 +65,7 @@ lab       research: charts, training"""
 
 
 def make_app(only: str | None = None) -> typer.Typer:
-    """Make the application with all commands, or with ``only`` one, so that the others are not imported."""
+    """Make the application with all commands, or with the command ``only``, so that no other is imported."""
     made = typer.Typer(
         name=PROGRAM, cls=Group, pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
@@ -85,17 +85,15 @@ def make_app(only: str | None = None) -> typer.Typer:
     )
     lab.callback(invoke_without_command=True)(_lab_root)
     for name, entry in find_plugins(PLUGINS).items():
-        is_ours = _is_ours(entry)
-        if only in (None, LAB if is_ours else name) and name not in OWN_COMMANDS:
+        in_lab = _is_research(entry)
+        if only in (None, LAB if in_lab else name) and name not in OWN_COMMANDS:
             try:
                 function = load_plugin(PLUGINS, name)
-            except UsageError as error:  # a package that is broken must not take the others with it
+            except UsageError as error:  # one broken package must not disable the other commands
                 say(str(error), kind="warning")
                 continue
-            place = (
-                lab.command(name, cls=Command) if is_ours else made.command(name, cls=Command, rich_help_panel=ADDED)
-            )
-            place(function)
+            group, panel = (lab, None) if in_lab else (made, PLUGIN_PANEL)
+            group.command(name, cls=Command, rich_help_panel=panel)(function)
     if only in (None, LAB):
         made.add_typer(lab, name=LAB, rich_help_panel="Research")
     return made
@@ -103,9 +101,10 @@ def make_app(only: str | None = None) -> typer.Typer:
 
 @lru_cache
 def make_command(only: str | None = None) -> Any:
-    """Make the command that parses and calls: of all commands, or of ``only`` one.
+    """Make the Click command that parses and calls, with all commands or with ``only`` one.
 
-    The option of Typer that writes into the shell's own files, unasked, is left out; the one that prints stays.
+    Typer's option that installs completion is removed, since it writes into the files of the shell. The one that
+    prints the completion stays.
     """
     command = typer.main.get_command(make_app(only))
     command.params = [param for param in command.params if param.name != "install_completion"]
@@ -117,21 +116,22 @@ def _lab_root(context: typer.Context) -> None:
         print(context.get_help())
 
 
-def _is_ours(entry: EntryPoint) -> bool:
+def _is_research(entry: EntryPoint) -> bool:
+    """Return whether a command comes from this package, not from another one."""
     return entry.module.startswith("gsmerge.")
 
 
 def _command_of(words: list[str]) -> str | None:
-    """Name the only command that is to be imported; None: all, for the help or an error."""
+    """Return the name of the only command to import; None: import all, to show the help or an error."""
     name = words[0] if words else ""
     if name in (*OWN_COMMANDS, LAB, LOOK):
         return name
     entry = find_plugins(PLUGINS).get(name)
-    return None if entry is None or _is_ours(entry) else name
+    return None if entry is None or _is_research(entry) else name
 
 
 def _is_scene(word: str) -> bool:
-    """Return whether a first word is a scene in place of a command: a path that is one, or a name of such files."""
+    """Return whether the first word names a scene instead of a command: an existing path, or a file of Gaussians."""
     if word.startswith("-") or _command_of([word]) is not None:
         return False
     if os.path.lexists(word) or os.path.dirname(word):
@@ -167,27 +167,28 @@ def root(
         typer.Option(
             PROGRESS,
             metavar="|".join(STYLES),
-            help="json: a line for each step on stderr, with the seconds left; also after the name of a command.",
+            help="json: print a line for each step on stderr, with the seconds left; also after the name of a command.",
         ),
     ] = STYLES[0],
 ) -> None:
     """Compact per-pixel 3D Gaussian scenes: 1 to 10 % of the Gaussians, seconds on a CPU."""
     if context.invoked_subcommand is None:
-        print(OPENING)
+        print(OVERVIEW)
 
 
-_SOON = 0.02  # seconds after which a signal is raised again that came where it could not be handled
+_RETRY_SECONDS = 0.02  # delay before a signal is raised again, if it came where it could not be handled
 
 
 @contextmanager
 def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end a block as Ctrl-C does, without unfinished files; list the signals that came.
+    """Let SIGTERM and SIGHUP end the block as Ctrl-C does, without unfinished files.
 
-    Signals that the caller handles or ignores, as under nohup, are left unchanged.
+    Each such signal is added to ``signals``. Signals that the caller handles or ignores, as under nohup, keep their
+    handlers.
     """
 
-    def again(number: int) -> None:
-        timer = threading.Timer(_SOON, signal.raise_signal, (number,))
+    def raise_later(number: int) -> None:
+        timer = threading.Timer(_RETRY_SECONDS, signal.raise_signal, (number,))
         timer.daemon = True
         timer.start()
 
@@ -196,26 +197,26 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
             signals.append(signal.Signals(number))
         raise KeyboardInterrupt
 
-    def try_again(lost: sys.UnraisableHookArgs) -> None:
-        if lost.exc_type is KeyboardInterrupt:  # it came in a library's callback, which has nobody to raise it to
-            again(signals[-1] if signals else signal.SIGINT)
+    def retry(unraisable: sys.UnraisableHookArgs) -> None:
+        if unraisable.exc_type is KeyboardInterrupt:  # came in a library's callback, where no caller can catch it
+            raise_later(signals[-1] if signals else signal.SIGINT)
         else:
-            print_it(lost)
+            usual_hook(unraisable)
 
     usual = {signal.SIGINT: signal.default_int_handler}
     usual |= {getattr(signal, name): signal.SIG_DFL for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)}
     if threading.current_thread() is not threading.main_thread():
         usual = {}
-    ours = {number: signal.getsignal(number) for number in usual}
-    ours = {number: handler for number, handler in ours.items() if handler in (usual[number], stop_at_once)}
-    for number in ours:
+    handlers = {number: signal.getsignal(number) for number in usual}
+    handlers = {number: handler for number, handler in handlers.items() if handler in (usual[number], stop_at_once)}
+    for number in handlers:
         signal.signal(number, stop)
-    print_it, sys.unraisablehook = sys.unraisablehook, try_again
+    usual_hook, sys.unraisablehook = sys.unraisablehook, retry
     try:
         yield
     finally:
-        sys.unraisablehook = print_it
-        for number, handler in ours.items():
+        sys.unraisablehook = usual_hook
+        for number, handler in handlers.items():
             signal.signal(number, handler)
 
 
@@ -225,28 +226,28 @@ def _check_working_directory() -> None:
         os.getcwd()
     except OSError as error:
         reason = f"the working directory cannot be used ({error.strerror})"
-        raise SceneError(os.curdir, reason, "change it") from error
+        raise SceneError(os.curdir, reason, "change to another one") from error
 
 
 def _take_progress(words: list[str]) -> tuple[list[str], list[str]]:
-    """Take the options of progress out of the words, wherever they stand; return the others and the values."""
+    """Remove ``--progress`` from the words, wherever it stands; return the remaining words, and its values."""
     end = words.index("--") if "--" in words else len(words)
-    others, values, i = [], [], 0
+    remaining, values, i = [], [], 0
     while i < end:
         name, equals, value = words[i].partition("=")
         if name != PROGRESS:
-            others.append(words[i])
+            remaining.append(words[i])
         elif equals:
             values.append(value)
         else:
             i += 1
             values.append("".join(words[i : min(i + 1, end)]))
         i += 1
-    return [*others, *words[end:]], values
+    return [*remaining, *words[end:]], values
 
 
 def _check_style(values: Sequence[str]) -> None:
-    """Raise UsageError for several values of how progress is shown, or an unknown one."""
+    """Raise UsageError if ``--progress`` has several values, or an unknown one."""
     if len(values) > 1:
         raise UsageError(f"{PROGRESS}: expected once, got it {len(values)} times")
     style = values[0] if values else STYLES[0]
@@ -262,7 +263,7 @@ def run(args: Sequence[str] | None = None) -> int:
     def fail(message: str, code: int) -> int:
         cause = getattr(sys.exc_info()[1], "__cause__", None)
         if code < 128 and (signals or isinstance(cause, KeyboardInterrupt)):
-            return stopped()  # libraries make errors of their own of it
+            return stopped()  # a library has turned the interruption into an error of its own
         if DEBUG in arguments:
             traceback.print_exc()
         with in_style():
@@ -286,13 +287,13 @@ def run(args: Sequence[str] | None = None) -> int:
             words = [LOOK, *words] if words and _is_scene(words[0]) else words
             command = make_command(_command_of(words))
             code = command(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
-            with suppress(BrokenPipeError):  # whoever read our output has seen enough
+            with suppress(BrokenPipeError):  # the reader of a pipe has closed it
                 sys.stdout.flush()
         return stopped() if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
     except GsmergeError as error:
         return fail(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort) as error:
-        if isinstance(error.__cause__, EOFError):  # which Typer takes for the end of the user's input: there is none
+        if isinstance(error.__cause__, EOFError):  # Typer takes it for the end of user input, which no command reads
             return fail("unexpected error: EOFError; run again with --debug", 1)
         return stopped()
     except BrokenPipeError:

@@ -21,7 +21,7 @@ from gsmerge.settings.stages import Engine
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
 
-MAX_LISTED = 20  # results in the table, failures, and results that are worse than their input
+MAX_LISTED = 20  # rows of the table, failures, and results that are worse than their input
 
 
 def parse_jobs(text: str) -> int:
@@ -34,39 +34,42 @@ def parse_jobs(text: str) -> int:
 
 
 @opt.command(
-    opt.argument("scenes", list[str], "FOLDER|PATTERN|LIST...", "Folders to search for scenes, patterns, .ply files, "
-                 "or text files with one of these per line."),
+    opt.argument("scenes", list[str], "FOLDER|PATTERN|LIST...", "Folders to search for scenes, patterns such as *.ply, "
+                 ".ply files, or text files with one of these per line."),
     *opt.panel(
         opt.INPUT,
-        opt.option("cameras", str, "Cameras: one path for all scenes, or with {scene}, {parent} and {stem} of each in "
-                   "it; none: without.", wording="beside each"),
-        opt.option("images", str, "Folder of the photos, in the same way.", wording="beside each"),
-        opt.option("masks", str, "Folder of their masks, as of compact, in the same way: '{parent}/masks'.",
+        opt.option("cameras", str, "Cameras: one path for all scenes, or a pattern in which {scene}, {parent} and "
+                   "{stem} are replaced by those of each scene; none: without.", wording="beside each"),
+        opt.option("images", str, "Folder of the photos: a path or such a pattern; none: without.",
+                   wording="beside each"),
+        opt.option("masks", str, "Folder of the masks of the photos, as in compact: a path or such a pattern, as "
+                   "'{parent}/masks'; none: without.",
                    wording="beside the photos of each"),
-        opt.option("protect", str, "Folder of images, white where a text or face has to stay sharp, in the same way."),
+        opt.option("protect", str, "Folder of images, white where a text or a face has to stay sharp: a path or such "
+                   "a pattern."),
     ),
     "hint budget quality effort",
     opt.settings_option(CompactOptions, Engine, example="fit=none"),
     *opt.panel(
         "Running",
-        opt.option("jobs", str, "Scenes at once: a number, or auto.", wording="auto", parser=parse_jobs,
-                   metavar="N|auto"),
+        opt.option("jobs", str, "Number of scenes to run at the same time, or auto.", wording="auto",
+                   parser=parse_jobs, metavar="N|auto"),
     ),
     "engine",
-    opt.output("Folder for the results; scenes whose result it holds are skipped.", default=opt.REQUIRED),
+    opt.output("Folder for the results. Scenes whose results are already in it are skipped.", default=opt.REQUIRED),
     *opt.panel(
         opt.OUTPUT,
-        opt.option("name", str, "Name of a result: {stem}, {parent}, {index} and {k} are filled in.",
+        opt.option("name", str, "Name of each result; {stem}, {parent}, {index} and {k} are replaced.",
                    default="{stem}.ply", metavar="NAME"),
     ),
-    opt.changed("overwrite", False, help="Compact scenes again, and replace files in the folder that no batch wrote "
-                "with these settings."),
+    opt.changed("overwrite", False, help="Compact all scenes again. Also replace files in the folder that were not "
+                "written by a batch with these settings."),
     "strict dry_run seed",
-    opt.changed("threads", help="Threads of each scene.", show_default="processors by jobs"),
+    opt.changed("threads", help="Number of threads of each scene.", show_default="processors by jobs"),
     opt.changed("json", False, help="Print one line of JSON per scene on stdout."),
 )  # fmt: skip
 def batch(args: opt.Args) -> None:
-    """Compact many scenes, each on its own: a failure stops no other scene, and a second call continues."""
+    """Compact many scenes, each on its own. A failure stops no other scene, and a second call continues."""
     out = args.output
     if out.exists() and not out.is_dir():
         raise UsageError(f"--output: expected a folder, found the file {out}")
@@ -94,7 +97,7 @@ def batch(args: opt.Args) -> None:
 
 
 def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
-    """Compact all scenes, report each, and sum up."""
+    """Compact all scenes, report each one, and print a summary."""
     from gsmerge.batch.run import choose_concurrency
 
     totals, stdout = Totals(len(jobs)), sys.stdout
@@ -117,15 +120,15 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     worse = ""
     if totals.worse:
         worse = f"{len(totals.worse)} of {totals.total} results show their photos worse than the input"
-        worse += _first(totals.worse, listed=not args.silent)
+        worse += _first_reason(totals.worse, listed=not args.silent)
     if worse and not args.strict:
         say_warning(worse, quiet=args.silent)
     check_failures(totals.failed, len(jobs), "scenes", listed=not args.silent)
     if totals.unmet:
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
     if totals.left_out:
-        left_out = f"{len(totals.left_out)} of {totals.total} scenes are read without what does not belong to them"
-        left_out += _first(totals.left_out, listed=not args.silent)
+        left_out = f"{len(totals.left_out)} of {totals.total} scenes have cameras or photos beside them of other scenes"
+        left_out += _first_reason(totals.left_out, listed=not args.silent)
         worse = f"{worse}; {left_out}" if worse else left_out
     if worse and args.strict:
         raise TargetError(worse)
@@ -138,12 +141,12 @@ def run_jobs(
     add: Callable[[dict[str, Any]], None],
     name: str = "scene",
 ) -> None:
-    """Run jobs, show progress, and pass each record to ``add``; ``name``: key in a record with the name of its job."""
+    """Run jobs, show progress, and pass each record to ``add``; ``name``: key of the job's name in a record."""
     from gsmerge.batch import run_batch
     from gsmerge.batch.records import FAILED, SKIPPED
 
     num_failed, weights = 0, {job.output: 1 + job.num_gaussians for job in jobs}
-    done, every = 0, sum(weights.values())  # of what is made in this run
+    done, total = 0, sum(weights.values())  # weight of what this run makes
     with (
         separate_stdout(options.engine, quiet=args.silent),
         closing(run_batch(jobs, args.output, options)) as records,
@@ -155,38 +158,39 @@ def run_jobs(
             num_failed += record["status"] == FAILED
             weight = weights.get(record["output"], 0)
             if record["status"] == SKIPPED:
-                every -= weight
+                total -= weight
             else:
                 done += weight
-            share = done / every if every > 0 else 1.0
+            share = done / total if total > 0 else 1.0
             progress(record[name], record["status"], num_ended, why, num_failed, share)
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
-    """Raise BatchError if jobs ``failed`` (name, reason), with the first reason unless they were ``listed``."""
+    """Raise BatchError if jobs ``failed`` (name, reason); it gives the first reason unless all were ``listed``."""
     if failed:
-        raise BatchError(f"{len(failed)} of {total} {unit} failed{_first(failed, listed=listed)}")
+        raise BatchError(f"{len(failed)} of {total} {unit} failed{_first_reason(failed, listed=listed)}")
 
 
-def _first(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
+def _first_reason(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
+    """Return the first scene and its reason, for the end of a message; "" if all were ``listed`` before."""
     scene, why = reasons[0]
     return "" if listed else f"; the first: {scene}: {why}"
 
 
 @dataclass
 class Totals:
-    """What a run made, for the lines at its end."""
+    """Results of a run, for the lines at its end."""
 
     total: int  # scenes
-    counts: Counter[str] = field(default_factory=Counter)  # of them, by status
-    num_input: int = 0  # Gaussians in the scenes that were done
+    counts: Counter[str] = field(default_factory=Counter)  # scenes by status
+    num_input: int = 0  # Gaussians in the scenes that were compacted
     num_output: int = 0  # Gaussians in their results
     unmet: int = 0  # results that miss their target
-    rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results that were made
-    unused: list[tuple[str, str]] = field(default_factory=list)  # scene, and its columns that are not used
+    rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results
+    unused: list[tuple[str, str]] = field(default_factory=list)  # scene, and the columns of it that are not used
     worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
-    left_out: list[tuple[str, str]] = field(default_factory=list)  # scene, and the note on what beside it is left out
-    lacking: list[tuple[str, str]] = field(default_factory=list)  # scene, and which cameras or photos it has none of
+    left_out: list[tuple[str, str]] = field(default_factory=list)  # scene, and the note on files that are not its own
+    lacking: list[tuple[str, str]] = field(default_factory=list)  # scene, and the cameras or photos that it lacks
     failed: list[tuple[str, str]] = field(default_factory=list)  # scene and reason
 
     def add(self, record: Mapping[str, Any]) -> None:
@@ -215,7 +219,7 @@ class Totals:
                 self.rows.append(_row(record["output"], report))
 
     def lines(self, columns: int | None = None) -> list[str]:
-        """Write a table of the results, ``columns`` wide, what is worse, what failed, and a line of totals."""
+        """Format the end of a run: a table, ``columns`` wide, of the results, notes, failures, and a line of totals."""
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.io.formats.columns import UNUSED
         from gsmerge.io.image_names import natural_key
@@ -249,23 +253,21 @@ class Totals:
 
 
 def _describe_lack(num_views: int) -> str:
-    """Describe what a scene without photos that show it lacks."""
-    named = "in the named folder; --images names photos"
-    return (
-        f"no photos found beside it or {named}"
-        if num_views
-        else f"no cameras found beside it or {named}, --cameras cameras"
-    )
+    """Describe what is missing for a scene that no photo shows."""
+    if num_views:
+        return "no photos found beside it or in the named folder; name them with --images"
+    return "no cameras found beside it or in the named folder; name them with --cameras, and photos with --images"
 
 
 def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the row of the table for a result and its report."""
     from gsmerge.raster.metrics import MAX_PSNR
     from gsmerge.runtime.memory import human_share
 
     psnr = report["psnr_input_views"]
     quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
     if judged := report["choices"].get("fidelity"):
-        # which it is compared with, for lack of photos
+        # without photos the result is compared with the input
         quality = ["the input", "equal" if judged["psnr"] >= MAX_PSNR else f"{judged['psnr']:.2f}"]
     counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
     gain = "" if new is None else f"{new['low']:+.1f} to {new['high']:+.1f} dB"
@@ -275,25 +277,30 @@ def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
 def print_plan(
     args: opt.Args, jobs: Sequence[Job], options: BatchOptions, unit: str = "scenes", notes: Sequence[str] = ()
 ) -> None:
-    """Print what a run would do; ``unit``: word for the jobs."""
+    """Print what a run would do; ``unit``: word for its jobs."""
     from gsmerge.batch.run import choose_concurrency, pending_jobs
     from gsmerge.report import document_head
 
     out, pending, concurrency = args.output, pending_jobs(jobs, args.output, options), choose_concurrency(jobs, options)
-    left = {job.output for job, _ in pending}
+    pending_outputs = {job.output for job, _ in pending}
     num_refused = sum(why is not None for _, why in pending)
-    num_left = len(pending) - num_refused
+    num_pending = len(pending) - num_refused
     document = {
         **document_head(),
         "dry_run": True,
         "output": str(out),
         f"num_{unit}": len(jobs),
-        "num_pending": num_left,
+        "num_pending": num_pending,
         "jobs": concurrency.jobs,
         "threads": concurrency.threads,
         unit: [
-            {"scene": j.scene, "output": j.output, "num_gaussians": j.num_gaussians, "done": j.output not in left}
-            for j in jobs
+            {
+                "scene": job.scene,
+                "output": job.output,
+                "num_gaussians": job.num_gaussians,
+                "done": job.output not in pending_outputs,
+            }
+            for job in jobs
         ],
         "options": options.settings.to_dict(),
         "notes": list(notes),
@@ -301,5 +308,5 @@ def print_plan(
     lines = [f"{job.scene} -> {f'refused: {why}' if why else out / job.output}" for job, why in pending]
     lines += [f"note: {note}" for note in notes]
     refused = f", {num_refused:,} refused" if num_refused else ""
-    lines.append(f"would write {out}: {num_left:,} of {len(jobs):,} {unit} to do{refused}, {concurrency}")
+    lines.append(f"would write {out}: {num_pending:,} of {len(jobs):,} {unit} to do{refused}, {concurrency}")
     print_document(document, lines, as_json=args.json)

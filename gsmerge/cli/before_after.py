@@ -1,4 +1,4 @@
-"""Read a scene, its compact versions and unseen views, for the commands that compare or measure them."""
+"""Read a scene, its compact versions and held-out views, for the commands that compare or measure them."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from gsmerge.scene.read import Loaded
     from gsmerge.types import Cameras, Gaussians, Scene, Views
 
-SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing and reading may make
+TOLERANCE = 1e-5  # difference of two equal poses after writing and reading, absolute and relative
 
 
 def lpips_networks(
     choice: str | None, usual: Sequence[str] = EvaluateOptions().lpips
 ) -> tuple[tuple[str, ...], list[str]]:
-    """Choose LPIPS networks by ``--lpips``, by default those ``usual`` that are installed; with a note if none is."""
+    """Choose LPIPS networks by ``--lpips``, by default the ``usual`` ones that are installed; add a note if none is."""
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
     if choice is None:
         nets = tuple(net for net in usual if lpips_available(net))
-        return nets, [] if nets else [f"LPIPS is left out, its weights are not installed: {INSTALL}"]
+        return nets, [] if nets else [f"LPIPS is left out, since its weights are not installed: {INSTALL}"]
     nets = {"both": NETS, "none": ()}.get(choice, (choice,))
     if not all(map(lpips_available, nets)):
-        raise UsageError(f"--lpips: its weights are not installed: {INSTALL}; or pass --lpips none")
+        raise UsageError(f"--lpips: the weights are not installed: {INSTALL}; or pass --lpips none")
     return nets, []
 
 
@@ -41,11 +41,12 @@ class BeforeAfter:
     """A scene and its compact versions, as commands compare them."""
 
     load: Loaded  # the scene as it was read
-    scene: Scene  # the same with views: placed ones where it has none
-    held_out: Views | None  # views that were no input
+    scene: Scene  # the scene with views; placed views if it has none
+    held_out: Views | None  # views that were not part of the input
     plys: dict[str, GaussianFile]  # the compact versions by name
-    cameras: dict[str, Cameras]  # of the input views, by name of a version that was made with others than the scene's
-    notes: list[str]  # what was adapted, one sentence each
+    # Cameras of the input views, by name of a version, for versions whose cameras differ from those of the scene
+    cameras: dict[str, Cameras]
+    notes: list[str]  # one sentence for each adaptation
 
     @property
     def title(self) -> str:
@@ -67,7 +68,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     from gsmerge.runtime.record import record_run
     from gsmerge.scene.files import result_cameras
 
-    if files.cameras is None and "cameras" not in files.named:  # a result may know those that its scene has lost
+    if files.cameras is None and "cameras" not in files.named:  # a result may hold cameras that its scene has lost
         files = replace(files, cameras=next(filter(None, map(result_cameras, args.after)), None))
     load, notes = args.load(files), list[str]()
     views = vars(args).get("views")
@@ -80,14 +81,15 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
     if plys and all(ply.info.count > load.info.count for ply in plys.values()):
         notes.append(
-            f"{files.ply.name} has fewer Gaussians than what is compared with it: are before and after exchanged?"
+            f"{files.ply.name} has fewer Gaussians than the files it is compared with; perhaps BEFORE and AFTER are"
+            " swapped"
         )
     cameras, moved = own_cameras(args.after, scene)
     return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *adapted, *notes, *moved])
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
-    """Read the cameras that ``compact`` wrote into results or beside them, as the fit moved them; with notes."""
+    """Read the cameras that ``compact`` wrote into or beside results and that the fit has moved; with notes."""
     import numpy as np
 
     from gsmerge.frame import scene_depth
@@ -100,34 +102,34 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     for name, path in zip(file_names(paths), paths, strict=True):
         holder, read = result_cameras(path), None
         if holder is not None and scene.is_shown:
-            with suppress(SceneError):  # whose ever it is, results can be measured without it
+            with suppress(SceneError):  # the results can be measured without this file, whoever wrote it
                 read = read_cameras(holder)
         if read is None or holder is None or read.names != scene.names:
             continue
-        if np.allclose(read.viewmats, start, rtol=SAME, atol=SAME):
+        if np.allclose(read.viewmats, start, rtol=TOLERANCE, atol=TOLERANCE):
             continue
         cameras[name] = replace(scene.cameras, viewmats=read.viewmats)
         moves = describe_moves(list_moves(scene.names, start, read.viewmats, scene_depth(scene)))
-        notes.append(f"{name}: its input views are seen from the cameras in {holder.name}, moved by {moves}")
+        notes.append(f"{name}: its input views are drawn from the cameras in {holder.name}, which are moved by {moves}")
     return cameras, notes
 
 
 def require_views(load: Loaded) -> None:
     """Raise SceneError if a scene has no cameras."""
     if len(load.scene) == 0:
-        problem = "expected cameras to measure from, found none beside it"
+        problem = "expected cameras to measure from, found none beside the scene"
         raise SceneError(load.files.ply, problem, "name them with --cameras")
 
 
 def held_out_views(
     load: Loaded, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[Scene, Views | None, tuple[str, ...]]:
-    """Choose the context views of ``--views``, and the held-out views; return scene, held-out views and notes."""
+    """Choose the context views by ``--views``, and the held-out views; return scene, held-out views and notes."""
     from gsmerge.facts.views import even_views, midpoint_views, subset
     from gsmerge.scene.held_out import read_held_out
 
     if target_images is not None and targets is None:
-        raise UsageError("--target-images: expected the cameras of those photos too; name them with --targets")
+        raise UsageError("--target-images: expected the cameras of these photos too; name them with --targets")
     read = None if targets is None else read_held_out(load, targets, target_images)
     notes = () if read is None else read.notes
     if views is None:
@@ -137,9 +139,7 @@ def held_out_views(
     chosen: Sequence[int] = ()
     if read is not None:
         if read.context_places is None:
-            raise UsageError(
-                "--views: expected --targets that also name the input views, in the order of the trajectory"
-            )
+            raise UsageError("--views: expected --targets to name the input views too, in the order of the trajectory")
         chosen = midpoint_views([read.context_places[i] for i in ids], read.places)
         if not chosen:
             raise UsageError(f"--views {views}: expected held-out views between the input views, found none")
@@ -147,7 +147,7 @@ def held_out_views(
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:
-    """Name each file uniquely: by file name if all differ, otherwise by path; UsageError for repeated files."""
+    """Name each file uniquely: by file name if all names differ, otherwise by path; UsageError for a repeated file."""
     if len(set(paths)) < len(paths):
         raise UsageError(f"expected every result once, got {max(paths, key=paths.count)} twice")
     short = [path.name for path in paths]

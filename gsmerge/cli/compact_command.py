@@ -1,4 +1,4 @@
-"""``gsmerge compact``: the main job, and Gaussians of Feature Gaussians that ``gsmerge extend`` made."""
+"""``gsmerge compact``: compact a scene, or decode the Feature Gaussians of ``gsmerge extend`` into Gaussians."""
 
 from __future__ import annotations
 
@@ -41,21 +41,20 @@ if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
     from gsmerge.scene.read import Loaded
 
-STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there at once
-MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
-# Arguments and options that say something about Feature Gaussians, too
-OF_FEATURES = ("scenes", "k", "set", "output", "overwrite", "dry_run", "open", "json", "quiet", "threads")
+STREAMED_LEVELS = 3  # of a lod-meta.json; the coarsest level, a sixteenth, loads at once
+REMEDY = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
+# Arguments and options that apply to Feature Gaussians too
+FEATURE_OPTIONS = ("scenes", "k", "set", "output", "overwrite", "dry_run", "open", "json", "quiet", "threads")
 
 
 PARAMETERS = (
-    opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
-                 "or the folder it is in; several of one place, as SHARP writes them, are joined. Or a .gsm of gsmerge "
-                 "extend."),
+    opt.argument("scenes", list[Path], "SCENE...", "A .ply of Gaussians, or the folder that holds it. "
+                 "Several scenes of one place, as SHARP writes them, are joined. Or a .gsm of gsmerge extend."),
     f"{opt.READING} masks protect budget quality levels k effort fit",
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
-    opt.output(f"{opt.COMPACT_SCENE} .html: a page to send, with a viewer. lod-meta.json: levels that stream; "
-               "colmap: a COLMAP model; any other folder gets SCENE.compact.ply.", "SCENE.compact.ply"),
+    opt.output(f"{opt.COMPACT_SCENE} .html: one page with a viewer, to send. lod-meta.json: levels for streaming. "
+               "colmap: a COLMAP model. Any other folder gets SCENE.compact.ply.", "SCENE.compact.ply"),
     "overwrite strict dry_run seed threads",
 )  # fmt: skip
 
@@ -68,16 +67,16 @@ def compact(args: opt.Args) -> None:
 
 @opt.command(*PARAMETERS, "open")
 def look(args: opt.Args) -> None:
-    """Compact a scene, and open a page with the result beside it: ``gsmerge SCENE``."""
+    """Compact a scene, and open a page that compares it with the result: ``gsmerge SCENE``."""
     scene, features = args.scenes[0], _features_in(args.scenes)
     usual = default_output(scene if features else args.files(*args.scenes).base)
     writing: FileOptions = args.make(CompactOptions, FileOptions, Engine)[1]
     args.output = output_file(args.output or usual, usual.name, site=writing.site)
-    # Files that were joined, and Feature Gaussians, have no page of their own
+    # The page cannot show joined files or Feature Gaussians, so it shows the result alone
     shown = [args.output] if features or len(args.scenes) > 1 else [scene, args.output]
     if os.path.lexists(args.output) and not (args.overwrite or args.dry_run):
         words = shlex.join(["gsmerge", "view", *map(str, shown)])
-        raise UsageError(f"{args.output}: exists already; {words} shows it, --overwrite makes it anew")
+        raise UsageError(f"{args.output}: exists already; {words} shows it, --overwrite makes it again")
     loads = list["Loaded"]()
     _compact(args, loads.append)
     from gsmerge.io.formats.table import VIEWED
@@ -88,13 +87,13 @@ def look(args: opt.Args) -> None:
 
     before, *after = shown
     cameras = {} if len(shown) == 1 else args.given(("cameras", "images", "masks", "protect", "hint"))
-    loaded = replace(loads[0], notes=()) if after else None  # which were said
-    wanted = args.open and not args.json
-    opt.call(view, before=before, after=after, **cameras, open=wanted, quiet=args.silent, loaded=loaded)
+    loaded = replace(loads[0], notes=()) if after else None  # its notes have been printed already
+    opens = args.open and not args.json
+    opt.call(view, before=before, after=after, **cameras, open=opens, quiet=args.silent, loaded=loaded)
 
 
 def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) -> None:
-    """Run ``compact``; ``on_read`` is called with the scene, which a page shows later."""
+    """Run ``compact``; ``on_read`` is called with the scene after reading it."""
     start = perf_counter()
     features = _features_in(args.scenes)
     if features is not None:
@@ -119,22 +118,21 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     if chosen.levels == "inside" and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
     if not chosen.levels and settings.budget.levels > 1:
-        raise UsageError(f"{out}: expected no --levels for {chosen.about.partition(':')[0]}, which holds one")
+        raise UsageError(f"{out}: expected no --levels for {chosen.about.partition(':')[0]}, which holds one level")
     if settings.budget.in_bytes and not output_format(out, levels=True, cameras=True).each:
-        raise UsageError(f"{out}: expected a --budget in Gaussians for such files, got {settings.budget.budget}")
+        raise UsageError(f"{out}: expected a --budget in Gaussians for this format, got {settings.budget.budget}")
     num_apart = settings.budget.levels if chosen.levels == "apart" else 1
     levels = [level_output(out, level) for level in range(1, num_apart)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras and not chosen.cameras else None
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
     inputs = (*input_files(files), *networks)
-    beside = cameras if args.overwrite else None  # otherwise it may be there already, for another format
-    named = (out, *files_beside(out, site=writing.site), *levels, beside)
-    check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
+    # Without --overwrite the camera file may exist, from a result in another format
+    replaced_cameras = cameras if args.overwrite else None
+    written = (out, *files_beside(out, site=writing.site), *levels, replaced_cameras)
+    check_outputs(written, inputs, overwrite=args.overwrite or args.dry_run)
     check_format(out, writing)
     if writing.columns == "full" and settings.budget.in_bytes:
-        raise UsageError(
-            f"columns full: expected a --budget as a number or a share with it, got {settings.budget.budget}"
-        )
+        raise UsageError(f"columns full: expected a --budget that is a number or a share, got {settings.budget.budget}")
     if args.dry_run:
         print_plan(args, files, settings, out, hints)
         return
@@ -155,7 +153,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
 
 
 def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
-    """Print the report of a run; TargetError if a target is missed. Unless a page is ``shown``, say how to look."""
+    """Print the report of a run, and how to view it unless a page is ``shown``; TargetError if a target is missed."""
     from gsmerge.compaction.report import curve_lines, level_lines, result_table, summary_line
     from gsmerge.io.formats.table import VIEWED, find_format
 
@@ -163,28 +161,28 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     say_notes([note for note in document["notes"] if note not in doubts], quiet=args.silent)
     lines = [summary_line(document), *level_lines(document), *curve_lines(document)]
     if sys.stdout.isatty():
-        look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
-        look = ["python", "-m", "http.server", "-d", str(out.parent)] if out.name == find_format(out).site else look
-        next_step = shlex.join([f"./{word}" if word.endswith(out.name) and word[0] == "-" else word for word in look])
+        words = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
+        words = ["python", "-m", "http.server", "-d", str(out.parent)] if out.name == find_format(out).site else words
+        next_step = shlex.join([f"./{word}" if word.endswith(out.name) and word[0] == "-" else word for word in words])
         lines = result_table(document, next_step or None, columns=terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     unchecked = document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]
     if args.strict and unchecked and not document["worse"]:
-        say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
+        say_notes(["--strict: nothing was checked, since there is no photo to compare with"], quiet=args.silent)
     problems = [document["unmet"], *(doubts if args.strict else [])]
     if document["worse"] and not args.strict:
         own = document["psnr_input_views"]
         lost = "fidelity" in document["choices"] or (own["after"] is not None and own["after"] < own["before"])
-        say_warning(f"{document['worse']}; {MORE}" if lost else document["worse"], quiet=args.silent)
+        say_warning(f"{document['worse']}; {REMEDY}" if lost else document["worse"], quiet=args.silent)
     if any(problems):
         raise TargetError("; ".join(filter(None, problems)))
 
 
 def _decode(args: opt.Args, path: Path, start: float) -> None:
-    """Write Gaussians of the Feature Gaussians in a ``.gsm``; ``start``: the time when the command began."""
+    """Decode the Feature Gaussians of a ``.gsm`` and write the result; ``start``: time when the command began."""
     if len(args.scenes) > 1:
-        raise UsageError(f"{path}: expected Feature Gaussians alone, got {len(args.scenes)} inputs")
-    args.require_scene(OF_FEATURES, path)
+        raise UsageError(f"{path}: expected Feature Gaussians as the only input, got {len(args.scenes)} inputs")
+    args.require_scene(FEATURE_OPTIONS, path)
     from gsmerge.settings.stages import DecodeOptions
     from gsmerge.states.files import decode_file, decoding_line
 
@@ -202,7 +200,7 @@ def _decode(args: opt.Args, path: Path, start: float) -> None:
 
 
 def _features_in(scenes: Sequence[Path]) -> Path | None:
-    """Return the first path that is a ``.gsm`` of Feature Gaussians; None without one."""
+    """Return the first path that is a ``.gsm`` of Feature Gaussians; None if there is none."""
     states = [path for path in scenes if path.suffix.lower() == SUFFIX and path.is_file()]
     if not states:
         return None
@@ -217,7 +215,7 @@ def _check_scenes(args: opt.Args) -> None:
         return
     if args.cameras not in (None, NONE):
         problem = "--cameras: expected one scene with it, got several"
-        raise UsageError(f"{problem}, whose cameras are beside or inside them")
+        raise UsageError(f"{problem}; the cameras of several scenes are read from beside or inside them")
     for place, scene in enumerate(args.scenes):
         if not os.path.lexists(scene):
             raise UsageError(f"{scene}: no such scene; name the output with -o")
@@ -227,7 +225,7 @@ def _check_scenes(args: opt.Args) -> None:
 
 
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:
-    """Warn before reading if the scene is not likely to fit into memory; not if it is compacted in blocks."""
+    """Warn before reading if the scene, or the largest of its blocks, is not likely to fit into memory."""
     from gsmerge.compaction.partition import gaussians_at_once
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.plan import wanted_blocks
@@ -242,7 +240,7 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
 
 
 def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
-    """Print an estimate of what ``compact`` would make of a scene."""
+    """Print an estimate of the result that ``compact`` would make."""
     from gsmerge.compaction.estimate import plan_files, plan_lines
     from gsmerge.compaction.files import Outputs, read_input
 

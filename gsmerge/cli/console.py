@@ -14,29 +14,29 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-Progress = Callable[[str, int, int], None]
-RunProgress = Callable[[str, str, int, str, int, float], None]  # see total_progress
+Progress = Callable[[str, int, int], None]  # stage, done, total
+RunProgress = Callable[[str, str, int, str, int, float], None]  # arguments: see total_progress
 
 Kind = Literal["info", "note", "warning", "error"]  # of a line on stderr
-STARTS: Mapping[Kind, str] = {
+PREFIXES: Mapping[Kind, str] = {
     "info": "", "note": "note: ", "warning": "gsmerge: warning: ", "error": "gsmerge: error: ",
 }  # fmt: skip
 MAX_LINE = 5000  # characters
-SHORT = 5  # seconds: what is left is shown from so many on
-NARROW = 60  # columns below which bars are short and say less
-OPENING = "start ..."  # on a terminal until a command has its first line or bar
+LEAST_SHOWN = 5  # seconds; a shorter remaining time is not shown
+NARROW = 60  # columns; narrower terminals get shorter bars with less text
+OPENING = "start ..."  # shown on a terminal until a command prints its first line or bar
 
 
 @dataclass
 class JsonLines:
-    """Lines of JSON on stderr: when they began, and how far the run is, as a share and in seconds left."""
+    """Progress as lines of JSON on stderr."""
 
     start: float = field(default_factory=time.monotonic)
-    share: float | None = None
-    left: float | None = None
+    share: float | None = None  # of the run that is done; None: unknown
+    left: float | None = None  # seconds; None: unknown
 
     def print(self, event: Mapping[str, Any]) -> None:
-        """Print an event with the seconds since the start, and how far the run is."""
+        """Print an event with the seconds since the start, the share that is done and the seconds left."""
         _erase_opening()
         share, left = self.share, self.left
         numbers = {"share": None if share is None else round(share, 3), "seconds": round(self.seconds, 2)}
@@ -45,7 +45,7 @@ class JsonLines:
             print(json.dumps({**event, **numbers}), file=sys.stderr, flush=True)
 
     def move(self, share: float | None, left: float | None) -> None:
-        """Take how far the run is; a share never goes back."""
+        """Set the share that is done and the seconds left; the share never decreases."""
         self.share = share if self.share is None else max(self.share, share or 0.0)
         self.left = left
 
@@ -55,8 +55,8 @@ class JsonLines:
         return time.monotonic() - self.start
 
 
-_stream: ContextVar[JsonLines | None] = ContextVar("stream", default=None)  # of progress as lines of JSON
-_opening: list[str] = []  # what stands on the terminal's last line, to be erased
+_stream: ContextVar[JsonLines | None] = ContextVar("stream", default=None)  # None: progress is not shown as JSON
+_opening: list[str] = []  # text on the terminal's last line that has to be erased
 
 
 def one_line(text: str) -> str:
@@ -67,7 +67,7 @@ def one_line(text: str) -> str:
 
 @contextmanager
 def opening_line(*, quiet: bool) -> Iterator[None]:
-    """Show at once on a terminal, unless ``quiet``, that a command runs, since imports may take a second."""
+    """Show that a command has started, since imports may take a second; only on a terminal and unless ``quiet``."""
     with suppress(OSError):
         if not quiet and sys.stderr.isatty():
             _opening.append(f"{OPENING:>16}")
@@ -79,15 +79,16 @@ def opening_line(*, quiet: bool) -> Iterator[None]:
 
 
 def _erase_opening() -> None:
+    """Erase the text of :func:`opening_line` from the terminal."""
     while _opening:
         with suppress(OSError):
             print("\r" + " " * len(_opening.pop()), end="\r", file=sys.stderr, flush=True)
 
 
 def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
-    """Print one line on stderr unless ``quiet``, wrapped in a terminal; ignore a closed stderr.
+    """Print one line on stderr unless ``quiet``; wrap it on a terminal, and ignore a closed stderr.
 
-    Notes, warnings and errors begin with what they are. Beside progress as JSON, each is an object with that as a key.
+    Notes, warnings and errors begin with their kind. With progress as JSON, a line is an object whose key is the kind.
     """
     if quiet:
         return
@@ -98,13 +99,13 @@ def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
     from gsmerge.report import wrap_line
 
     _erase_opening()
-    text = one_line(STARTS[kind] + message)
+    text = one_line(PREFIXES[kind] + message)
     with suppress(OSError):
         print("\n".join(wrap_line(text, terminal_columns(sys.stderr))), file=sys.stderr, flush=True)
 
 
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
-    """Print a line on stderr for each note about the input or the run, unless ``quiet``; a warning of a bad result."""
+    """Print each note on stderr unless ``quiet``; a note that the result is worse than the input becomes a warning."""
     from gsmerge.raster.metrics import WORSE
 
     for note in notes:
@@ -116,8 +117,8 @@ def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
 
 def say_warning(text: str, *, quiet: bool = False) -> None:
     """Print a warning on stderr unless ``quiet``, in red on terminals or with ``FORCE_COLOR``, without ``NO_COLOR``."""
-    wanted = sys.stderr.isatty() or os.environ.get("FORCE_COLOR")
-    colored = not (quiet or _stream.get()) and bool(wanted) and not os.environ.get("NO_COLOR")
+    has_colors = sys.stderr.isatty() or os.environ.get("FORCE_COLOR")
+    colored = not (quiet or _stream.get()) and bool(has_colors) and not os.environ.get("NO_COLOR")
     with suppress(OSError):
         print("\033[31m" * colored, end="", file=sys.stderr)
         say(text, kind="warning", quiet=quiet)
@@ -125,7 +126,7 @@ def say_warning(text: str, *, quiet: bool = False) -> None:
 
 
 def terminal_columns(stream: Any) -> int | None:
-    """Return the width of a stream's terminal; None if it is no terminal."""
+    """Return the width of a stream's terminal in columns; None if the stream is not a terminal."""
     return shutil.get_terminal_size().columns if stream.isatty() else None
 
 
@@ -146,7 +147,7 @@ def print_document(
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Print warnings in the block as one line each, without file and line number; those of numpy as one note."""
+    """Print each warning in the block on one line, without file and line number; those of NumPy as one note."""
     numbers: list[str] = []
 
     def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
@@ -154,7 +155,7 @@ def plain_warnings() -> Iterator[None]:
             say(str(message), kind="warning")
             return
         if not numbers:
-            say(f"some numbers are too large, or undefined ({message})", kind="note")
+            say(f"some numbers are too large or undefined ({message})", kind="note")
         numbers.append(str(message))
 
     with warnings.catch_warnings():
@@ -163,19 +164,20 @@ def plain_warnings() -> Iterator[None]:
 
 
 def _terminal(*, quiet: bool) -> Any:
-    """Open Rich's console on stderr; None when quiet or where stderr is no terminal."""
+    """Open Rich's console on stderr; None if quiet, or if stderr is not a terminal."""
     if quiet:
         return None
     from rich.console import Console
 
     _erase_opening()
     console = Console(stderr=True)
-    console.width = max(20, console.width - len("^C") - 1)  # which the terminal prints, and which must not begin a line
+    # The terminal prints ^C after the bar on Ctrl-C, which must not wrap to a new line
+    console.width = max(20, console.width - len("^C") - 1)
     return console if console.is_terminal else None
 
 
 def _bar(console: Any) -> Any:
-    """Make the column of bars, which are short in a narrow terminal."""
+    """Make the column of progress bars, shorter in a narrow terminal."""
     from rich.progress import BarColumn
 
     return BarColumn(16 if console.width >= NARROW else 8)
@@ -183,7 +185,7 @@ def _bar(console: Any) -> Any:
 
 @contextmanager
 def json_progress(lines: JsonLines | None = None) -> Iterator[None]:
-    """Print progress in the block as lines of JSON on stderr, whatever else is quiet; continue ``lines`` if given."""
+    """Print progress in the block as lines of JSON on stderr, even with ``--quiet``; continue ``lines`` if given."""
     token = _stream.set(lines or JsonLines())
     try:
         yield
@@ -192,7 +194,7 @@ def json_progress(lines: JsonLines | None = None) -> Iterator[None]:
 
 
 def _print_stages(stream: JsonLines) -> Progress:
-    """Return a progress that prints each event with how far the run is."""
+    """Return a progress callback that prints each event as JSON."""
     from gsmerge.runtime.record import current_forecast
     from gsmerge.runtime.time_left import Forecast
 
@@ -232,7 +234,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
 
         def render(self, task: rich.Task) -> str:
             seconds = task.time_remaining
-            return "" if task.finished or not seconds or seconds < SHORT else f"{duration(seconds)} left"
+            return "" if task.finished or not seconds or seconds < LEAST_SHOWN else f"{duration(seconds)} left"
 
     count, detail = (rich.TextColumn(f"{{task.fields[{name}]}}", markup=False) for name in ("count", "detail"))
     place = Column(max_width=max(18, console.width // 3), no_wrap=True, overflow="ellipsis")
@@ -272,7 +274,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
 
 @contextmanager
 def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
-    """Keep Ray's messages about lost processes on their own lines of stdout in the block."""
+    """Keep Ray's messages about lost processes off stdout in the block: send them to stderr, or nowhere if quiet."""
     if engine != "ray":
         yield
         return
@@ -285,7 +287,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     """Show one bar for many runs on stderr, with the time left, and the last failure below it.
 
     Without a terminal it prints a line for each run. Yields ``(name, status, done, failure, num_failed, share) ->
-    None``; ``failure`` is empty after a run that succeeded, and ``share`` of what there is to do is done, from 0 to 1.
+    None``; ``failure`` is empty after a run that succeeded, and ``share``, 0 to 1, is the part of the work done so far.
     """
     stream = _stream.get()
     if stream is not None:
@@ -317,24 +319,25 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
         _bar(console), rich.MofNCompleteColumn(), *[rich.TimeElapsedColumn()] * (console.width >= NARROW),
         rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}", markup=False),
     )  # fmt: skip
-    bars, last = rich.Progress(*columns), Text(no_wrap=True, overflow="ellipsis")
-    with Live(Group(bars, last), console=console, transient=True, refresh_per_second=5):
+    bars, last_failure = rich.Progress(*columns), Text(no_wrap=True, overflow="ellipsis")
+    with Live(Group(bars, last_failure), console=console, transient=True, refresh_per_second=5):
         task = bars.add_task("", total=total)
 
         def move(name: str, status: str, done: int, failure: str, num_failed: int, _: float) -> None:
             bars.update(task, completed=done, description=one_line(_run_text(name, status, failure, num_failed)))
             if failure:
-                last.plain = one_line(f"last failure: {failure}")
+                last_failure.plain = one_line(f"last failure: {failure}")
 
         yield move
 
 
 def _run_text(name: str, status: str, failure: str, num_failed: int) -> str:
+    """Describe the end of one run, with the number of failures so far."""
     return f"{name} {status}{f', {num_failed} failed' if num_failed and not failure else ''}"
 
 
 def duration(seconds: float) -> str:
-    """Write seconds for people: ``95`` -> ``95 s``, ``600`` -> ``10 min``, ``9000`` -> ``2.5 h``."""
+    """Format seconds for people: ``95`` -> ``95 s``, ``600`` -> ``10 min``, ``9000`` -> ``2.5 h``."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

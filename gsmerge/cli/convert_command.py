@@ -1,4 +1,4 @@
-"""``gsmerge convert``: Gaussians from format to format, joined, cut and turned, without a fit."""
+"""``gsmerge convert``: convert, join, crop and transform Gaussians, without merging or fitting."""
 
 from __future__ import annotations
 
@@ -19,29 +19,30 @@ from gsmerge.settings.stages import CleanOptions
 class PhotoOptions(Settings):
     """Photos that a conversion reads."""
 
-    images: str | None = setting(None, "Folder of the cameras' photos, which `--drop sky` needs, and which a COLMAP "
-        "model links; for the latter `images` beside the cameras is found.", metavar="PATH")  # fmt: skip
+    images: str | None = setting(None, "Folder of the photos of the cameras. `--drop sky` needs it, and a COLMAP model "
+        "links it. For a model, a folder `images` beside the cameras is found without this setting.",
+        metavar="PATH")  # fmt: skip
 
 
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
                  "Files or folders of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb, lod-meta.json, "
-                 ".ksplat, meta.json, .lcc or .lcc2; several of one world are joined. The last is written, as its "
-                 "name says: .ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html (a page to send), lod-meta.json, a "
-                 "folder, or one named colmap. Or a .gsm of gsmerge extend, and a .npz for its Feature Gaussians as "
-                 "arrays."),
-    opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
+                 ".ksplat, meta.json, .lcc or .lcc2. Several files in one coordinate frame are joined. The last path "
+                 "is the output, and its name sets the format: .ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html (a "
+                 "page to send), lod-meta.json, a folder, or a folder named colmap. Or a .gsm of gsmerge extend, and "
+                 "a .npz for the arrays of its Feature Gaussians."),
+    opt.changed("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
-    opt.changed("hint", help="How the files store opacity where it is not recognised: opacity=logit or opacity=raw."),
+    opt.changed("hint", help="How the files store opacity, if it is not recognised: opacity=logit or opacity=raw."),
     opt.settings_option(FileOptions, PhotoOptions, CleanOptions, PlacementOptions, example="normals=false"),
     "up scale rotate translate sh_degree crop drop overwrite",
 )  # fmt: skip
 def convert(args: opt.Args) -> None:
-    """Write Gaussians in another format, frame or extent, as they are: nothing is merged or fitted."""
+    """Write Gaussians in another format, frame or extent, without merging or fitting them."""
     *inputs, output = args.paths
     if not inputs:
-        remedy = f"name what is written last, as in gsmerge convert {output} x.spz"
-        raise UsageError(f"expected files to read and one to write, got {output} alone; {remedy}")
+        remedy = f"name the output last, as in gsmerge convert {output} x.spz"
+        raise UsageError(f"expected files to read and one to write, got only {output}; {remedy}")
     if output.suffix.lower() == ".npz":
         _convert_features(args, inputs, output)
         return
@@ -72,7 +73,7 @@ def _convert_features(args: opt.Args, inputs: list[Path], output: Path) -> None:
     """Write the Feature Gaussians of a ``.gsm`` as arrays."""
     path = inputs[0]
     if len(inputs) > 1 or path.suffix.lower() != SUFFIX:
-        raise UsageError(f"{output}: expected one {SUFFIX} of Feature Gaussians for arrays, got {path}")
+        raise UsageError(f"{output}: expected one {SUFFIX} of Feature Gaussians to write as arrays, got {path}")
     args.require_scene(("paths", "overwrite", "json", "quiet"), path)
     from gsmerge.states.files import arrays_line, convert_features
 

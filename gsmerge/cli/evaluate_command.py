@@ -1,4 +1,4 @@
-"""``gsmerge evaluate``: a scene and its compact versions: quality against photos, bytes, render time."""
+"""``gsmerge evaluate``: measure quality, bytes and render time of a scene and its compact versions."""
 
 from __future__ import annotations
 
@@ -22,21 +22,22 @@ if TYPE_CHECKING:
 
 PAGE = ".html"
 SUFFIXES = (".json", ".csv", ".md", PAGE)
-SPEED_ZOOMS = (1.0, 2.0)  # sizes of pictures whose render time is measured where `zoom` names none
+SPEED_ZOOMS = (1.0, 2.0)  # picture sizes for render times, unless `zoom` is given
 
 
 @dataclass(frozen=True)
 class MeasuringOptions(Settings):
-    """Settings of the command beside those of :func:`gsmerge.evaluate`."""
+    """Settings of the command besides those of :func:`gsmerge.evaluate`."""
 
-    views: int | None = setting(None, "Use so many of the input views, at equal intervals, as the context, and the "
-        "held-out ones midway between them as targets.", least=1, shown="all")  # fmt: skip
-    masks: str | None = setting(None, "Folder of images named as the photos, dark where a photo does not count.",
+    views: int | None = setting(None, "Number of input views to use as the context, at equal intervals; the "
+        "held-out views midway between them are the targets.", least=1, shown="all")  # fmt: skip
+    masks: str | None = setting(None, "Folder of masks with the names of the photos, dark where a photo does not "
+        "count.",
         shown="masks beside the photos")  # fmt: skip
-    speed: bool = setting(False, "Also measure render time, at the sizes of `zoom` or at 1 and 2, and Gaussians per "
-        "pixel.")  # fmt: skip
-    merge_seconds: tuple[float | str, ...] = setting((), "Seconds that making each AFTER took, or the JSON of its "
-        "compact run, to say after how many frames they are earned back.", metavar="LIST")  # fmt: skip
+    speed: bool = setting(False, "Also measure the render time, at the sizes of `zoom` or at 1 and 2, and the "
+        "Gaussians per pixel.")  # fmt: skip
+    merge_seconds: tuple[float | str, ...] = setting((), "Seconds that it took to make each AFTER, or the JSON report "
+        "of its run; gives the number of frames after which this time is saved.", metavar="LIST")  # fmt: skip
 
 
 @opt.command(
@@ -47,10 +48,10 @@ class MeasuringOptions(Settings):
     opt.settings_option(EvaluateOptions, MeasuringOptions, example="context=false, photo_side=476 or speed=true"),
     *opt.panel(
         opt.OUTPUT,
-        opt.option("output", list[Path], "A file to write: .json, .csv (a row for each result and view), .md, or the "
-                   "page of view with these scores, .html; may be repeated.", "--output", "-o"),
-        opt.option("maps", Path, "A folder for a picture of each result and view: photo, result, and a map of how far "
-                   "off new views are likely to be, by the photos of other views.", metavar="DIR"),
+        opt.option("output", list[Path], "File to write: .json, .csv (a row for each result and view), .md, or .html "
+                   "(the page of gsmerge view with these scores); may be repeated.", "--output", "-o"),
+        opt.option("maps", Path, "Folder for a picture of each result and view: photo, result, and a map of the likely "
+                   "error of new views, estimated by the photos of other views.", metavar="DIR"),
     ),
 )  # fmt: skip
 def evaluate(args: opt.Args) -> None:
@@ -63,11 +64,11 @@ def evaluate(args: opt.Args) -> None:
     args.views, args.masks = own.views, None if own.masks is None else opt.named_or_none(own.masks)
     files, outputs = args.files(args.before), args.output or []
     if args.quiet and not (outputs or args.json or args.maps):
-        raise UsageError("--quiet: expected -o or --json with it, since nothing would be shown")
+        raise UsageError("--quiet: expected -o, --maps or --json with it, since otherwise nothing is shown or written")
     _check_files(args, outputs, own, input_files(files))
     if args.maps is not None:
         check_folder(args.maps, tuple(input_files(files)), overwrite=True)
-    seconds = [_seconds_of(making) for making in own.merge_seconds]
+    seconds = [_read_seconds(value) for value in own.merge_seconds]
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
     from gsmerge.measure.scores import evaluation_document, evaluation_lines
     from gsmerge.pages.data import still_keeper
@@ -82,7 +83,7 @@ def evaluate(args: opt.Args) -> None:
     notes = [*pair.notes, *missing]
     if pair.plys and len(pair.scene) < len(pair.load.scene):
         notes.append(
-            f"measured as results of {len(pair.scene)} views: one that was made of more has seen what it is asked here"
+            f"scores assume results of {len(pair.scene)} views; a result of more views has seen the held-out photos"
         )
     say_notes(notes, quiet=args.silent)
     stills: Stills = {}
@@ -104,23 +105,23 @@ def evaluate(args: opt.Args) -> None:
 
 
 def _check_files(args: opt.Args, outputs: Sequence[Path], own: MeasuringOptions, inputs: Sequence[Path]) -> None:
-    """Raise UsageError for outputs that cannot be written, or another number of ``merge_seconds`` than of results."""
+    """Raise UsageError if an output cannot be written, or if ``merge_seconds`` are not as many as the results."""
     for path in outputs:
         if path.suffix not in SUFFIXES:
-            raise UsageError(f"{path}: expected a name that ends in {opt.join_words(SUFFIXES)}")
-    makings = [Path(making) for making in own.merge_seconds if isinstance(making, str)]
-    check_outputs(outputs, (*inputs, *args.after, args.targets, args.target_images, *makings), overwrite=True)
+            raise UsageError(f"{path}: expected a name ending in {opt.join_words(SUFFIXES)}")
+    reports = [Path(value) for value in own.merge_seconds if isinstance(value, str)]
+    check_outputs(outputs, (*inputs, *args.after, args.targets, args.target_images, *reports), overwrite=True)
     check_replaced(outputs)
     if own.merge_seconds and len(own.merge_seconds) != len(args.after):
         raise UsageError(
-            f"merge_seconds: expected that of each of {len(args.after)} AFTER, got {len(own.merge_seconds)}"
+            f"merge_seconds: expected one value for each of {len(args.after)} AFTER, got {len(own.merge_seconds)}"
         )
 
 
 def _facts(
     pair: BeforeAfter, options: EvaluateOptions, own: MeasuringOptions, seconds: Mapping[str, float]
 ) -> dict[str, dict[str, Any]]:
-    """Collect facts about each file by name, with the cost of drawing if requested."""
+    """Collect facts about each file by name, with the cost of rendering if requested."""
     from gsmerge.measure.evaluate import INPUT, near_plane
     from gsmerge.measure.sizes import shrink_cameras
     from gsmerge.measure.speed import measure_costs
@@ -140,17 +141,17 @@ def _facts(
     return facts
 
 
-def _seconds_of(making: float | str) -> float:
-    """Return seconds that are given, or read them in the report of a run."""
-    seconds: Any = making
-    if isinstance(making, str):
+def _read_seconds(value: float | str) -> float:
+    """Return a number of seconds, or read it from the report of a run if ``value`` is a path."""
+    seconds: Any = value
+    if isinstance(value, str):
         from gsmerge.io import read_json
 
-        document = read_json(Path(making))
+        document = read_json(Path(value))
         seconds = document.get("total_seconds") if isinstance(document, dict) else None
     if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < 1e9:
         raise SceneError(
-            Path(str(making)), "expected seconds or the report of a compact run (total_seconds), found neither"
+            Path(str(value)), "expected seconds or the report of a compact run (total_seconds), found neither"
         )
     return float(seconds)
 
@@ -158,7 +159,7 @@ def _seconds_of(making: float | str) -> float:
 def _write(
     outputs: Sequence[Path], document: Mapping[str, Any], pair: BeforeAfter, evaluation: Evaluation, stills: Stills
 ) -> None:
-    """Write the files, each in the format of its ending."""
+    """Write the reports, each in the format of its ending."""
     from gsmerge.measure.scores import evaluation_csv, evaluation_markdown
     from gsmerge.report import to_json
 
@@ -177,7 +178,7 @@ def _write(
 
 
 def _write_maps(folder: Path, pair: BeforeAfter, *, context: bool) -> list[Path]:
-    """Write the sheet of each result and view into a folder, named after both; return their paths."""
+    """Write a sheet of each result and view into a folder, named after both; return the paths."""
     from gsmerge.measure.drawings import picture_stems
     from gsmerge.measure.error_maps import draw_sheets
     from gsmerge.measure.evaluate import INPUT

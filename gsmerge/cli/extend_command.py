@@ -1,4 +1,4 @@
-"""``gsmerge extend``: views that arrive batch by batch, folded into a state."""
+"""``gsmerge extend``: add views that arrive in batches to a state."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from gsmerge.settings.reading import NONE
 
 
 @opt.command(
-    opt.argument("state", Path, "STATE", "A .gsm file, which the first batch makes."),
+    opt.argument("state", Path, "STATE", "A .gsm file; the first batch creates it."),
     opt.argument(
         "scenes",
         list[Path] | None,
         "[SCENE]...",
-        "Batches of new views, in order: each a scene as compact takes it.",
+        "Batches of new views, in order; each is a scene as compact takes it.",
         default=None,
     ),
     opt.READING,
-    opt.option("remove", int, "Take a batch out again, by the number that inspect lists it with.", min=1),
+    opt.option("remove", int, "Remove the batch with this number; gsmerge inspect lists the numbers.", min=1),
     "dry_run",
     opt.settings_option(CompactOptions, ExtendOptions, example="budget=2%"),
 )
 def extend(args: opt.Args) -> None:
-    """Compact new views and add them to a state, which gsmerge compact makes results of at any time."""
+    """Compact new views and add them to a state, from which gsmerge compact makes a result at any time."""
     start = perf_counter()
     if args.state.suffix.lower() != SUFFIX:
-        raise UsageError(f"{args.state}: expected a state, which ends in {SUFFIX}")
+        raise UsageError(f"{args.state}: expected a state whose name ends in {SUFFIX}")
     hints, scenes = args.hints(), args.scenes or []
     if (args.remove is None) == (not scenes):
-        raise UsageError("extend: expected either batches to add, each a scene, or --remove NUMBER")
+        raise UsageError("extend: expected either scenes to add or --remove NUMBER")
     if args.remove is not None:
         _remove(args)
         return
     if len(scenes) > 1 and {args.cameras, args.images} - {None, NONE}:
-        raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
+        raise UsageError("--cameras and --images: expected one batch with them, got several; add one batch at a time")
     from gsmerge.states.files import batch_line, extend_file
 
     settings = args.values(CompactOptions, ExtendOptions)
@@ -70,7 +70,7 @@ def extend(args: opt.Args) -> None:
 
 
 def _remove(args: opt.Args) -> None:
-    """Take a batch out of the state."""
+    """Remove a batch from the state."""
     from gsmerge.states.files import removal_line, remove_batch
 
     document = remove_batch(args.state, args.remove, dry_run=args.dry_run)

@@ -1,4 +1,4 @@
-"""``gsmerge inspect``: what files hold, whether they are sound, and what compact would make of a scene."""
+"""``gsmerge inspect``: check and describe files, and say what compact would make of a scene."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from gsmerge.errors import SceneError, UsageError
 
 
 @opt.command(
-    opt.argument("paths", list[Path], "SCENE|FILE...", "A scene, or several; also cameras, .gsm files, networks and "
+    opt.argument("paths", list[Path], "SCENE|FILE...", "One or several scenes; also cameras, .gsm files, networks and "
                  "lod-meta.json."),
     opt.READING,
 )  # fmt: skip
 def inspect(args: opt.Args) -> None:
-    """Read files to their ends, and say what they hold and what compact would make, or refuse, of each scene."""
+    """Check and describe files, and say what compact would make of each scene, or why it refuses it."""
     from gsmerge.inspection.file_checks import holds_scene
     from gsmerge.io.formats.table import INDEX
 
@@ -30,7 +30,7 @@ def inspect(args: opt.Args) -> None:
 
 
 def _inspect_scene(args: opt.Args, path: Path) -> None:
-    """Describe a scene at length; SceneError if ``compact`` refuses it."""
+    """Describe a scene in detail; SceneError if ``compact`` refuses it."""
     from gsmerge.inspection.file_checks import check_content, damage
     from gsmerge.inspection.inspect import inspect as inspect_scene
     from gsmerge.inspection.inspect import inspection_lines
@@ -74,6 +74,6 @@ def _check_files(args: opt.Args) -> None:
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
     count = f"wrong files: {len(wrong)} of {len(checks)}" if several else ""
     if wrong and several and not args.silent:
-        raise SceneError(wrong[0].path, "refused, for the cause above", count)
+        raise SceneError(wrong[0].path, "refused, for the reason above", count)
     if wrong:
         raise SceneError(wrong[0].path, "; ".join(wrong[0].problems), count)

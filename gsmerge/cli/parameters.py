@@ -1,8 +1,8 @@
-"""Declare the options of the command line, each once, and make settings of them.
+"""Declare the options of the command line, each once, and turn their values into settings.
 
-A command is a function of one :class:`Args`; :func:`command` lists its parameters for Typer: names of options
-declared here, and its own. An option that is a setting of the library carries the setting's name and no default; its
-help, values and default in words are those of the setting (:func:`setting_option`).
+A command is a function of one :class:`Args`. The decorator :func:`command` lists its parameters for Typer, by the names
+of options that are declared here, and with parameters of its own. An option for a setting of the library has the
+setting's name and no default. Its help, values and shown default come from the setting (:func:`setting_option`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, FileHints, OpacityChoice, ReadHints
-from gsmerge.settings.setting import Setting, change_settings, flat_settings, join_words, near_names, perhaps
+from gsmerge.settings.setting import Setting, change_settings, find_near_names, flat_settings, join_words, suggest_name
 from gsmerge.settings.stages import CROP_FILES, Engine
 
 if TYPE_CHECKING:
@@ -43,12 +43,12 @@ if TYPE_CHECKING:
 INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
     "Input", "How many Gaussians", "Method", "Measuring", "Output", "General"
 )  # fmt: skip
-# In the help, of plain values
+# Forms of plain values in the help
 METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH", list[Path]: "PATH"}
 REQUIRED = Parameter.empty
-LIST = "help"  # for which --set prints all settings
-SEED = "GSMERGE_SEED"  # of the environment: the seed where a command is given none
-MAX_DIGITS = 1000  # of such a seed, far fewer than Python refuses
+LIST_SETTINGS = "help"  # value for which --set prints all settings
+SEED = "GSMERGE_SEED"  # environment variable: the seed of commands that are given none
+MAX_DIGITS = 1000  # of that seed; Python refuses only far more
 
 SETTINGS = {
     setting.name: setting for kind in (EvaluateOptions, Engine, PlacementOptions, CompactOptions)
@@ -61,7 +61,7 @@ class Args(SimpleNamespace):
 
     @property
     def silent(self) -> bool:
-        """Whether to print data only."""
+        """Whether to print only data, or nothing."""
         return bool(self.quiet or self.json)
 
     def given(self, names: Iterable[str]) -> dict[str, Any]:
@@ -70,12 +70,12 @@ class Args(SimpleNamespace):
         return {name: values[name] for name in names if values.get(name) is not None}
 
     def require_scene(self, names: Collection[str], path: Path) -> None:
-        """Raise UsageError for an option not in ``names``, those that Feature Gaussians, the input ``path``, take."""
+        """Raise UsageError for an option that is not in ``names``, since the input ``path`` holds Feature Gaussians."""
         for name, value in vars(self).items():
             if value and name not in names and value != OPTIONS[name].default:
                 flag = f"--{name.replace('_', '-')}"
                 raise UsageError(
-                    f"{flag}: expected a scene with it, {path} holds Feature Gaussians, whose number --k decides"
+                    f"{flag}: expected a scene with it, but {path} holds Feature Gaussians; their number is set by --k"
                 )
 
     def make(self, *kinds: type, **changes: Any) -> list[Any]:
@@ -89,12 +89,12 @@ class Args(SimpleNamespace):
             ]
 
     def values(self, *kinds: type, but: Collection[str] = ()) -> dict[str, Any]:
-        """Collect the user's settings of the classes ``kinds`` by flat name, without the names in ``but``."""
+        """Collect the settings of the classes ``kinds`` that the user gave, by flat name, except those in ``but``."""
         settings = {name: setting for kind in kinds for name, setting in flat_settings(kind).items() if name not in but}
         options = self.given(settings)
         chosen = parse_pairs("--set", vars(self).get("set") or (), settings)
         for name in options.keys() & chosen.keys():
-            raise UsageError(f"--set {name}: expected it once, got --{name.replace('_', '-')} too")
+            raise UsageError(f"--set {name}: expected this setting once, got --{name.replace('_', '-')} too")
         values = options | chosen
         if "seed" in settings:
             values |= {"seed": values["seed"]} if "seed" in values else _environment_seed()
@@ -130,7 +130,7 @@ class Args(SimpleNamespace):
     def files(self, scene: Path, *more: Path) -> SceneFiles:
         """Find the .ply, cameras and photos of a scene, and of further scenes to join with it.
 
-        Cameras and photos are those that the user named, or those beside each scene.
+        Cameras and photos are those that the user named, otherwise those beside each scene.
         """
         from gsmerge.scene.files import find_scene_files
 
@@ -139,9 +139,9 @@ class Args(SimpleNamespace):
         return replace(first, more=tuple(others))
 
     def load(self, files: SceneFiles, **defaults: Any) -> Loaded:
-        """Read the scene of ``files``, or take it from the command that called this one and has ``loaded`` it.
+        """Read the scene of ``files``, unless the command that called this one has already ``loaded`` it.
 
-        ``defaults``: hints to use unless the user gave others.
+        ``defaults``: hints that apply where the user gave none.
         """
         from gsmerge.scene.read import load_files
 
@@ -162,45 +162,45 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
         if not sign:
             raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}")
         if name not in settings:
-            near = join_words(near_names(name, settings, 3, 0.5))
-            near = f"; perhaps {near}" if near else ""
-            more = f"{flag} {LIST} lists all" if flag == "--set" else f"expected {join_words(settings)}"
-            raise UsageError(f"{flag} {name}: unknown{near}; {more}")
+            near = join_words(find_near_names(name, settings, 3, 0.5))
+            hint = f"; perhaps {near}" if near else ""
+            known = f"{flag} {LIST_SETTINGS} lists all" if flag == "--set" else f"expected {join_words(settings)}"
+            raise UsageError(f"{flag} {name}: unknown{hint}; {known}")
         if name in values:
             raise UsageError(f"{flag} {name}: expected it once, got it twice")
-        readings = _read_value(text)
+        candidates = _parse_value(text)
         if settings[name].is_list:
-            readings.append([_read_value(part.strip())[0] for part in text.split(",")])
-        fitting = [value for value in readings if settings[name].fits(value)]
+            candidates.append([_parse_value(part.strip())[0] for part in text.split(",")])
+        fitting = [value for value in candidates if settings[name].fits(value)]
         if not fitting:
-            expected, near = settings[name].expected(readings[0], null=True), perhaps(text, settings[name].words)
-            raise UsageError(f"{flag} {name}: expected {expected}, got {text!r}{near}")
+            expected, hint = settings[name].expected(candidates[0], null=True), suggest_name(text, settings[name].words)
+            raise UsageError(f"{flag} {name}: expected {expected}, got {text!r}{hint}")
         values[name] = fitting[0]
     return values
 
 
-def _read_value(text: str) -> list[Any]:
-    """Read a value as JSON or as a number, where it is one, and as text."""
-    readings: list[Any] = [text]
-    for read in (float, json.loads):
+def _parse_value(text: str) -> list[Any]:
+    """List the possible values of a text, the best first: as JSON, as a number, and as text."""
+    candidates: list[Any] = [text]
+    for parse in (float, json.loads):
         with suppress(ValueError, RecursionError):
-            readings.insert(0, read(text))
-    return readings
+            candidates.insert(0, parse(text))
+    return candidates
 
 
 def _environment_seed() -> dict[str, int]:
-    """Return the seed of the environment, if there is one; UsageError if it is no seed."""
+    """Return the seed of the environment variable, if it is set; UsageError if it is not a seed."""
     text = os.environ.get(SEED)
-    if not text:  # an empty variable is one that is not set
+    if not text:  # an empty variable counts as not set
         return {}
     if not (text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS):
-        raise UsageError(f"{SEED}: expected a whole number from 0 of at most {MAX_DIGITS} digits, got {text!r:.40}")
+        raise UsageError(f"{SEED}: expected a whole number from 0, of at most {MAX_DIGITS} digits, got {text!r:.40}")
     return {"seed": int(text)}
 
 
 @contextmanager
 def usage_errors() -> Iterator[None]:
-    """Turn a ValueError of the library in the block into a UsageError."""
+    """Turn a ValueError that the library raises in the block into a UsageError."""
     try:
         yield
     except ValueError as error:
@@ -218,14 +218,14 @@ def option(
 ) -> Parameter:  # fmt: skip
     """Declare an option of a command; ``kind`` bool makes a switch, a tuple lists the possible values.
 
-    ``flags``: needed if they cannot be derived from the name. ``wording``: the default in words, if the library decides
-    it; ``more`` is passed to Typer.
+    ``flags``: by default derived from the name. ``wording``: the default in words, if the library decides it. ``more``
+    is passed to Typer.
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
     if more.get("metavar") is None:
         more["metavar"] = "|".join(kind) if isinstance(kind, tuple) else METAVARS.get(kind)
     if isinstance(kind, tuple):
-        choice: Any = Enum  # which mypy knows with literal names alone
+        choice: Any = Enum  # mypy accepts Enum only with literal names
         kind = choice(f"{name}_choice", {value: value for value in kind}, type=str)
         default = kind(default) if isinstance(default, str) else default
     kind = kind | None if default is None else kind
@@ -234,7 +234,7 @@ def option(
 
 
 def setting_option(name: str, *flags: str, **more: Any) -> Parameter:
-    """Declare an option for a setting of the library, with its help and values; ``more``: passed to :func:`option`."""
+    """Declare an option for a setting of the library, with its help and values; ``more`` goes to :func:`option`."""
     declared = SETTINGS[name]
     kinds = [kind for kind in declared.kinds if kind is not NoneType]
     kind: Any = str if len(kinds) > 1 or (kinds and declared.words) else kinds[0] if kinds else declared.words
@@ -260,7 +260,7 @@ def panel(title: str, *parameters: Parameter) -> tuple[Parameter, ...]:
 
 
 def changed(name: str, default: Any = None, **changes: Any) -> Parameter:
-    """Copy a declared option with changes for one command: default, ``help``, ``show_default``, ``hidden``, ..."""
+    """Copy a declared option and change it for one command: its default, ``help``, ``show_default``, ``hidden``, ..."""
     kind, info = get_args(OPTIONS[name].annotation)
     info = copy(info)
     for attribute, value in changes.items():
@@ -269,12 +269,12 @@ def changed(name: str, default: Any = None, **changes: Any) -> Parameter:
 
 
 def _escape(help: str) -> str:
-    """Escape brackets, so that rich does not take ``[ray]`` for markup, and leave out backticks."""
+    """Escape brackets, so that Rich does not take ``[ray]`` for markup, and remove backticks."""
     return re.sub(r"\[(?=[a-z])", r"\\[", help.replace("`", ""))
 
 
 def command(*parameters: str | Parameter) -> Callable[[Callable[[Args], None]], Callable[..., None]]:
-    """Decorate a command with its parameters in the order of the help."""
+    """Decorate a command with its parameters, in the order of the help; a text holds names of declared options."""
     listed: dict[str, Parameter] = {}
     for parameter in (*parameters, "json quiet"):
         for name in parameter.split() if isinstance(parameter, str) else [parameter.name]:
@@ -300,17 +300,17 @@ def command(*parameters: str | Parameter) -> Callable[[Callable[[Args], None]], 
 
 
 def call(function: Callable[..., None], **values: Any) -> None:
-    """Run another command with some of its parameters; the others have their defaults."""
+    """Run another command with the given parameters; all others have their defaults."""
     declared: Signature = function.__signature__  # type: ignore[attr-defined]
     function(**{name: parameter.default for name, parameter in declared.parameters.items()} | values)
 
 
 def settings_option(*kinds: type | LazyFunction, help: str = "Any other setting, such as {}; may be repeated. --set "
-                    "help lists them all.", example: str = "match=aabb") -> Parameter:  # fmt: skip
-    """Declare ``--set`` of a command for settings of ``kinds``, which ``--set help`` lists; heavy ones are lazy."""
+                    "help lists all.", example: str = "match=aabb") -> Parameter:  # fmt: skip
+    """Declare ``--set`` for the settings of ``kinds``, which ``--set help`` lists; slow ones are LazyFunctions."""
 
     def show(values: list[str] | None) -> list[str] | None:
-        if LIST not in (values or ()):
+        if LIST_SETTINGS not in (values or ()):
             return values
         print("\n".join(_settings_lines(listed_settings(kinds))))
         raise typer.Exit
@@ -319,13 +319,13 @@ def settings_option(*kinds: type | LazyFunction, help: str = "Any other setting,
 
 
 def listed_settings(kinds: Iterable[type | LazyFunction]) -> dict[str, Setting]:
-    """List the settings of a command's ``--set`` by name."""
+    """Return the settings that a command's ``--set`` takes, by name."""
     loaded = (kind.load() if isinstance(kind, LazyFunction) else kind for kind in kinds)
     return {name: declared for kind in loaded for name, declared in flat_settings(kind).items()}
 
 
 def _settings_lines(settings: Mapping[str, Setting]) -> list[str]:
-    """Write each setting with its default, and what it does, for a terminal."""
+    """Format each setting with its default and help, for a terminal."""
     width, lines = max(40, shutil.get_terminal_size().columns), list[str]()
     for name, declared in settings.items():
         default = declared.default
@@ -338,7 +338,7 @@ def _settings_lines(settings: Mapping[str, Setting]) -> list[str]:
 
 
 def share_list(text: str) -> list[str]:
-    """Parse shares with commas between: "1,4.4%" -> ["1%", "4.4%"]."""
+    """Parse shares that are separated by commas: "1,4.4%" -> ["1%", "4.4%"]."""
     shares = [f"{part.strip().removesuffix('%')}%" for part in text.split(",")]
     try:
         numbers = [parse_share(share) for share in shares]
@@ -359,14 +359,14 @@ def number_or_text(text: str) -> int | str:
     return int(text) if text.isdecimal() else text
 
 
-BEFORE = argument("before", Path, "BEFORE", "The scene: a .ply or its folder.")
+BEFORE = argument("before", Path, "BEFORE", "The scene: a .ply, or the folder that holds it.")
 AFTER = argument(
-    "after", list[Path] | None, "[AFTER]...", "Compact files of it: .ply, .spz, .sog, .splat or .glb.", default=None
+    "after", list[Path] | None, "[AFTER]...", "Its compact files: .ply, .spz, .sog, .splat or .glb.", default=None
 )
-SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder it is in.")
+SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder that holds it.")
 
-# What commands share: a text, and names of options
-COMPACT_SCENE = "The compact scene: .ply, .spz, .sog, .splat, .glb, .usdc or .usdz, by its name."
+# Shared by commands: a text, and names of options
+COMPACT_SCENE = "The compact scene; the ending sets the format: .ply, .spz, .sog, .splat, .glb, .usdc or .usdz."
 READING = "cameras images hint"
 TARGETS = "targets target_images"
 
@@ -377,17 +377,18 @@ _TABLE = (
                "Default: beside the .ply; none: without.", parser=named_or_none),
         option("images", Path, "Folder of the input photos. Default: beside the .ply; none: without.",
                parser=named_or_none),
-        option("masks", Path, "Folder of images named as the photos, dark where a photo does not count. Default: masks "
-               "beside the photos, and where these are transparent; none: without.", parser=named_or_none),
-        option("protect", Path, "Folder of images named as the photos, white where a text or face has to stay sharp: "
-               "it counts four times.", parser=named_or_none),
-        option("hint", list[str], "How to read the file, where it is recognised wrongly: "
+        option("masks", Path, "Folder of masks with the names of the photos, dark where a photo does not count. "
+               "Default: masks beside the photos, and the transparency of the photos; none: without.",
+               parser=named_or_none),
+        option("protect", Path, "Folder of images with the names of the photos, white where a text or a face has to "
+               "stay sharp. These pixels count four times.", parser=named_or_none),
+        option("hint", list[str], "How to read a file that is recognised wrongly: "
                f"{join_words(flat_settings(FileHints))}, such as order=none; may be repeated.", metavar="NAME=VALUE"),
-        option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made from "
-               "are left out."),
+        option("targets", Path, "Cameras of held-out photos, in any camera file. Views that the scene was made from "
+               "are skipped."),
         option("target_images", Path, "Folder of the held-out photos. Default: beside their cameras."),
-        option("sizes", str, "Also compact BEFORE to these shares of its Gaussians, in %, such as 1,2,4.4,10: the page "
-               "has a slider over all sizes.", metavar="LIST", parser=share_list),
+        option("sizes", str, "Also compact BEFORE to these shares of its Gaussians, in %, such as 1,2,4.4,10. The page "
+               "gets a slider over all sizes.", metavar="LIST", parser=share_list),
     ),
     panel(
         COUNT,
@@ -412,9 +413,9 @@ _TABLE = (
         *map(setting_option, ("up", "scale", "rotate", "translate", "sh_degree")),
         option("output", Path, "", "--output", "-o"),
         switch("overwrite", "Replace the output if it exists."),
-        switch("strict", "Exit with code 4, once all is written, where a result shows the scene's own photos worse "
-               "than the input does, by more than .5 dB, or cameras or photos do not fit."),
-        switch("dry_run", "Print what would be done; write nothing."),
+        switch("strict", "Exit with code 4, after writing everything, if a result shows the scene's photos more "
+               "than 0.5 dB worse than the input does, or if cameras or photos do not fit."),
+        switch("dry_run", "Print what would be done, and write nothing."),
         option("open", bool, "Open the page in the browser.", "--open/--no-open", default=True),
         switch("json", "Print JSON on stdout."),
     ),

@@ -1,4 +1,4 @@
-"""Check where a command reads from and writes to, before any work is done."""
+"""Check the inputs and outputs of a command before any work is done."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
 
 
-# In the first bytes of what gsmerge makes for readers: pages, JSON, CSV, Markdown
+# One of these is in the first MARKED_BYTES of the reports that gsmerge writes: pages, JSON, CSV, Markdown
 MARKS = (b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,", b"<!-- gsmerge ")
-MARKED = 4000  # of these bytes
+MARKED_BYTES = 4000
 
 
 @dataclass(frozen=True)
 class FileOptions(Settings):
     """Options for writing a result."""
 
-    normals: bool = setting(True, "Write the three columns of zeros that some viewers want of a `.ply`, 12 of its 68 "
-        "bytes per Gaussian; a `budget` in bytes counts them.")  # fmt: skip
-    columns: str = setting("needed", "Columns of a `.ply`: those that are needed, or full: all 62 of INRIA's, which "
-        "Unity's importer wants, with zeros for harmonics up to degree 3.", choices=("needed", "full"))  # fmt: skip
-    site: bool = setting(False, "Write a web site into the folder `-o`: a page as of `.html`, with its scene and "
-        "viewer beside it.")  # fmt: skip
-    viewer_cameras: bool = setting(True, "Write the input views beside the result of `compact`, as `NAME.cameras.json` "
-        "for viewers.")  # fmt: skip
+    normals: bool = setting(True, "Write the normals of a `.ply`, three columns of zeros that some viewers need: 12 of "
+        "its 68 bytes per Gaussian. A `budget` in bytes counts them.")  # fmt: skip
+    columns: str = setting("needed", "Columns of a `.ply`. needed: only those that are needed; full: all 62 columns of "
+        "INRIA's files, with zeros for missing harmonics up to degree 3, which Unity's importer needs.",
+        choices=("needed", "full"))  # fmt: skip
+    site: bool = setting(False, "Write a web site into the folder `-o`: the same page as for `.html`, with scene "
+        "and viewer in files of their own.")  # fmt: skip
+    viewer_cameras: bool = setting(True, "Write the cameras of the input views beside the result of `compact`, as "
+        "`NAME.cameras.json` for viewers.")  # fmt: skip
 
 
 def default_output(ply: Path) -> Path:
@@ -40,9 +41,10 @@ def default_output(ply: Path) -> Path:
 
 
 def output_file(output: Path, name: str, *, site: bool = False) -> Path:
-    """Return the file that an output names: itself, or of a folder, which a new name without an ending is, its file.
+    """Return the file that an output names; for a folder, that is a file in it.
 
-    That is the page of a ``site``, the main file of the format that the folder's name means, and otherwise ``name``.
+    A name without an ending is a folder unless such a file exists. In a folder the file is the page of a ``site``, the
+    main file of the format that the folder's name stands for, or otherwise ``name``.
     """
     from gsmerge.io.formats.table import FOLDERS, FORMATS, OUTPUT_FORMATS
 
@@ -58,56 +60,58 @@ def output_file(output: Path, name: str, *, site: bool = False) -> Path:
 
 
 def is_page(path: Path) -> bool:
-    """Return whether a file is a page, or a table, that gsmerge made."""
-    return any(mark in _start_of(path) for mark in MARKS)
+    """Return whether a file is a report that gsmerge made: a page or a table."""
+    return any(mark in _read_start(path) for mark in MARKS)
 
 
-def _start_of(path: Path) -> bytes:
+def _read_start(path: Path) -> bytes:
+    """Read the first bytes of a file; empty if it does not exist or cannot be read."""
     try:
         with path.open("rb") as file:
-            return file.read(MARKED)
-    except OSError:  # there is none yet, or writing fails with its own reason
+            return file.read(MARKED_BYTES)
+    except OSError:  # if it exists but cannot be read, writing fails with a reason of its own
         return b""
 
 
 def files_beside(output: Path, *, site: bool = False) -> tuple[Path, ...]:
-    """List the other files of an output whose names are known; SceneError if another program's are there."""
+    """List the further files of an output with known names; SceneError if files of another program have these names."""
     from gsmerge.io.formats.table import find_format
 
     return tuple(find_format(output).beside(output, site))
 
 
 def check_format(output: Path, options: FileOptions) -> None:
-    """Raise UsageError if an output's ending is unknown, its package is missing, or it does not fit the options."""
+    """Raise UsageError if an output's ending is unknown, needs a missing package, or does not fit the options."""
     from gsmerge.io import output_format
 
     columns = output_format(output, levels=True, cameras=True).columns
     if options.columns == "full" and not (columns and options.normals):
-        raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
+        raise UsageError(f"columns full: expected a .ply output with normals, got {output.name}")
 
 
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Raise UsageError for an output that is an input, exists without ``overwrite``, or is given twice.
 
-    ``inputs`` are files that are read, and folders of photos and COLMAP models; nothing in these is replaced.
-    SceneError if the output cannot be written. Missing folders are made with the first file in them, so a run that
-    fails before leaves no folders.
+    ``inputs`` are the files that are read, and folders of photos or COLMAP models, in which no file is replaced.
+    SceneError if the output cannot be written. Missing folders are made together with their first file, so a run that
+    fails earlier makes no folders.
     """
     from gsmerge.io.cameras.read import find_cameras
 
     paths = [path for path in inputs if path is not None]
-    inside = [cameras for path in paths if path.is_dir() and (cameras := find_cameras(path)) is not None]
-    input_paths, seen = {os.path.realpath(path) for path in (*paths, *inside)}, set[str]()
+    camera_files = [cameras for path in paths if path.is_dir() and (cameras := find_cameras(path)) is not None]
+    input_paths, seen = {os.path.realpath(path) for path in (*paths, *camera_files)}, set[str]()
     for output in outputs:
         if output is None:
             continue
         _check_output(output, input_paths, overwrite=overwrite)
         if os.path.realpath(output) in seen:
-            raise UsageError(f"{output}: expected a file of its own for each output, got it twice")
+            raise UsageError(f"{output}: expected a different file for each output, got it twice")
         seen.add(os.path.realpath(output))
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
+    """Check one output as :func:`check_outputs` does; ``inputs``: real paths."""
     from gsmerge.io.atomic import check_name
     from gsmerge.io.formats.table import MODEL_NAMES
     from gsmerge.io.image_names import IMAGE_SUFFIXES
@@ -117,7 +121,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
         os.lstat(output)
     except FileNotFoundError:
         pass
-    except (OSError, ValueError) as error:  # the latter: a zero byte
+    except (OSError, ValueError) as error:  # ValueError: the name has a zero byte
         reason = getattr(error, "strerror", None) or error
         raise SceneError(output, f"cannot be written ({reason})", "choose another name") from error
     if output.is_dir():
@@ -134,8 +138,8 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
 def check_replaced(outputs: Sequence[Path]) -> None:
     """Raise UsageError for an output that exists, unless it is a page or a table that gsmerge made."""
     for output in outputs:
-        if _start_of(output) and not is_page(output):
-            raise UsageError(f"{output}: exists already, and is no report that gsmerge made; name another output")
+        if _read_start(output) and not is_page(output):
+            raise UsageError(f"{output}: exists already and is not a report of gsmerge; name another output")
 
 
 def _check_place(folder: Path, output: Path, expected: str) -> None:
@@ -144,7 +148,7 @@ def _check_place(folder: Path, output: Path, expected: str) -> None:
         nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     except OSError as error:
         raise SceneError(output, f"cannot be read ({error.strerror})", "name another output") from error
-    except StopIteration:  # of a Windows that has no such drive
+    except StopIteration:  # on Windows, if there is no such drive
         raise SceneError(output, f"found no drive {folder.absolute().drive}", "name another output") from None
     if not nearest.is_dir():
         raise SceneError(output, f"expected {expected}, found the file {nearest}", "name another output")
@@ -158,7 +162,7 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
 
 
 def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:
-    """Write text files: all of them, or none."""
+    """Write text files: either all of them or none."""
     from gsmerge.io import atomic_outputs
 
     with atomic_outputs(overwrite=overwrite) as add:
@@ -169,7 +173,7 @@ def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:
 def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
     """Raise UsageError for an output folder with files (unless ``overwrite``) or photos, or without write access.
 
-    The folder is made with the first file in it, so a run that fails before leaves no folder.
+    The folder is made together with its first file, so a run that fails earlier makes no folder.
     """
     _check_place(folder, folder, "a folder to write pictures to")
     try:

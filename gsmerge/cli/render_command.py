@@ -1,4 +1,4 @@
-"""``gsmerge render``: pictures of scenes from their cameras, and clips along paths."""
+"""``gsmerge render``: draw pictures of scenes from their cameras, and clips along paths."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_folder, check_outputs, input_files
 from gsmerge.errors import UsageError
+from gsmerge.settings.pictures import CLIPS, PICTURES
 from gsmerge.settings.reading import NONE
 
-MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
-PICTURES, CLIPS = (".png", ".jpg", ".jpeg", ".webp"), (".mp4", ".webm", ".gif")
-# What can have alpha beside its colours, show opacity, and show depth, which takes 16 bits; so do pictures in a folder
+MAX_SIDE = 1 << 20  # pixels; so large that pictures have the size of the cameras
+# Endings of outputs that can hold each channel: "color" with alpha, opacity, and depth, which takes 16 bits. Folders
+# can hold all
 LAYERS = {"color": (".png", ".webp", ".webm"), "alpha": (*PICTURES, *CLIPS), "depth": (".png",)}
-MAX_DIGITS = 9  # of a number of views: more are as many
-SIDES = (16, 16384)  # pixels of a picture
+MAX_DIGITS = 9  # of a number of views that are read
+SIDES = (16, 16384)  # least and largest width and height of a picture, pixels
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Parse ``--size``: a width and a height with an x between."""
+    """Parse ``--size``: width and height, separated by an x."""
     match = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(SIDES[0] <= side <= SIDES[1] for side in size):
@@ -31,17 +32,17 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_views(text: str) -> int | str:
-    """Parse ``--views``: a number, or the name of a view; digits that begin with 0 are a name."""
+    """Parse ``--views``: a number or the name of a view. Digits that begin with 0 are a name."""
     if not re.fullmatch(r"[+-]?[\d.]+", text) or re.fullmatch(r"0\d+", text):
         return text
     count = int(text[:MAX_DIGITS]) if text.isdecimal() else 0
     if count < 1:
-        raise typer.BadParameter(f"expected a number from 1, or the name of a view, got {text}")
+        raise typer.BadParameter(f"expected a number from 1 or the name of a view, got {text}")
     return count
 
 
 def parse_background(text: str) -> float | str:
-    """Parse ``--background``: a grey level, or "none"."""
+    """Parse ``--background``: a grey level or "none"."""
     if text.lower() == NONE:
         return NONE
     try:
@@ -54,55 +55,58 @@ def parse_background(text: str) -> float | str:
 
 
 @opt.command(
-    opt.argument("scenes", list[Path], "SCENES...", "Gaussian files, the first may be a folder: before, after, ..."),
+    opt.argument("scenes", list[Path], "SCENES...", "Files of Gaussians: before, after, ... The first may be a "
+                 "folder."),
     opt.READING,
-    opt.output("A panel of photos and scenes, .png or .jpg; a clip, .mp4, .webm or .gif, in which a line moves between "
-               "two scenes; or a folder for a picture of each camera. With --views NAME a picture of one.",
+    opt.output("A picture, .png or .jpg: a panel of photos and scenes, or with --views NAME one view of one scene. A "
+               "clip, .mp4, .webm or .gif; a moving line separates two scenes. A folder gets a picture of each camera.",
                default=opt.REQUIRED),
     *opt.panel(
         opt.OUTPUT,
-        opt.option("path", str, "The way of the camera: orbit about the middle view, or orbit:45 by 45 degrees to each "
-                   "side; turntable, once about the scene's middle; spline through all views; each with ,back:0.5 for "
-                   "half of the depth farther back; or a camera for each frame in a file.",
+        opt.option("path", str, "Path of the camera. orbit: about the middle view, orbit:45 by 45 degrees to each "
+                   "side; turntable: once about the centre of the scene; spline: through all views. With ,back:0.5 "
+                   "it moves back by half of the depth. Or a file with a camera for each frame.",
                    wording="orbit, none for a folder", metavar="orbit|turntable|spline|FILE"),
-        opt.option("size", str, "Width and height in pixels, on a panel of each picture; views of another shape lose "
-                   "two borders.", wording="the cameras', of a GIF at most 640",
+        opt.option("size", str, "Width and height in pixels, in a panel of each picture. Views with another aspect "
+                   "ratio are cropped on two sides.", wording="the cameras', of a GIF at most 640",
                    metavar="WIDTHxHEIGHT", parser=parse_size),
-        opt.option("frames", int, "Frames of a clip, 30 a second, or 12.5 of a GIF.",
+        opt.option("frames", int, "Number of frames of a clip, at 30 frames per second, or 12.5 in a GIF.",
                    wording="6 seconds of a turntable, else 4", min=2, max=100_000),
-        opt.option("views", str, "Views at most, at equal intervals; or the name of one, which the picture of one "
-                   "scene shows alone: 00006, or 6.jpg, as 6 is a number.", metavar="NUMBER|NAME", parser=parse_views,
+        opt.option("views", str, "Largest number of views, at equal intervals; or the name of one view, such as "
+                   "00006 or 6.jpg (6 would be a number).", metavar="NUMBER|NAME", parser=parse_views,
                    wording="4 on a panel, else all; the first of a picture with alpha, opacity or depth"),
-        opt.option("overlay", ("support",), "Colour what one view of the scene alone shows, and what none does: "
-                   "yellow, red."),
-        opt.option("background", str, "Grey level behind the scene, 0 to 1; none: nothing, so that .png, .webp, .webm "
-                   "and pictures in a folder have alpha.", wording="0", metavar="LEVEL|none", parser=parse_background),
-        opt.option("channel", ("color", "alpha", "depth"), "What pictures and clips show: colour; opacity; or depth, "
-                   "in a .png or a folder, in 16 bits, 0 where nothing is; --json has their unit.", wording="color"),
+        opt.option("overlay", ("support",), "Colour what only one view of the scene shows yellow, and what no view "
+                   "shows red."),
+        opt.option("background", str, "Grey level behind the scene, 0 to 1; none: transparent, in .png, .webp, .webm "
+                   "or a folder.", wording="0", metavar="LEVEL|none", parser=parse_background),
+        opt.option("channel", ("color", "alpha", "depth"), "Channel to draw: color, alpha (opacity), or depth. Depth "
+                   "takes a .png or a folder, with 16 bits and 0 where nothing is; --json gives its unit.",
+                   wording="color"),
     ),
     "overwrite",
 )  # fmt: skip
 def render(args: opt.Args) -> None:
-    """Draw scenes: a clip with before and after, a panel beside the photos, or a picture for each camera."""
+    """Draw scenes: a clip of before and after, a panel with the photos, or a picture for each camera."""
     kind = _choose_kind(args)
     from gsmerge.measure import drawings
     from gsmerge.measure.camera_path import parse_path
     from gsmerge.report import document_head
 
     files = args.files(args.scenes[0])
-    like = drawings.frame_files(files, args.cameras, args.images)
-    inputs = (*args.scenes, *input_files(files), *input_files(like))
-    if args.path is not None and parse_path(args.path) is None:  # of a file
+    framing = drawings.frame_files(files, args.cameras, args.images)
+    inputs = (*args.scenes, *input_files(files), *input_files(framing))
+    if args.path is not None and parse_path(args.path) is None:  # the path is a file
         inputs = (*inputs, Path(args.path))
     if args.output.suffix.lower() in (*PICTURES, *CLIPS):
-        read = [path for path in inputs if path not in args.scenes or not path.is_dir()]  # photos in it may not be
+        # A picture in a scene's folder may be replaced, unless it is a photo
+        read = [path for path in inputs if path not in args.scenes or not path.is_dir()]
         check_outputs((args.output,), (*read, files.images), overwrite=args.overwrite)
     else:
         check_folder(args.output, inputs, overwrite=args.overwrite)
     hints = args.hints(max_side=MAX_SIDE) if kind == "views" else args.hints()
     arguments = args.given(("views", "path", "frames", "size", "overlay", "background", "channel"))
     drawing = drawings.DRAWINGS[kind](
-        drawings.DrawOptions(files, args.scenes, like, args.output, args.opacity, hints, **arguments)
+        drawings.DrawOptions(files, args.scenes, framing, args.output, args.opacity, hints, **arguments)
     )
     document = {**document_head(), "output": str(args.output), "pictures": [str(path) for path in drawing.paths]}
     document |= drawing.facts
@@ -114,7 +118,7 @@ def render(args: opt.Args) -> None:
 
 
 def _choose_kind(args: opt.Args) -> str:
-    """Choose what is drawn by the name of the output and the options; UsageError if they do not fit."""
+    """Choose the kind of drawing by the name of the output and the options; UsageError if they do not fit."""
     suffix = args.output.suffix.lower()
     is_clip, is_picture = suffix in CLIPS, suffix in PICTURES
     if suffix and not is_clip and not is_picture and not args.output.is_dir():
@@ -127,19 +131,22 @@ def _choose_kind(args: opt.Args) -> str:
         if is_picture:
             raise UsageError(f"{args.output}: expected a clip, {opt.join_words(CLIPS)}, or a folder with --path")
         if isinstance(args.views, str):
-            raise UsageError("--views: expected a number of views with --path and clips, got a name")
+            raise UsageError("--views: expected a number of views for a clip or a --path, got a name")
         _check_path(args)
         return "path"
     if args.frames is not None:
-        raise UsageError(f"--frames: expected a clip, {opt.join_words(CLIPS)}, or --path with it")
+        raise UsageError(f"--frames: expected a clip, {opt.join_words(CLIPS)}, or a --path with it")
     if is_layer and is_picture and isinstance(args.views, int):
-        raise UsageError(f"{args.output}: expected a folder with a number of --views, or the name of one view")
+        raise UsageError(f"{args.output}: expected a folder for several --views, or the name of one view")
     alone = is_layer or (isinstance(args.views, str) and len(args.scenes) == 1)
     return "panel" if is_picture and not alone else "views"
 
 
 def _check_layer(args: opt.Args, suffix: str) -> bool:
-    """Return whether alpha, opacity or depth is asked for; UsageError unless the output, "" for a folder, has it."""
+    """Return whether alpha, opacity or depth is drawn; UsageError if an output with this ``suffix`` cannot hold it.
+
+    ``suffix``: "" for a folder.
+    """
     channel = args.channel or "color"
     if channel == "color" and args.background != NONE:
         return False
@@ -148,14 +155,14 @@ def _check_layer(args: opt.Args, suffix: str) -> bool:
         option = "--background none"
     for other in ("overlay", "background") if channel != "color" else ():
         if vars(args)[other] is not None:
-            raise UsageError(f"--{other}: expected colours with it, got {option}")
+            raise UsageError(f"--{other}: expected --channel color with it, got {option}")
     if len(args.scenes) > 1 or (suffix and suffix not in endings):
-        raise UsageError(f"{args.output}: expected a folder or {opt.join_words(endings)}, and one scene, with {option}")
+        raise UsageError(f"{args.output}: expected one scene, and a folder or {opt.join_words(endings)}, with {option}")
     return True
 
 
 def _check_path(args: opt.Args) -> None:
-    """Raise UsageError for an unknown path, or for frames of a file."""
+    """Raise UsageError for an unknown path, or for ``--frames`` with a path that is a file."""
     from gsmerge.measure.camera_path import parse_path
 
     with opt.usage_errors():
@@ -165,4 +172,4 @@ def _check_path(args: opt.Args) -> None:
         expected = "orbit, turntable, spline or a file of cameras"
         raise UsageError(f"--path {args.path}: expected {expected}, found no such file")
     if args.frames is not None:
-        raise UsageError("--frames: expected a path by its name; of a file, --views chooses some of the cameras")
+        raise UsageError("--frames: expected orbit, turntable or spline; with a file of cameras, use --views")

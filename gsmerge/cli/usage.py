@@ -1,4 +1,4 @@
-"""Explain wrong usage: words that are no values, and what to type in place of what does not exist."""
+"""Explain wrong usage: reject words that are not values, and suggest options and commands that exist."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from typer.core import TyperCommand, TyperGroup
 from gsmerge.cli.parameters import listed_settings
 from gsmerge.errors import UsageError
 from gsmerge.settings.reading import FileHints
-from gsmerge.settings.setting import flat_settings, near_names, perhaps
+from gsmerge.settings.setting import find_near_names, flat_settings, suggest_name
 
 PROGRAM = "gsmerge"
-LAB, LOOK = "lab", "look"  # the group of research commands, and compact with a page, which a scene's name alone calls
-_NEAR = 0.75  # likeness of two names, as difflib measures it, from which one is taken for the other
+LAB = "lab"  # group of research commands
+LOOK = "look"  # compact with a page; runs if the first word is a scene instead of a command
+_LEAST_SIMILARITY = 0.75  # of an unknown option and the suggested one, 0 to 1, as difflib measures it
 
-# What other programs call a command, and the number of Gaussians
-OTHER_WORDS = {
+# Names of other programs for our commands
+COMMAND_SYNONYMS = {
     "compact": ("compress", "simplify", "reduce", "decimate", "optimize", "optimise", "run"),
     "convert": ("transform", "export", "join", "merge", "combine", "crop", "translate"),
     "inspect": ("info", "stats", "describe", "show", "validate", "verify", "lint", "test"),
@@ -29,8 +30,8 @@ OTHER_WORDS = {
     "render": ("preview", "segment"),
     "view": ("viewer", "compare"),
 }
-# What other programs call an option
-OTHER_OPTIONS = {
+# Names of other programs for our options
+OPTION_SYNONYMS = {
     "overwrite": ("force", "f", "clobber", "replace", "yes", "y"),
     "output": ("o", "out", "outdir", "out_dir", "output_dir", "output_path", "outfile", "dest"),
     "quiet": ("silent", "s", "no_progress"),
@@ -38,6 +39,7 @@ OTHER_OPTIONS = {
     "images": ("photos", "image", "image_dir", "image_path"),
     "cameras": ("camera", "poses", "transforms", "colmap"),
 }
+# The same for formats, which the name of an output decides here, and for --budget
 FORMAT_WORDS = ("format", "to", "type", "ext", "extension")
 BUDGET_WORDS = (
     "ratio", "percent", "percentage", "share", "fraction", "factor", "keep", "count", "num", "number", "gaussians",
@@ -49,13 +51,13 @@ UsageErrors: Any = typer.BadParameter.__mro__[2]
 
 
 def expand_home(word: str) -> str:
-    """Write out the ~ with which a word, or what follows an option or a = in it, begins, where no shell has done so."""
+    """Expand a leading ~ in a word, also after a short option or after a =, where the shell has not done it."""
     match = re.fullmatch(r"(-\w|.*?=|)(~.*)", word, re.DOTALL)
     return word if match is None else match[1] + os.path.expanduser(match[2])
 
 
 class _Words:
-    """Part of commands and groups: what was typed is checked as words, before it is read as values."""
+    """Mixin of commands and groups that checks the typed words before they are parsed as values."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the words after a command's name; raise UsageError for empty, missing and repeated values."""
@@ -68,7 +70,7 @@ class _Words:
         try:
             rest: list[str] = super().parse_args(ctx, args)  # type: ignore[misc]
         except UsageErrors as error:
-            error.ctx = getattr(error, "ctx", None) or ctx  # the parser's own have none
+            error.ctx = getattr(error, "ctx", None) or ctx  # errors of the parser have no context
             raise
         values, _, order = self.make_parser(ctx).parse_args(args=words)  # type: ignore[attr-defined]
         for param in params:
@@ -77,7 +79,7 @@ class _Words:
 
 
 def _check_words(param: Any, words: Any, times: int, names: set[str]) -> None:
-    """Raise UsageError if a parameter's words are no values: empty, the name of an option, or one too many."""
+    """Raise UsageError if a parameter's words are not its values: an empty word, an option, or too many words."""
     is_option = param.param_type_name == "option"
     label = param.opts[0] if is_option else param.metavar or str(param.name).upper()
     words = [word for word in (words if isinstance(words, (list, tuple)) else [words]) if isinstance(word, str)]
@@ -99,7 +101,7 @@ class Group(_Words, TyperGroup):
 
 
 class Command(_Words, TyperCommand):
-    """A command whose usage begins with its arguments, each as its help names it."""
+    """A command whose usage line begins with its arguments, under the names that its help uses."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """List the parts of the usage line after the name of the command."""
@@ -112,67 +114,67 @@ class Command(_Words, TyperCommand):
 
 
 def usage_message(error: Any, make_command: Callable[[], Any]) -> str:
-    """Describe wrong usage in one line, with the correct way to write it; ``make_command`` makes all commands."""
+    """Describe wrong usage in one line, with a correction if one is known; ``make_command`` makes all commands."""
     place = PROGRAM if error.ctx is None else error.ctx.command_path.replace(f" {LOOK}", " compact")
-    message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # a prefix of checks inside Typer
+    message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # Typer adds this prefix
     parameters = [] if error.ctx is None else error.ctx.command.params
     has_output = any(parameter.name == "output" for parameter in parameters)
     if hasattr(error, "possibilities") and error.ctx is not None:
         suggestion = _suggest(error.option_name, error.ctx.command, place, make_command)
         message = suggestion or f"No such option: {error.option_name}"
     elif match := re.search(r": '(.*)' is not one of (.*)", message):
-        message += perhaps(match[1], re.findall("'([^']*)'", match[2]))
+        message += suggest_name(match[1], re.findall("'([^']*)'", match[2]))
     elif message.startswith("Got unexpected extra argument") and has_output:
-        message += "; name what is written with -o"
+        message += "; name the output with -o"
     elif match := re.match(r"No such command '(\w+)'", message):
         if match[1] == "help":
-            return f"help is no command: use {PROGRAM} --help, or {PROGRAM} COMMAND --help"
-        near = next((name for name, words in OTHER_WORDS.items() if match[1] in words), None)
-        message = message if near is None else f"{match[0]}. Did you mean '{near}'?"
+            return f"help is not a command: use {PROGRAM} --help, or {PROGRAM} COMMAND --help"
+        synonym = next((name for name, words in COMMAND_SYNONYMS.items() if match[1] in words), None)
+        message = message if synonym is None else f"{match[0]}. Did you mean '{synonym}'?"
     return f"{message}; see '{place} --help'"
 
 
 def _suggest(option: str, command: Any, place: str, make_command: Callable[[], Any]) -> str | None:
-    """Suggest what to type in place of an option that ``command``, called as ``place``, lacks; None if nothing is near.
+    """Suggest a replacement for an option that ``command``, called as ``place``, does not have; None if there is none.
 
-    That is ``--set`` or ``--hint`` for a setting without an option of its own, what other programs' word for it means,
-    an option of nearly the same name, or the command that has it.
+    The suggestion is ``--set`` or ``--hint`` if the name is that of a setting without an option of its own, the option
+    that other programs call so, an option with a similar name, or the command that has the option.
     """
     name = option.lstrip("-").replace("-", "_")
     names = {str(parameter.name): parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
     names["help"] = "--help"
     if name in BUDGET_WORDS and "budget" in names:
-        more = ", or --k" if "k" in names else ""
-        return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
+        alternative = ", or --k" if "k" in names else ""
+        return f"{option} is not an option: use --budget, such as 2%, 40000 or 5MB{alternative}"
     if name in flat_settings(FileHints) and "hint" in names:
-        return f"{option} is no option: use --hint {name}=VALUE"
+        return f"{option} is not an option: use --hint {name}=VALUE"
     positive, settings = name.removeprefix("no_"), {}
-    with suppress(ImportError):  # training's, where torch is not installed
+    with suppress(ImportError):  # the settings of training need torch, which may not be installed
         settings = listed_settings(getattr(command.callback, "kinds", ()))
     if positive in settings:
         default = settings[positive].default
         value = str(not default).lower() if isinstance(default, bool) else "VALUE" if positive == name else "none"
-        more = f", or --grid {positive}=A,B for several" if "grid" in names else ""
-        return f"{option} is no option: use --set {positive}={value}{more}"
-    same = [known for known, words in OTHER_OPTIONS.items() if name in words]
-    if command.name == "convert" and ("output" in same or name in ("output", *FORMAT_WORDS)):
-        return f"{option} is no option: the last file is what is written, by its name: gsmerge convert a.ply x.spz"
+        alternative = f", or --grid {positive}=A,B for several" if "grid" in names else ""
+        return f"{option} is not an option: use --set {positive}={value}{alternative}"
+    synonyms = [known for known, words in OPTION_SYNONYMS.items() if name in words]
+    if command.name == "convert" and ("output" in synonyms or name in ("output", *FORMAT_WORDS)):
+        return f"{option} is not an option: the last file is the output, as in gsmerge convert a.ply x.spz"
     if name in FORMAT_WORDS and "output" in names:
         example = ", such as -o x.spz" if command.name in ("compact", LOOK) else ""
-        return f"{option} is no option: the name of -o decides{example}"
-    begun = [known for known in names if len(name) > 2 and known.startswith(name)]
-    near = [known for known in same if known in names] or (begun if len(begun) == 1 else [])
-    near = near or near_names(name, names, least=_NEAR)
+        return f"{option} is not an option: the ending of -o sets the format{example}"
+    extended = [known for known in names if len(name) > 2 and known.startswith(name)]
+    near = [known for known in synonyms if known in names] or (extended if len(extended) == 1 else [])
+    near = near or find_near_names(name, names, least=_LEAST_SIMILARITY)
     if near and not name.startswith("no_"):
-        return f"{option} is no option: use {names[near[0]]}"
-    owner = None if positive in names else _owner({name, positive, *same}, make_command())
+        return f"{option} is not an option: use {names[near[0]]}"
+    owner = None if positive in names else _owner({name, positive, *synonyms}, make_command())
     if owner is not None and hasattr(command, "commands"):
         return f"{option} comes after the name of a command or scene"
-    return None if owner is None else f"{option} is no option of {place}: {PROGRAM} {owner} has it"
+    return None if owner is None else f"{option} is not an option of {place}: use {PROGRAM} {owner}"
 
 
 def _owner(names: set[str], group: Any) -> str | None:
-    """Name the first command of a group that has an option of one of these names; groups in it come last."""
+    """Return the first command of a group that has an option with one of these names; its own groups come last."""
     for word, command in sorted(group.commands.items(), key=lambda item: hasattr(item[1], "commands")):
         if hasattr(command, "commands"):
             inner = _owner(names, command)

@@ -1,4 +1,4 @@
-"""``gsmerge view``: a scene and its compact versions as one page, in stills and in 3D."""
+"""``gsmerge view``: show a scene and its compact versions on one page, in stills and in 3D."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     opt.BEFORE,
     opt.AFTER,
     f"{opt.READING} masks protect targets sizes",
-    opt.output("The page, .html; one that gsmerge made is replaced.",
+    opt.output("The page, .html. A page that gsmerge made is replaced.",
                wording="AFTER.compare.html, or BEFORE.view.html, beside it"),
     *opt.panel(
         opt.OUTPUT,
-        opt.switch("light", "Show BEFORE in pictures alone: a page of a third of the size, with AFTER in 3D."),
+        opt.switch("light", "Show BEFORE only in pictures, and AFTER in 3D; the page has a third of the size."),
     ),
     "open",
 )  # fmt: skip
 def view(args: opt.Args) -> None:
-    """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D, scores in one file."""
+    """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D and scores in one file."""
     from gsmerge.pages.data import collect
     from gsmerge.pages.page import headline, speed, speed_words, view_page
     from gsmerge.pages.view import file_gains
@@ -40,14 +40,14 @@ def view(args: opt.Args) -> None:
 
     args.after = args.after or []
     if args.protect is not None and not args.sizes and "loaded" not in vars(args):
-        raise UsageError("--protect: expected --sizes with it, which are compacted; files AFTER stay as they are")
+        raise UsageError("--protect: expected --sizes with it, since it has no effect on the files AFTER")
     files, after = args.files(args.before), args.after
-    beside = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.base.with_suffix(".view.html")
-    output = args.output or beside
+    default = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.base.with_suffix(".view.html")
+    output = args.output or default
     check_outputs((output,), (*input_files(files), *after, args.targets), overwrite=True)
     check_replaced((output,))
     if output.suffix.lower() not in (".html", ".htm"):
-        raise UsageError(f"{output}: expected a name that ends in .html")
+        raise UsageError(f"{output}: expected a name ending in .html")
     with stage_progress(quiet=args.silent) as progress:
         progress("read", 0, 0)
         pair = read_before_after(args, files)
@@ -62,10 +62,16 @@ def view(args: opt.Args) -> None:
     page = view_page(data)
     write_texts({output: page}, overwrite=True)
     say_notes(data.notes, quiet=args.silent)
-    said = headline(data) + speed_words(speed(data)).replace("\u00a0", " ")
+    summary = headline(data) + speed_words(speed(data)).replace("\u00a0", " ")
     notes = [*pair.notes, *data.notes]
-    document = {**document_head(), "output": str(output), "notes": notes, "bytes": len(page.encode()), "headline": said}
-    print_document(document, f"{output}: {said}", as_json=args.json, quiet=args.quiet)
+    document = {
+        **document_head(),
+        "output": str(output),
+        "notes": notes,
+        "bytes": len(page.encode()),
+        "headline": summary,
+    }
+    print_document(document, f"{output}: {summary}", as_json=args.json, quiet=args.quiet)
     if args.open and not _open(output):
         say(f"open {output.absolute().as_uri()} in a browser", quiet=args.silent)
 
@@ -75,7 +81,7 @@ def _compact_sizes(
 ) -> tuple[dict[str, Gaussians], dict[str, Cameras], dict[str, tuple[float, float]], list[int]]:
     """Compact the scene to ``shares`` such as "2%"; return Gaussians, cameras and expected gains by name, and bytes.
 
-    Without files AFTER the one nearest the default comes first, for the page opens on it.
+    Without files AFTER, the share nearest to the default comes first, since the page opens with it.
     """
     from gsmerge.compaction.compact import compact
     from gsmerge.io.formats.ply import file_bytes
@@ -85,9 +91,9 @@ def _compact_sizes(
     results: dict[str, Gaussians] = {}
     cameras: dict[str, Cameras] = {}
     gains: dict[str, tuple[float, float]] = {}
-    nearest = min(shares, key=lambda share: abs(parse_share(share) - parse_share(SHARE)), default="")
-    opened = None if pair.plys else nearest
-    for share in sorted(shares, key=lambda share: (share != opened, parse_share(share))):
+    usual = min(shares, key=lambda share: abs(parse_share(share) - parse_share(SHARE)), default="")
+    first = None if pair.plys else usual
+    for share in sorted(shares, key=lambda share: (share != first, parse_share(share))):
         name = share.replace("%", " %")
         progress(f"compact to {name}", 0, 0)
         result = compact(pair.load.scene, budget=share, fill=True)
@@ -100,7 +106,7 @@ def _compact_sizes(
 
 
 def _open(page: Path) -> bool:
-    """Open a page in the browser; False without a screen, where a text browser would occupy the terminal."""
+    """Open a page in the browser. Return False without a screen, where a text browser would take over the terminal."""
     if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
         return False
     import webbrowser

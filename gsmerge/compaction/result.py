@@ -417,9 +417,9 @@ def _report(
         made = replace(made, psnr_before=None, psnr_after=None, **vars(Besides()), choices=choices)
         return replace(made, notes=[*made.notes, prepared.doubt], worse=prepared.doubt)
     worse = None
-    if rendered and level == 0 and not plan.clean.hiding:  # coarser levels are meant to differ
+    if rendered and level == 0 and not plan.clean.visible_drops:  # coarser levels are meant to differ
         worse = describe_distance(candidate.psnr)
-    elif reference.of_views and not plan.clean.hiding:
+    elif reference.of_views and not plan.clean.visible_drops:
         name, pictures = f"level {level}" if level else "the result", reference.name
         compared = (covered.before, covered.after) if covered else (before, shown)
         worse = describe_loss(name, *compared, OWN_PHOTOS if pictures == PHOTOS else pictures)

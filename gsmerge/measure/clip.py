@@ -21,13 +21,12 @@ from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.kernels.elementary import sin
 from gsmerge.measure.preview import FACE, Picture, shorten_text
+from gsmerge.settings.pictures import GIF
 from gsmerge.types import StrPath
 
 # Encoders by the ending of a name, the first that OpenCV has is used, with their names. Browsers play all but the last
 # of .mp4. VP8 takes a third of the time of VP9 and 1.6 times the space.
 ENCODERS = {".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")), ".webm": (("VP80", "VP8"), ("VP90", "VP9"))}
-GIF = ".gif"
-SUFFIXES = (*ENCODERS, GIF)
 # How the program ffmpeg encodes frames with so many channels, and the encoder that it needs: nearly every program plays
 # H.264, and browsers and editors read the alpha of VP9
 BY_FFMPEG = {

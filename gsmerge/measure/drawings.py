@@ -25,10 +25,8 @@ from gsmerge.measure.camera_path import parse_path, sample_path, turned_degrees,
 from gsmerge.measure.clip import (
     BY_FFMPEG,
     FOLDER,
-    GIF,
     MAX_GIF_PIXELS,
     MAX_VIDEO_PIXELS,
-    SUFFIXES,
     draw_swipe,
     make_captions,
     stored_size,
@@ -46,10 +44,10 @@ from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import read_into_frame
 from gsmerge.scene.read import Loaded, SceneViews, move_cameras_to_scene, read_gaussian_file
+from gsmerge.settings.pictures import CLIPS, GIF, PICTURES
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 PANEL_VIEWS = 4  # rows of a panel
 SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # of a path, at least
 VIEW_FRAMES = 4  # for each view of a spline, at least
@@ -262,7 +260,7 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     facts = {"views": ids, "notes": group.notes, "scenes": group.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
     facts |= _depth_unit(group, cameras, options)
-    if options.output.suffix.lower() not in SUFFIXES:
+    if options.output.suffix.lower() not in CLIPS:
         return Drawing([options.output / f"frame_{i:05d}.png" for i in range(len(cameras))], facts, draw)
     _check_frames(options.output, cameras.width, cameras.height, len(cameras))
     width, height = stored_size(options.output, cameras.width, cameras.height)

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from gsmerge.alignment import ESTIMATED, MAY_BE_UNALIGNED, Layout
 from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.json_files import FFGS
-from gsmerge.settings.reading import OF_SCENE, QuatChoice, ReadHints
-from gsmerge.settings.setting import join_words, perhaps
+from gsmerge.settings.reading import SCENE_ARGUMENTS, QuatChoice, ReadHints
+from gsmerge.settings.setting import join_words, suggest_name
 
 if TYPE_CHECKING:
     from gsmerge.io.formats.read import FileInfo
@@ -32,8 +32,8 @@ def make_hints(values: dict[str, Any]) -> ReadHints:
     names = {field.name for field in fields(ReadHints)}
     unknown = sorted(values.keys() - names)
     if unknown:
-        known = sorted({*names, *OF_SCENE})
-        near = perhaps(unknown[0], known)
+        known = sorted({*names, *SCENE_ARGUMENTS})
+        near = suggest_name(unknown[0], known)
         raise ValueError(f"expected {join_words(map(repr, known))}, got {unknown[0]!r}{near}")
     return ReadHints(**values)
 

@@ -1,1 +1,1 @@
-"""Every option once: default, meaning and possible values; light, since ``--help`` reads it."""
+"""Declarations of all options: default, meaning and possible values. Light to import, since ``--help`` reads them."""

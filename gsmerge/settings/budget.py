@@ -1,4 +1,7 @@
-"""Settings of the number of Gaussians: budgets, file sizes, devices and quality targets, and their texts."""
+"""Settings that decide the number of Gaussians, and the parsers of their texts.
+
+A user asks for a count, a share of the input, a file size, a device or a quality.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,11 @@ from decimal import Decimal
 from fractions import Fraction
 
 from gsmerge.errors import UsageError
-from gsmerge.settings.setting import Settings, perhaps, setting
+from gsmerge.settings.setting import Settings, setting, suggest_name
 
 SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}  # bytes
 AUTO = "auto"
-GREY = 6.0  # dB that a picture of mean grey alone has of any photo: nobody asks for less
+GREY_PSNR = 6.0  # dB; a picture of the mean grey reaches this on any photo, so nobody asks for less
 COUNT = r"\d[\d_]*|\d{1,3}(?:,\d{3})+|\d*\.?\d+(?:k|m|e\d)"  # Gaussians: 40000, 40_000, 40,000, 40k, 4e4
 DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
 
@@ -23,28 +26,27 @@ DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
 class BudgetOptions(Settings):
     """Settings that decide the number of Gaussians, next to superpixels per view and K."""
 
-    budget: int | str | None = setting(None, "Gaussians in the result: a number, met exactly; at most a share such as "
-        "2% of the input, a size such as 5MB, or what quest3, mobile or desktop draw fluidly; auto: as many as the "
-        "scene needs.",
-        "A size is that of the output's file, a `.ply` in Python, and never exceeded. No more is taken than new views "
-        "gain from, unless `fill` is true.",
-        metavar="40000|2%|5MB|DEVICE|auto", counts=True, neutral=(AUTO, *DEVICES), uncut=(AUTO,),
-        in_trial=None)  # fmt: skip
-    fill: bool = setting(False, "Whether shares, sizes and devices are filled.")
-    most: int | None = setting(None, "Gaussians from which on new views gain nothing, where that is known.",
+    budget: int | str | None = setting(None, "Number of Gaussians in the result. A number such as 40000 is met "
+        "exactly. Upper limits are a share of the input such as 2%, a file size such as 5MB, or a device that draws "
+        "them fluidly: quest3, mobile or desktop. auto: as many as the scene needs.",
+        "The file size is that of the output, in Python that of a `.ply`, and is never exceeded. A limit is used only "
+        "as far as new views gain from more Gaussians, unless `fill` is true.", metavar="40000|2%|5MB|DEVICE|auto",
+        counts=True, neutral=(AUTO, *DEVICES), uncut=(AUTO,), in_trial=None)  # fmt: skip
+    fill: bool = setting(False, "Use all of a share, file size or device, even if fewer Gaussians suffice.")
+    most: int | None = setting(None, "Number of Gaussians beyond which new views gain nothing, if known.",
         internal=True)  # fmt: skip
-    quality: str | None = setting(None, "Fewest Gaussians that render photos at a PSNR such as 30dB, or that lose at "
-        "most so much against the best, such as -0.2dB.",
-        "These are photos that are left out, of four or more, or those of the input. Where rows belong to no pixels "
-        "and no number is asked for, the result keeps the input: its renders at 32.5 dB without photos, the photos "
-        "within 0.3 dB with them.",
+    quality: str | None = setting(None, "Use the fewest Gaussians that render photos at a PSNR such as 30dB, or at "
+        "most so far below the best number, such as -0.2dB.",
+        "The photos are held out if there are four or more, otherwise they are those of the input. If the rows belong "
+        "to no pixels and no number is asked for, the result keeps the quality of the input. Without photos it "
+        "reaches 32.5 dB against renders of the input; with photos it loses at most 0.3 dB on them.",
         metavar="30dB|-0.2dB", whole="value", in_trial=None)  # fmt: skip
     output: str = setting(
-        "", "Name of the file that is written and whose bytes a size counts, with its ending.", internal=True
+        "", "Name of the output file, with its ending. A file size as `budget` counts its bytes.", internal=True
     )
-    levels: int = setting(1, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter of "
-        "the Gaussians of the one before.",
-        "Each is fitted by itself.", least=1, most=8, whole="name", in_trial=1,
+    levels: int = setting(1, "Number of levels of detail. Each level has a quarter of the Gaussians of the one before. "
+        "They are written to one file each, or all to a lod-meta.json.",
+        "Each level is fitted on its own.", least=1, most=8, whole="name", in_trial=1,
         in_batches=False)  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -60,10 +62,10 @@ class BudgetOptions(Settings):
             parse_quality(self.quality)
 
     @property
-    def searching(self) -> list[str]:
-        """Names of what is asked for that takes several results, of which the scene says which."""
-        asked = {"budget auto": self.auto, "levels": self.levels > 1, f"quality {self.quality}": self.quality}
-        return [name for name, is_asked in asked.items() if is_asked]
+    def search_names(self) -> list[str]:
+        """Names of the settings in use that need several results to be built and compared."""
+        requests = {"budget auto": self.auto, "levels": self.levels > 1, f"quality {self.quality}": self.quality}
+        return [name for name, is_asked in requests.items() if is_asked]
 
     @property
     def auto(self) -> bool:
@@ -72,17 +74,17 @@ class BudgetOptions(Settings):
 
     @property
     def is_limit(self) -> bool:
-        """Whether the budget is a share, a size or a device, of which no more is taken than new views gain from."""
+        """Whether the budget is an upper limit: a share, a size or a device, used only as far as new views gain."""
         return not self.fill and not self.auto and self.budget is not None and self.number is None
 
     @property
     def is_filled(self) -> bool:
-        """Whether as many Gaussians are written as the budget names or allows, even where nobody sees them."""
+        """Whether the result has all Gaussians that the budget names or allows, even where no view sees them."""
         return self.number is not None or self.fill
 
     @property
     def number(self) -> int | None:
-        """The number of Gaussians that the budget names; None where it is a share, a size, a device, or left out."""
+        """The number of Gaussians that the budget names; None if it names none, or is a share, a size or a device."""
         if self.budget is None or self.auto or self.in_bytes or self.budget in DEVICES or "%" in str(self.budget):
             return None
         return parse_budget(self.budget, sys.maxsize)
@@ -94,19 +96,19 @@ class BudgetOptions(Settings):
 
     @property
     def target_psnr(self) -> float | None:
-        """PSNR (dB) that the input photos have to reach; None without this target."""
+        """PSNR (dB) that the photos have to reach; None without such a target."""
         quality = None if self.quality is None else parse_quality(self.quality)
         return None if quality is None or self.max_drop is not None else quality
 
     @property
     def max_drop(self) -> float | None:
-        """Allowed loss in dB against the best of the scene's curve; None without this target."""
+        """Allowed loss in dB against the best count on the scene's curve; None without such a target."""
         loss = self.quality is not None and self.quality.strip().startswith("-")
         return -parse_quality(str(self.quality)) if loss else None
 
 
 def parse_quality(text: str) -> float:
-    """Parse the dB of ``--quality``: a PSNR as "30dB", or a loss below zero as "-0.2dB".
+    """Parse the dB of ``--quality``: a PSNR such as "30dB", or a loss such as "-0.2dB", which is returned below zero.
 
     Example:
         >>> parse_quality("30dB"), parse_quality("-0.2dB")
@@ -114,10 +116,10 @@ def parse_quality(text: str) -> float:
     """
     match = re.fullmatch(r"(-?)(\d*\.?\d+)\s*db", str(text).strip().lower(), re.ASCII)
     value = float(match[2]) if match else math.inf
-    if match is None or not math.isfinite(value) or (value < GREY and not match[1]):
-        near = f'; perhaps "{text}dB"' if re.fullmatch(r"-?\d*\.?\d+", str(text), re.ASCII) else ""
-        near = f'; perhaps "-{value:g}dB"' if match is not None and 0 < value < GREY else near
-        raise ValueError(f'quality: expected a PSNR as "30dB" or a loss as "-0.2dB", got {text!r}{near}')
+    if match is None or not math.isfinite(value) or (value < GREY_PSNR and not match[1]):
+        hint = f'; perhaps "{text}dB"' if re.fullmatch(r"-?\d*\.?\d+", str(text), re.ASCII) else ""
+        hint = f'; perhaps "-{value:g}dB"' if match is not None and 0 < value < GREY_PSNR else hint
+        raise ValueError(f'quality: expected a PSNR as "30dB" or a loss as "-0.2dB", got {text!r}{hint}')
     return -value if match[1] else value
 
 
@@ -138,11 +140,14 @@ def share_text(share: float) -> str:
 
 
 def parse_budget(budget: str | int | None, num_input: int) -> int:
-    """Parse a number of Gaussians as "40000", "40k" or "1e5", or a share of the input as "2%"; at most ``num_input``.
+    """Parse a number of Gaussians such as "40000", "40k" or "1e5", or a share of the input such as "2%".
+
+    Returns:
+        At most ``num_input`` Gaussians.
 
     Raises:
-        ValueError: If it is neither.
-        UsageError: If it is not at least one Gaussian.
+        ValueError: If the text is neither a number nor a share.
+        UsageError: If the result is less than one Gaussian.
 
     Example:
         >>> parse_budget("40000", 1_000_000), parse_budget("2.5%", 1_000_000)
@@ -151,13 +156,13 @@ def parse_budget(budget: str | int | None, num_input: int) -> int:
     text = str(budget).strip()
     match = re.fullmatch(rf"(?:{COUNT})|(\d*\.?\d+)\s*%", text, re.ASCII | re.IGNORECASE)
     if not match:
-        number = re.fullmatch(r"\d*\.\d+", text, re.ASCII)
-        percent = float(text) * (100 if float(text) < 1 else 1) if number else 0.0
-        near = f'; perhaps "{percent:g}%"' if 0 < percent <= 100 else perhaps(text, (AUTO, *DEVICES))
-        near = f"; --quality {text} asks for a PSNR" if text.lower().endswith("db") else near
+        is_fraction = re.fullmatch(r"\d*\.\d+", text, re.ASCII) is not None
+        percent = float(text) * (100 if float(text) < 1 else 1) if is_fraction else 0.0
+        hint = f'; perhaps "{percent:g}%"' if 0 < percent <= 100 else suggest_name(text, (AUTO, *DEVICES))
+        hint = f"; --quality {text} asks for a PSNR" if text.lower().endswith("db") else hint
         raise ValueError(
             f'budget: expected a number of Gaussians as "40000", a share as "2%", a size as "5MB", auto or'
-            f" {', '.join(DEVICES)}, got {text!r}{near}"
+            f" {', '.join(DEVICES)}, got {text!r}{hint}"
         )
     if match[1]:
         share = Fraction(match[1])
@@ -173,7 +178,7 @@ def parse_budget(budget: str | int | None, num_input: int) -> int:
 
 
 def parse_bytes(size: str | int) -> int:
-    """Parse a size in bytes, as "5MB", "800 KiB" or "5000000".
+    """Parse a file size such as "5MB", "800 KiB" or "5000000" into bytes.
 
     Example:
         >>> parse_bytes("1.5MB")

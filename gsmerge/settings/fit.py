@@ -10,10 +10,10 @@ from gsmerge.settings.setting import Settings, setting
 
 Fit = Literal["full", "none"]
 STEPS = 320  # of the full fit
-LONG_STEPS = 600  # from here on a little dropout pays
-USUAL_SHARE = 0.044  # of Gaussians in the pixels, which a quarter of these shows well
-HASTY_STEPS = 20  # shorter runs have no time for full-size photos
-GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
+LONG_STEPS = 600  # runs of at least so many steps gain from a little dropout
+USUAL_SHARE = 0.044  # Gaussians per pixel; a quarter of the pixels shows so many well
+TOO_FEW_STEPS = 20  # shorter runs have no time for full-size photos
+GROW_STEPS = 150  # shorter runs do better when they begin with all their Gaussians
 
 
 @dataclass(frozen=True)
@@ -25,48 +25,49 @@ class Tuning:
     quats_lr: float = 0.03  # Step of a quaternion
     opacities_lr: float = 0.3  # Step of an opacity's logit
     colors_lr: float = 0.03  # Step of a colour, sRGB in [0, 1]
-    poses_lr: float = 0.1  # First step of a moved camera: turns and shifts by so many pixels
-    decay: float = 0.4  # Factor on the other steps at the end; less beyond 300 steps
+    poses_lr: float = 0.1  # First step of a moved camera: rotation and shift, each in pixels
+    decay: float = 0.4  # Factor on all step sizes above but poses_lr at the end; less beyond 300 steps
     beta1: float = 0.8  # Largest decay of Adam's first moment, see gsmerge.fit.schedule.first_decay
-    beta2: float = 0.9  # Decay of its second moment
+    beta2: float = 0.9  # Decay of Adam's second moment
     max_mean_shift: float = 2.0  # Largest shift of a mean, in units of the Gaussian's size
     max_scale_change: float = 2.5  # Largest change of a log scale
     max_opacity_change: float = 4.0  # Largest change of an opacity's logit
-    # Share of the limits of mean and scales for a Gaussian that one photo alone shows: that photo
-    # says what it looks like, not where it is. From two photos on the limits are whole
+    # Share of the limits of mean and scales for a Gaussian that only one photo shows: that photo
+    # determines its colour, not its depth. With two photos or more the limits apply in full
     single_view_share: float = 0.3
-    # Least scale, in pixels of the photo that a Gaussian is nearest to: thinner ones show as
-    # needles when a viewer enlarges them. 0 for none
+    # Least scale, in pixels of the photo nearest to the Gaussian: thinner Gaussians show as
+    # needles when a viewer enlarges them. 0: no limit
     min_scale: float = 0.5
-    # Gaussians whose three sigma reach this share of the width of the nearest photo are at most so
-    # many times as long as their second axis, once a run has grown: from elsewhere longer ones show
-    # as strokes. Before, they help few Gaussians to find their places
+    # A Gaussian is large if its three sigma reach `long_share` of the width of the nearest photo. Once a run
+    # has grown, a large Gaussian is at most `max_ratio` times as long as its second axis, since longer ones show
+    # as strokes from other viewpoints. Before, long Gaussians help a small number of them to find their places
     long_share: float = 0.25
     max_ratio: float = 3.0
-    average_share: float = 0.2  # Share of the last steps that the parameters are averaged over
-    ssim_lambda: float = 0.35  # Share of structural similarity in the loss, the rest is L1
-    # Weight in the loss, at the end, of the L1 of differences between neighbouring pixels; it
-    # grows from 0: edges say little where they lie elsewhere
+    average_share: float = 0.2  # Share of the steps, the last ones, over which the parameters are averaged
+    ssim_lambda: float = 0.35  # Share of structural similarity in the loss; the rest is L1
+    # Weight in the loss of the L1 of differences between neighbouring pixels, at the end of a run. It
+    # grows from 0, since the gradients of edges mean little before the edges lie in their places
     edge_weight: float = 2.4
     # Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024):
     # what the photos do not need fades, instead of standing in front of other views
     opacity_reg: float = 0.03
-    # The same of the mean size, in units of each Gaussian's own at its start: fewer of them
-    # overlap, and a step takes a third less time
+    # Weight in the loss of the mean size, in units of each Gaussian's size at its start. Fewer Gaussians
+    # overlap then, and a step takes a third less time
     scale_reg: float = 0.01
-    outside_every: int = 7  # Steps from one look from outside to the next, see gsmerge.fit.outside
-    # Share of the steps that come before them, 1 for none; what hangs in gaps early on helps the rest
+    outside_every: int = 7  # Steps from one outside view to the next, see gsmerge.fit.outside
+    # Share of the steps before the first outside view, 1 for none. Early on, Gaussians that hang in gaps
+    # help the others
     outside_from: float = 0.15
     iterations: int = 6  # Conjugate-gradient steps of the colour fit
-    prior_weight: float = 0.03  # Weight of the unfitted colours, relative to visibility
+    prior_weight: float = 0.03  # Weight of the colours before the colour fit, relative to visibility
     huber: float = 0.2  # Colour error beyond which a pixel counts less in the colour fit
-    # Exposure of a view against the mean, as a factor, from which on the colour fit compensates it;
-    # smaller differences come from holes and highlights as often as from the camera
+    # Least exposure of a view, as a factor on the mean, that the colour fit compensates; smaller
+    # differences come from holes and highlights as often as from the camera
     min_gain: float = 1.15
-    max_gain: float = 2.0  # Largest exposure factor that is believed
+    max_gain: float = 2.0  # Largest exposure factor that is compensated
 
     def scaled(self, factor: float) -> Tuning:
-        """Return the same constants with ``factor`` times the step sizes of Gaussians."""
+        """Return the constants with the step sizes of Gaussians multiplied by ``factor``."""
         names = ("means_lr", "scales_lr", "quats_lr", "opacities_lr", "colors_lr")
         return replace(self, **{name: factor * getattr(self, name) for name in names})
 
@@ -75,35 +76,36 @@ class Tuning:
 class FitOptions(Settings):
     """Settings of the fit to the photos."""
 
-    fit: Fit = setting("full", "full: closer to the photos, for most of the time that a run takes; none: neither.")
-    fit_steps: int | None = setting(None, "Steps of the full fit, one view each.",
-        "By default 320, and by effort and numbers of views and Gaussians.", least=1)  # fmt: skip
+    fit: Fit = setting("full", "full: fit the Gaussians to the photos, which takes most of a run's time; none: skip "
+        "it.")  # fmt: skip
+    fit_steps: int | None = setting(None, "Number of steps of the full fit; each step draws one view.",
+        "By default 320, scaled by `effort` and by the numbers of views and Gaussians.", least=1)  # fmt: skip
     time_budget: float | None = setting(None, "Seconds after which the full fit stops.",
-        "The result is then no longer the same on every machine. By default there is no limit.", above=0,
+        "With a limit the result is no longer the same on every machine. By default there is no limit.", above=0,
         unit="seconds", in_trial=None)  # fmt: skip
-    photo_scale: float | Literal["auto"] = setting("auto", "Times the views' size at which two of every five steps "
-        "after the first ones look at larger photos, as far as the photos are that large.",
+    photo_scale: float | Literal["auto"] = setting("auto", "Photo scale, relative to the view size, for two of every "
+        "five later steps; at most the scale of the photos that are given.",
         "`auto`: up to 2 with effort `default` and `best`.", least=1, below=math.inf, in_trial=1.0)  # fmt: skip
-    dropout: float | None = setting(None, "Share of the Gaussians that a step leaves out.",
-        "By default 0.1 for at most five views and at least 150 steps, 0.05 from 600 steps and 30 looks at each view "
-        "on, otherwise 0.", least=0, below=1)  # fmt: skip
+    dropout: float | None = setting(None, "Share of the Gaussians that are left out of each step.",
+        "By default 0.1 for at most five views and at least 150 steps, 0.05 for at least 600 steps and 30 steps per "
+        "view, otherwise 0.", least=0, below=1)  # fmt: skip
     half_res_share: float | None = setting(None, "Share of the steps, the first ones, that draw a quarter of the "
-        "pixels.", "By default 0.7, from 600 steps on 0.5, below 20 all; less for more than 4.4 % of the "
-        "Gaussians.", least=0, most=1)  # fmt: skip
-    holdout: float = setting(0.05, "Share of the photos' patches that decides whether a fit is accepted.", above=0,
-        below=1)  # fmt: skip
-    min_contribution: float = setting(1 / 255, "Least blending weight at some pixel of some photo; a fit leaves out "
-        "Gaussians below it in all photos that they lie in. 0: all Gaussians are written, also those that change no "
-        "photo by more than rounding.", least=0, most=1)  # fmt: skip
-    judged: bool = setting(True, "Whether the result has to show held-out patches better than its start; not where the "
-        "start has seen them.", internal=True)  # fmt: skip
-    move_cameras: bool = setting(False, "Whether the full fit moves the cameras on; a plan decides it by `poses`.",
+        "pixels.", "By default 0.7, with at least 600 steps 0.5, with fewer than 20 steps 1. Less if there are more "
+        "Gaussians than 4.4 % of the pixels.", least=0, most=1)  # fmt: skip
+    holdout: float = setting(0.05, "Share of the photos' patches that is held out, to decide whether a fit is "
+        "accepted.", above=0, below=1)  # fmt: skip
+    min_contribution: float = setting(1 / 255, "Least blending weight of a Gaussian. A fit removes Gaussians that "
+        "stay below it at all pixels of the photos that they lie in. 0 keeps all Gaussians, even those that change "
+        "no photo by more than rounding.", least=0, most=1)  # fmt: skip
+    judged: bool = setting(True, "Accept the result only if it shows held-out patches better than its start does; "
+        "false if the start was made from these patches.", internal=True)  # fmt: skip
+    move_cameras: bool = setting(False, "Refine the cameras during the full fit; the plan decides it by `poses`.",
         internal=True)  # fmt: skip
-    beyond: bool = setting(False, "Whether Gaussians may reach beyond all views; a plan decides it by `extent`.",
+    beyond: bool = setting(False, "Let Gaussians reach beyond all views; the plan decides it by `extent`.",
         internal=True)  # fmt: skip
-    fills: bool = setting(False, "Whether others take the places of Gaussians that nobody sees; a plan decides it by "
-        "`budget`.", internal=True)  # fmt: skip
-    share: float | None = setting(None, "Gaussians of the result for each pixel; a plan knows it.",
+    fills: bool = setting(False, "Replace Gaussians that no view sees by others; the plan decides it by `budget`.",
+        internal=True)  # fmt: skip
+    share: float | None = setting(None, "Number of Gaussians in the result per pixel; the plan sets it.",
         "By default 0.044.", internal=True)  # fmt: skip
     tuning: Tuning = setting(Tuning(), "Constants.", internal=True)
 
@@ -117,13 +119,13 @@ class FitOptions(Settings):
         """Share of the steps, the first ones, that draw a quarter of the pixels."""
         if self.half_res_share is not None:
             return self.half_res_share
-        if self.steps < HASTY_STEPS:
+        if self.steps < TOO_FEW_STEPS:
             return 1.0
-        most = 0.5 if self.steps >= LONG_STEPS else 1.0  # details come last, and long runs have time for them
+        most = 0.5 if self.steps >= LONG_STEPS else 1.0  # details come last, and long runs have the time for them
         share = 1.0 if self.share is None or not self.grows else self.share / USUAL_SHARE
         return min(most, 0.7 / math.sqrt(max(share, 1.0)))
 
     @property
     def grows(self) -> bool:
-        """Whether the fit starts with fewer Gaussians than requested, and adds the rest during its steps."""
+        """Whether the fit starts with fewer Gaussians than requested and adds the rest during its steps."""
         return self.fit == "full" and self.steps >= GROW_STEPS

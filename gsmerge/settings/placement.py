@@ -1,4 +1,4 @@
-"""Settings of where a written scene lies: turned, scaled, moved, and with how many harmonics."""
+"""Settings that turn, scale and move a scene when it is written, and limit its harmonics."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
 
 @dataclass(frozen=True)
 class PlacementOptions(Settings):
-    """Settings of the frame in which a scene is written, in the order in which they are applied."""
+    """Settings of the coordinate frame of a written scene, in the order in which they are applied."""
 
     up: str | None = setting(None, "Turn the scene so that its upward direction is this axis: y for most viewers, z "
         "for Blender.",
-        "Upward is the mean of the cameras' upward directions, -y where no camera is known.", choices=AXES)  # fmt: skip
+        "The upward direction is the mean of those of the cameras, or -y if no camera is known.",
+        choices=AXES)  # fmt: skip
     scale: float | None = setting(None, "Enlarge the scene about the origin by this factor.", above=0, below=1e9)
-    rotate: str | None = setting(None, "Turn the scene about the axes x, y and z, in this order, by so many degrees.",
+    rotate: str | None = setting(None, "Turn the scene by these angles, in degrees, about the axes x, y and z, in this "
+        "order.", metavar="X,Y,Z")  # fmt: skip
+    translate: str | None = setting(None, "Move the scene along the axes x, y and z, in units after scaling.",
         metavar="X,Y,Z")  # fmt: skip
-    translate: str | None = setting(None, "Move the scene along the axes x, y and z, in its new units.",
-        metavar="X,Y,Z")  # fmt: skip
-    sh_degree: int | None = setting(None, "Leave out harmonics above this degree.", least=0, most=4)
+    sh_degree: int | None = setting(None, "Leave out spherical harmonics above this degree.", least=0, most=4)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -41,7 +42,7 @@ class PlacementOptions(Settings):
 
 
 def parse_triple(name: str, text: str | None) -> tuple[float, float, float]:
-    """Parse three numbers of a setting with commas between; zeros for None.
+    """Parse three numbers that are separated by commas; None gives zeros.
 
     Example:
         >>> parse_triple("rotate", "90,0,0")

@@ -1,7 +1,7 @@
-"""Declare a setting once: its default, what it does, and the values that it takes.
+"""Declare settings: default, help and possible values of each.
 
-The checks of values, Python's help, the options of the command line and docs/reference are made from declarations. The
-package loads neither NumPy nor torch, so that ``--help`` can read it.
+The checks of values, the help in Python, the options of the command line and docs/reference are all derived from these
+declarations. This package imports neither NumPy nor torch, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -18,41 +18,43 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
-KEPT = "as it is"  # of a value that a run of a piece of a scene takes: the whole scene's
-PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
+SAME = "as it is"  # marks that a run on a piece of a scene takes the value of the whole scene
+KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Declaration of one setting: default, help and range. :func:`setting` makes it; the class adds its name."""
+    """Declaration of one setting: default, help and range. :func:`setting` makes it, :func:`settings_of` names it."""
 
-    help: str  # one sentence, as the command line shows it; names of values in single backticks
-    more: str = ""  # sentences that Python's help and docs/reference show besides
+    help: str  # shown by the command line too; names of values in single backticks
+    more: str = ""  # further sentences, shown by Python's help and docs/reference only
     choices: Sequence[Any] | Callable[[], Sequence[Any]] = ()  # possible values, where the type does not list them
     least: float | None = None
     most: float | None = None
     above: float | None = None
     below: float | None = None
     unit: str = ""
-    unique: bool = False  # whether a list has no value twice
-    filled: bool = False  # whether a list has at least one value
-    internal: bool = False  # whether the program sets it, and no user by name
-    counts: bool = False  # whether it decides how many Gaussians there are
-    neutral: tuple[Any, ...] = ()  # values besides the default with which it decides nothing itself
-    replaces: bool = False  # whether it puts something else in the place of the stages' closed formulas
-    in_batches: bool = True  # whether a batch of views can have a value other than the default
-    # Of a group: whether its settings say how views become superpixels, or what views are used for besides
+    unique: bool = False  # true: a list must not repeat a value
+    filled: bool = False  # true: a list must have at least one value
+    internal: bool = False  # true: the program sets it, users cannot
+    counts: bool = False  # true: it decides the number of Gaussians
+    neutral: tuple[Any, ...] = ()  # values besides the default with which it decides nothing
+    replaces: bool = False  # true: it replaces the closed formulas of the stages
+    in_batches: bool = True  # false: batches of views take its default only
+    # Of a group of settings: "superpixels" if they decide how views become superpixels, "views" if they act on the
+    # views otherwise
     acts_on: Literal["", "views", "superpixels"] = ""
-    common: bool = False  # whether every method uses it, baselines too
-    # Whether a value other than the default needs the whole scene, and what messages call it: "name", or "value" for
-    # name and value; and values that keep a scene in one piece, while views of it may still come in batches
+    common: bool = False  # true: every method uses it, baselines too
+    # Not empty: values other than the default need the whole scene, and messages call the setting by its "name", or
+    # by name and "value"
+
     whole: Literal["", "name", "value"] = ""
-    uncut: tuple[Any, ...] = ()
-    # The value in a run of a piece of a scene: a block, a batch of views; and in one that tries settings on some views,
-    # where that is another one
-    in_piece: Any = KEPT
-    in_trial: Any = KEPT
-    shown: str | None = None  # the default in words, where the program chooses it
+    uncut: tuple[Any, ...] = ()  # values that exclude blocks, but allow views that arrive in batches
+    # The value in a run on a piece of a scene, which is a block or a batch of views. `in_trial` is the value in a run
+    # that tries settings on some of the views, if it differs
+    in_piece: Any = SAME
+    in_trial: Any = SAME
+    shown: str | None = None  # the default in words, if the program chooses it
     metavar: str | None = None  # form of the values on the command line
     name: str = ""
     kind: Any = None
@@ -81,19 +83,19 @@ class Setting:
 
     @property
     def words(self) -> tuple[Any, ...]:
-        """Values that are listed one by one: the choices."""
+        """The possible values that are listed one by one."""
         listed = self.choices() if callable(self.choices) else self.choices
         literals = [kind for kind in _parts(self.kind) if get_origin(kind) is Literal]
         return (*listed, *(word for kind in literals for word in get_args(kind)))
 
     def fits(self, value: Any) -> bool:
-        """Return whether a value has one of the types; choices and range are not checked."""
+        """Return whether a value has one of the types, without checking choices and range."""
         if self.is_list:
             return isinstance(value, list | tuple) and all(map(self._fits, value))
         return self._fits(value)
 
     def _fits(self, value: Any) -> bool:
-        is_bool = type(value).__name__.startswith("bool")  # Python's, or NumPy's, which is not loaded here
+        is_bool = type(value).__name__.startswith("bool")  # of Python or NumPy, which is not imported here
         for kind in _parts(self.kind):
             if get_origin(kind) is Literal:
                 fits = value in get_args(kind)
@@ -115,17 +117,17 @@ class Setting:
         return all(bool(holds(value, limit)) for limit, holds in limits if is_number and limit is not None)
 
     def values(self, *, null: bool = True) -> str:
-        """Describe the possible values: choices, a range, or a type; ``null``: also mention None."""
+        """Describe the possible values: choices, a range, or a type; ``null``: mention None too."""
         kinds = [kind for kind in self.kinds if kind is not NoneType]
-        texts = [self._describe_range(kind) if kind in (int, float) else PLAIN.get(kind, "") for kind in kinds]
+        texts = [self._describe_range(kind) if kind in (int, float) else KIND_NAMES.get(kind, "") for kind in kinds]
         texts += [str(word) for word in self.words]
-        return join_words([*texts, PLAIN[NoneType]] if null and NoneType in self.kinds else texts)
+        return join_words([*texts, KIND_NAMES[NoneType]] if null and NoneType in self.kinds else texts)
 
     def expected(self, value: Any, *, null: bool = False) -> str:
         """Describe the expected values for an error message about ``value``."""
         values = self.values(null=null)
         needs_whole = isinstance(value, float) and int in self.kinds and float not in self.kinds
-        return f"{PLAIN[int]}, {values}" if needs_whole and not values.startswith(PLAIN[int]) else values
+        return f"{KIND_NAMES[int]}, {values}" if needs_whole and not values.startswith(KIND_NAMES[int]) else values
 
     def _describe_range(self, kind: type) -> str:
         low = None if self.least is None else _number(self.least)
@@ -135,7 +137,7 @@ class Setting:
         if high is None and self.below not in (None, inf):
             high = f"below {_number(self.below)}"
         if low is None:
-            return PLAIN[kind]
+            return KIND_NAMES[kind]
         text = f"at least {low}".replace("at least above", "more than") if high is None else f"{low} to {high}"
         return f"{text} {self.unit}".strip()
 
@@ -157,12 +159,12 @@ class Setting:
         is_text = not self.choices and set(_parts(self.kind)) <= {str, NoneType}
         if is_text and not isinstance(value, str | NoneType):
             raise ValueError(f"{self.name}: expected a text, got {value!r}")
-        free = any(kind not in (int, float, bool, NoneType) for kind in self.kinds)  # checked by the class itself
-        if free or (self._fits(value) and self._in_range(value)):
+        is_checked_later = any(kind not in (int, float, bool, NoneType) for kind in self.kinds)  # by its class
+        if is_checked_later or (self._fits(value) and self._in_range(value)):
             return
         is_number = isinstance(value, str) and re.fullmatch(r"-?\d*\.?\d+", value, re.ASCII) is not None
-        plain = is_number and bool({int, float} & set(self.kinds))
-        hint = f"; perhaps {value} without quotes" if plain else perhaps(value, self.words)
+        is_quoted = is_number and bool({int, float} & set(self.kinds))
+        hint = f"; perhaps {value} without quotes" if is_quoted else suggest_name(value, self.words)
         raise ValueError(f"{self.name}: expected {self.expected(value)}, got {value!r}{hint}")
 
 
@@ -172,7 +174,7 @@ def setting(default: Any, help: str, more: str = "", **declared: Any) -> Any:
 
 
 class Settings:
-    """Base class of frozen dataclasses whose fields are settings; values that are not allowed raise ValueError."""
+    """Base class of frozen dataclasses whose fields are settings; invalid values raise ValueError."""
 
     def __init_subclass__(cls) -> None:
         """Write the declarations of the fields into the docstring."""
@@ -185,21 +187,21 @@ class Settings:
             declared.check(getattr(self, name))
 
 
-_declared: dict[type, dict[str, Setting]] = {}  # by class, whose types are resolved once
+_declared: dict[type, dict[str, Setting]] = {}  # by class; resolving the types of its fields takes time
 
 
 def settings_of(options: type) -> dict[str, Setting]:
     """Return the declarations of a class of settings by field name."""
     if options not in _declared:
         kinds = get_type_hints(options)
-        made = {f.name: f.metadata["setting"] for f in fields(options) if "setting" in f.metadata}
-        _declared[options] = {n: replace(entry, name=entry.name or n, kind=kinds[n]) for n, entry in made.items()}
+        entries = {f.name: f.metadata["setting"] for f in fields(options) if "setting" in f.metadata}
+        _declared[options] = {n: replace(entry, name=entry.name or n, kind=kinds[n]) for n, entry in entries.items()}
     return _declared[options]
 
 
 @cache
 def flat_settings(options: type) -> dict[str, Setting]:
-    """Return all settings by flat name; the settings of a stage replace the stage."""
+    """Return all settings by flat name; those of a stage stand in place of the stage."""
     flat: dict[str, Setting] = {}
     for name, declared in settings_of(options).items():
         if not declared.internal:
@@ -208,22 +210,22 @@ def flat_settings(options: type) -> dict[str, Setting]:
     return flat
 
 
-def names_of(options: type, is_one: Callable[[Setting], Any]) -> tuple[str, ...]:
-    """Return the flat names of the settings whose declaration fulfils a condition."""
-    return tuple(name for name, declared in flat_settings(options).items() if is_one(declared))
+def names_of(options: type, condition: Callable[[Setting], Any]) -> tuple[str, ...]:
+    """Return the flat names of the settings whose declaration meets a condition."""
+    return tuple(name for name, declared in flat_settings(options).items() if condition(declared))
 
 
 def piece_settings(options: type, *, trial: bool = False) -> dict[str, Any]:
-    """Return by flat name what settings are in a run of a piece of a scene, or in a ``trial`` on some of its views."""
+    """Return the values that a run on a piece of a scene needs, by flat name; ``trial``: a run on some views to try."""
     declared = flat_settings(options)
     values = {
-        name: one.in_trial if trial and one.in_trial is not KEPT else one.in_piece for name, one in declared.items()
+        name: one.in_trial if trial and one.in_trial is not SAME else one.in_piece for name, one in declared.items()
     }
-    return {name: value for name, value in values.items() if value is not KEPT}
+    return {name: value for name, value in values.items() if value is not SAME}
 
 
 def change_settings(options: T, values: Mapping[str, Any]) -> T:
-    """Change settings by flat name, those of stages too."""
+    """Change settings by flat name, including those of stages."""
     changes: dict[str, Any] = {}
     for name, declared in settings_of(type(options)).items():
         names = flat_settings(declared.kind) if declared.is_group and not declared.internal else {name}
@@ -240,10 +242,10 @@ def join_words(words: Iterable[str]) -> str:
     return " or ".join(filter(None, (", ".join(listed[:-1]), *listed[-1:])))
 
 
-def near_names(word: str, names: Iterable[Any], count: int = 1, least: float = 0.6) -> list[Any]:
-    """List at most ``count`` names nearly the same as a word, the nearest first, whatever their case.
+def find_near_names(word: str, names: Iterable[Any], count: int = 1, least: float = 0.6) -> list[Any]:
+    """List at most ``count`` names that resemble a word, the nearest first; case does not matter.
 
-    ``least``: their likeness, as difflib measures it.
+    ``least``: least similarity, 0 to 1, as difflib measures it.
     """
     from difflib import get_close_matches
 
@@ -251,9 +253,9 @@ def near_names(word: str, names: Iterable[Any], count: int = 1, least: float = 0
     return [lower[near] for near in get_close_matches(word.lower(), lower, count, least)]
 
 
-def perhaps(word: Any, names: Iterable[Any]) -> str:
-    """Return the end of a message about a word that is none of the names: the one that it is near to, if any."""
-    return "".join(f"; perhaps {near}" for near in near_names(word, names)) if isinstance(word, str) else ""
+def suggest_name(word: Any, names: Iterable[Any]) -> str:
+    """Return "; perhaps NAME", the end of a message about an unknown word, or "" if no name resembles it."""
+    return "".join(f"; perhaps {near}" for near in find_near_names(word, names)) if isinstance(word, str) else ""
 
 
 def _parts(kind: Any) -> list[Any]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gsmerge.settings.budget import AUTO, parse_share
-from gsmerge.settings.setting import Settings, perhaps, setting
+from gsmerge.settings.setting import Settings, setting, suggest_name
 
 Poses = Literal["auto", "fixed", "free"]
 Exposure = Literal["auto", "fixed", "per-photo"]
@@ -22,34 +22,35 @@ SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
 SHARE = "4.4%"  # superpixels per pixel by default
 AUTO_SHARE = "auto"
 MAX_CHILDREN = 8
-MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
-USUAL_K = 1  # what "auto" is unless there are reasons for more
-NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/internals/notebook.md has figures
-CROP = "sphere:x,y,z,radius, box:x0,y0,z0,x1,y1,z1 or a box with the degrees by which it is turned"
-CROP_FILES = (".json", ".toml")  # endings of files that hold a crop, which the command line reads
+MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # K differs between groups, and is one of these values
+USUAL_K = 1  # the K of "auto", except for a single camera without a long fit
+NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours to compare; measurements: docs/internals/notebook.md
+CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, optionally with three angles in degrees"
+CROP_FILES = (".json", ".toml")  # endings of crop files; only the command line reads them
 CROP_NUMBERS = {"sphere": (4,), "box": (6, 9)}
 DROPS = ("floaters", "sky", "transparent", "unseen")
 
 
 @dataclass(frozen=True)
 class PrepareOptions(Settings):
-    """Settings of the preparation: poses, exposure, unseen Gaussians, and what photos may change."""
+    """Settings of the preparation: poses, exposure, unseen Gaussians, colours and extent."""
 
-    poses: Poses = setting("auto", "Whether cameras may move: where they are off, never, or always.",
-        "`free`: views are moved to where their photos agree, and the fit moves the cameras on; `auto`: where some "
-        "view is more than 1.5 pixels off and agrees clearly better elsewhere.", uncut=("free",),
+    poses: Poses = setting("auto", "Move cameras to where their photos agree. auto: only if their poses are wrong; "
+        "fixed: never; free: always.",
+        "`auto` moves them if some view is more than 1.5 pixels off and agrees clearly better elsewhere. Cameras that "
+        "move are refined during the fit.", uncut=("free",),
         in_piece="fixed")  # fmt: skip
-    exposure: Exposure = setting("auto", "Bring photos that differ in exposure or white balance to their mean: where "
-        "they differ at random, never, or always.",
+    exposure: Exposure = setting("auto", "Bring the exposure and white balance of all photos to their mean. "
+        "auto: if they differ at random; fixed: never; per-photo: always.",
         "The Gaussians of their pixels change with them.", uncut=("per-photo",), in_piece="fixed")  # fmt: skip
-    unseen: Unseen = setting("drop", "What becomes of Gaussians without a pixel that no view sees.",
-        "`drop`: they are left out. `keep`: they are merged among their neighbours, at the rate of the "
-        "others.")  # fmt: skip
-    look: Look = setting("auto", "Whose colours count: auto: those of the photos, but its own of a scene with another "
-        "look; scene: its own; photos: theirs as they are.")  # fmt: skip
-    extent: Extent = setting("auto", "Where the result may show more than the scene: auto: nowhere; photos: in large "
-        "parts of the photos where the scene shows nothing, as one that was cut out or has no sky; beyond: beside the "
-        "photos, after a long fit.")  # fmt: skip
+    unseen: Unseen = setting("drop", "Gaussians that belong to no pixel and that no view sees: drop them, or keep "
+        "them.",
+        "`keep` merges them with their neighbours, at the same rate as the other Gaussians.")  # fmt: skip
+    look: Look = setting("auto", "Source of the colours. photos: the photos; scene: the scene itself; auto: the "
+        "photos, unless the scene was given another look, such as a style.")  # fmt: skip
+    extent: Extent = setting("auto", "Places that may get Gaussians although the scene has none there. auto: small "
+        "holes; photos: also large parts of the photos, such as the sky or what was cut out of the scene; beyond: also "
+        "outside the photos, after a long fit.")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -57,17 +58,18 @@ class SegmentOptions(Settings):
     """Settings of cutting views into superpixels."""
 
     superpixels: int | str = setting(SHARE, "Superpixels per view: a number such as 3000, a share of its pixels, or "
-        "auto: 4.4 to 7 %, the more the better the depths of the views agree.",
-        "A share is where `bass-adaptive` starts from.", metavar="NUMBER|SHARE|auto", counts=True)  # fmt: skip
-    segmentation: str = setting("rdseg", "How superpixels are cut; `gsmerge.stages.superpixels` describes the methods.",
-        choices=SEGMENTATIONS)  # fmt: skip
-    rectangles: float | None = setting(None, "Of `rdseg`: rectangles per superpixel that it begins with.",
-        "By default 2, and by effort.", least=1, unit="per superpixel")  # fmt: skip
+        "auto. auto takes 4.4 to 7 %, more the better the depths of the views agree.",
+        "`bass-adaptive` starts from a share and adapts it to each view.", metavar="NUMBER|SHARE|auto",
+        counts=True)  # fmt: skip
+    segmentation: str = setting("rdseg", "Method that cuts views into superpixels; `gsmerge.stages.superpixels` lists "
+        "all.", choices=SEGMENTATIONS)  # fmt: skip
+    rectangles: float | None = setting(None, "Of `rdseg`: number of rectangles per superpixel at its start.",
+        "By default by effort: draft and fast 1, default 2, best 3.", least=1, unit="per superpixel")  # fmt: skip
     early_sweeps: int | None = setting(None, "Of `rdseg`: sweeps over border pixels before rectangles are merged.",
-        "By default 0, and by effort.", least=0, most=1000)  # fmt: skip
-    compactness: float = setting(1e-5, "Of `rdseg` and the clean-up of `slic`: weight of squared pixels against "
-        "squared colours in [0, 1].",
-        "At 0 superpixels become snakes that no Gaussian fits.", least=0, most=1)  # fmt: skip
+        "By default 0, with effort best 1.", least=0, most=1000)  # fmt: skip
+    compactness: float = setting(1e-5, "Of `rdseg` and the clean-up of `slic`: weight of squared distances in pixels, "
+        "relative to squared differences of colours in [0, 1].",
+        "At 0 superpixels become long and winding, and no Gaussian fits them.", least=0, most=1)  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -81,7 +83,7 @@ class SegmentOptions(Settings):
 
     @property
     def per_view(self) -> int | None:
-        """Number of superpixels of each view; None if the option is a share of its pixels."""
+        """Number of superpixels of each view; None if the option is a share of its pixels or "auto"."""
         text = str(self.superpixels)
         return int(text) if text.removeprefix("-").isdecimal() else None
 
@@ -93,7 +95,7 @@ class SegmentOptions(Settings):
 
     @property
     def adapts(self) -> bool:
-        """Whether each view adapts its number of superpixels: ``bass-adaptive`` with a share of the pixels."""
+        """Whether the number of superpixels is adapted to each view: ``bass-adaptive`` with a share of the pixels."""
         return self.segmentation == "bass-adaptive" and self.per_view is None
 
 
@@ -101,22 +103,22 @@ class SegmentOptions(Settings):
 class MatchOptions(Settings):
     """Conditions under which Feature Gaussians of different views are merged."""
 
-    match: MatchMethod | None = setting(None, "How Feature Gaussians of different views are merged.",
-        "`overlap`: Bhattacharyya coefficient, similar colours, star clusters that cannot chain. `aabb`, as in the "
-        "paper (section 4.4): box IoU, similar latents, connected components. By default `overlap`, but `none` in a "
-        "draft.", neutral=("none",))  # fmt: skip
-    overlap: float = setting(0.7, "Least overlap of `overlap`.", least=0, most=1)
-    iou: float = setting(0.2, "Least IoU of the boxes of `aabb` (tau_g).", least=0, most=1)
-    similarity: float = setting(0.8, "Least cosine of the latents of `aabb` (tau_f).",
-        "Without latents colours are compared.", least=-1,
+    match: MatchMethod | None = setting(None, "Rule by which Feature Gaussians of different views are merged.",
+        "`overlap` compares Bhattacharyya coefficients and colours, and merges star clusters, which cannot chain. "
+        "`aabb`, the rule of the paper (section 4.4), compares the IoU of boxes and latents, and merges connected "
+        "components. By default `overlap`, but `none` in a draft.", neutral=("none",))  # fmt: skip
+    overlap: float = setting(0.7, "Of `overlap`: least Bhattacharyya coefficient.", least=0, most=1)
+    iou: float = setting(0.2, "Of `aabb`: least IoU of the boxes (tau_g).", least=0, most=1)
+    similarity: float = setting(0.8, "Of `aabb`: least cosine of the latents (tau_f).",
+        "Without latents, colours are compared.", least=-1,
         most=1)  # fmt: skip
     max_color: float = setting(0.12, "Largest difference of base colours (Euclidean, sRGB in [0, 1]).", least=0)
-    neighbors: int | None = setting(None, "Nearest neighbours of other views in 3D that are compared (k, which the "
-        "paper leaves open).",
-        "By default 16 with `overlap`, 1 with `aabb`, which leaves holes with more.",
+    neighbors: int | None = setting(None, "Number of nearest neighbours in 3D, of other views, to compare (k, which "
+        "the paper does not give).",
+        "By default 16 with `overlap` and 1 with `aabb`, where more would cause holes.",
         least=1, most=1000)  # fmt: skip
-    cluster_size: int | None = setting(None, "Most Feature Gaussians in a star cluster.",
-        "By default as many as there are views.", least=1, most=1_000_000)  # fmt: skip
+    cluster_size: int | None = setting(None, "Largest number of Feature Gaussians in a star cluster.",
+        "By default the number of views.", least=1, most=1_000_000)  # fmt: skip
 
     @property
     def num_neighbors(self) -> int:
@@ -126,25 +128,26 @@ class MatchOptions(Settings):
 
 @dataclass(frozen=True)
 class DecodeOptions(Settings):
-    """Settings of decoding: how many Gaussians each Feature Gaussian becomes."""
+    """Settings of decoding, where each Feature Gaussian becomes one Gaussian or several."""
 
-    k: int | Literal["mixed", "auto"] = setting(AUTO, "More detail and a larger file: Gaussians for each superpixel; "
-        "mixed: 1, 2 or 4, most where there is most to see; auto: 1, and 4 for one photo without a long fit.",
-        "`mixed` is of the paper's supplement.", least=1, most=MAX_CHILDREN, metavar="1-8|mixed|auto",
+    k: int | Literal["mixed", "auto"] = setting(AUTO, "Gaussians per superpixel; more give more detail and a larger "
+        "file. mixed: 1, 2 or 4, most where there is most to see; auto: 1, but 4 for a single camera without a long "
+        "fit.",
+        "`mixed` is described in the paper's supplement.", least=1, most=MAX_CHILDREN, metavar="1-8|mixed|auto",
         counts=True)  # fmt: skip
-    k_low: float = setting(50.0, "Percentile of `mixed` up to which groups become one Gaussian.",
-        "The paper's are 33.3 and 66.7.", least=0, most=100)  # fmt: skip
-    k_high: float = setting(85.0, "Percentile of `mixed` above which groups become four Gaussians.", least=0, most=100)
-    k_rule: KRule = setting("saliency", "What the percentiles are of: `saliency`, the mean corner response of the "
-        "group's pixels, as in the paper, or `distortion`: as many Gaussians, where they lower distortion "
-        "most.")  # fmt: skip
-    min_opacity: float = setting(1 / 255, "Gaussians below this opacity are left out (paper section 4.3, tau_a).",
+    k_low: float = setting(50.0, "Of `mixed`: percentile up to which groups become one Gaussian.",
+        "The paper uses 33.3, and 66.7 for `k_high`.", least=0, most=100)  # fmt: skip
+    k_high: float = setting(85.0, "Of `mixed`: percentile above which groups become four Gaussians.", least=0, most=100)
+    k_rule: KRule = setting("saliency", "Of `mixed`: quantity that ranks the groups. `saliency`: the mean corner "
+        "response of the group's pixels, as in the paper; `distortion`: the same number of Gaussians, where they "
+        "lower distortion most.")  # fmt: skip
+    min_opacity: float = setting(1 / 255, "Least opacity; Gaussians below it are left out (paper section 4.3, tau_a).",
         least=0, most=1)  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.k_high < self.k_low:
-            raise ValueError(f"k_high: expected {self.k_low:g}, which is k_low, to 100, got {self.k_high}")
+            raise ValueError(f"k_high: expected at least k_low ({self.k_low:g}) and at most 100, got {self.k_high}")
 
     @property
     def mean_k(self) -> float:
@@ -160,15 +163,16 @@ class DecodeOptions(Settings):
 
 @dataclass(frozen=True)
 class CleanOptions(Settings):
-    """Settings of clean-up: what to leave out of the result."""
+    """Settings of clean-up: Gaussians to leave out of the result."""
 
-    crop: str | None = setting(None, "Keep the Gaussians inside a sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in the "
-        "scene's world units, or inside the shape of a .json or .toml file; counts, fit and scores are of these.",
-        "Three more numbers of a box turn it about its middle: degrees about x, y and z. The command line alone reads "
-        "files.", metavar="SHAPE", common=True, whole="name", in_trial=None)  # fmt: skip
-    drop: str | None = setting(None, "Leave out floaters, sky, transparent or unseen Gaussians, with commas between.",
-        "`floaters`: isolated, far beyond the scene, or hanging across it; `sky`: what is sky in the photos; "
-        "`transparent`: of an opacity below 1/255; `unseen`: what no camera shows, without cameras no placed one.",
+    crop: str | None = setting(None, "Keep only the Gaussians inside sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in "
+        "the scene's world units, or inside the shape in a .json or .toml file. Counts, fit and scores are of these.",
+        "Three more numbers of a box turn it about its centre, in degrees about x, y and z. Only the command line "
+        "reads files.", metavar="SHAPE", common=True, whole="name", in_trial=None)  # fmt: skip
+    drop: str | None = setting(None, "Kinds of Gaussians to leave out, separated by commas: floaters, sky, "
+        "transparent, unseen.",
+        "`floaters`: isolated, far beyond the scene, or huge and across it; `sky`: what is sky in the photos; "
+        "`transparent`: opacity below 1/255; `unseen`: what no camera sees. Without cameras, viewpoints are placed.",
         metavar="floaters,sky,...", common=True, whole="value", in_trial=None)  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -179,8 +183,8 @@ class CleanOptions(Settings):
             if name in self.drops[:number]:
                 raise ValueError(f"drop: expected {name} once, got {self.drop!r}")
             if name not in DROPS:
-                near = perhaps(name, DROPS)
-                raise ValueError(f"drop: expected some of {', '.join(DROPS)}, with commas between, got {name!r}{near}")
+                hint = suggest_name(name, DROPS)
+                raise ValueError(f"drop: expected some of {', '.join(DROPS)}, separated by commas, got {name!r}{hint}")
 
     @property
     def drops(self) -> tuple[str, ...]:
@@ -193,8 +197,8 @@ class CleanOptions(Settings):
         return self.crop is not None or bool(self.drops)
 
     @property
-    def hiding(self) -> list[str]:
-        """Names of what is asked for that removes things which photos show."""
+    def visible_drops(self) -> list[str]:
+        """Names of the settings in use that remove what photos show."""
         return ["drop sky"] if "sky" in self.drops else []
 
 
@@ -221,10 +225,10 @@ def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
 
 @dataclass(frozen=True)
 class Engine(Settings):
-    """Place where the blocks of a scene are compacted; the result does not depend on it."""
+    """Settings of where scenes or blocks are compacted; the result does not depend on them."""
 
-    engine: str = setting("local", "Where scenes, or the blocks of one, are compacted. local: on this machine; ray: a "
-        "Ray cluster, gsmerge[ray].", choices=("local", "ray"))  # fmt: skip
+    engine: str = setting("local", "Where scenes or blocks are compacted. local: on this machine; ray: on a Ray "
+        "cluster (pip install gsmerge[ray]).", choices=("local", "ray"))  # fmt: skip
     address: str | None = setting(None, "Address of the Ray cluster, such as auto or HOST:PORT.",
         shown="one of this machine")  # fmt: skip
 
@@ -238,14 +242,14 @@ class Engine(Settings):
 class BlockOptions(Settings):
     """Settings for compacting scenes with many views in blocks."""
 
-    blocks: int | Literal["auto", "none"] = setting("auto", "Blocks of views that are compacted one by one, for scenes "
-        "of hundreds of views; auto: beyond 20 million Gaussians, one for every 8 million, and for hundreds of views "
-        "that see little of each other.",
-        "Memory is that of one block. `auto` counts one Gaussian for each pixel; `none`: one piece.", least=1,
+    blocks: int | Literal["auto", "none"] = setting("auto", "Number of blocks of views that are compacted one by one. "
+        "auto: one for every 8 million Gaussians if there are more than 20 million; also several for hundreds of "
+        "views that see little of each other. none: one piece.",
+        "A run needs the memory of one block. `auto` counts one Gaussian for each pixel.", least=1,
         metavar="auto|none|NUMBER", in_piece="none")  # fmt: skip
     engine: Engine = setting(Engine(), "Where the blocks are compacted.", internal=True)
 
     @property
     def asked(self) -> list[str]:
-        """What messages call a number of blocks; empty without one."""
+        """Name and value of a number of blocks, for messages; empty without one."""
         return [f"blocks {self.blocks}"] if isinstance(self.blocks, int) else []

@@ -81,4 +81,4 @@ def test_results_are_measured_from_where_they_were_made(exact: Path, tmp_path: P
     _, own, given = (one["mean"]["context"]["psnr"] for one in found["results"])
     assert own == pytest.approx(document["psnr_input_views"]["after"], abs=0.6)  # of a quarter of each photo
     assert own > given + 2
-    assert sum("its input views are seen from the cameras in auto.cameras.json" in n for n in found["notes"]) == 1
+    assert sum("its input views are drawn from the cameras in auto.cameras.json" in n for n in found["notes"]) == 1

@@ -141,5 +141,5 @@ def test_warnings_of_numbers_are_one_note(capsys: pytest.CaptureFixture[str]) ->
             warnings.warn(text, RuntimeWarning, stacklevel=1)
         warnings.warn("old", UserWarning, stacklevel=1)
     first, second = capsys.readouterr().err.splitlines()
-    assert first == "note: some numbers are too large, or undefined (Mean of empty slice)"
+    assert first == "note: some numbers are too large or undefined (Mean of empty slice)"
     assert second == "gsmerge: warning: old"

@@ -1,0 +1,5 @@
+"""Endings of the files that ``gsmerge render`` writes."""
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+GIF = ".gif"
+CLIPS = (".mp4", ".webm", GIF)
