@@ -1,1 +1,1 @@
-"""What photos and Gaussians say of each other: pairs compared alike, and judged in units of their own noise."""
+"""Compare photos with what Gaussians show; all scores are relative to the noise of wrong pairs."""

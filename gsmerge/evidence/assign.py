@@ -1,9 +1,14 @@
-"""Which photo, turned how, shows which view: names propose, what photos and Gaussians show decides.
+"""Assign photos to views: find which photo shows which view, and in which orientation.
 
-A photo that a name gives to a view stays unless another photo or turn is clearly more like the view, it is no more
-like it than wrong pairs are where most names are right, or its parts lie farther from their places than those of the
-others. Elsewhere the most alike photos are compared part by part: a neighbour's photo shows the same things, but in
-other places.
+File names propose a photo for each view. A comparison of the photo with the Gaussians of the view decides. A proposed
+photo is replaced or left out
+
+- if another photo or another orientation matches the view clearly better,
+- if it matches the view no better than wrong pairs match, or
+- if its parts lie farther from their places than the parts of the other proposed photos do.
+
+For all other views the photos with the highest scores are compared part by part. This tells neighbouring views apart:
+their photos show the same things in other places.
 """
 
 from __future__ import annotations
@@ -16,66 +21,70 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsmerge.evidence.offsets import NEAR_PIXELS, SAME, SIDE, PhotoOffsets, find_offsets
+from gsmerge.evidence.offsets import NEAR_PIXELS, SIDE, TOLERANCE, PhotoOffsets, find_offsets
 from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.runtime.threads import parallel_map
 
-DOUBT = 2.0  # standard deviations of noise up to which two scores are one, and a photo is not like its view
-ALIKE = 4  # photos most like a view that are compared with it part by part
-FLAT = 1 / 255  # root mean square of a picture's contrast below which it shows nothing to go by: a rounding of 8 bits
-FAR = 1e6  # cost of a pair that cannot be
-TOGETHER, TASKS = 8, 16  # least photos that one task compares, and most tasks: each looks at what all views show
-AT_ONCE = 256  # photos of a film that are compared first, at equal distances; then those around the most alike
+SIGNIFICANT = 2.0  # standard deviations of noise; smaller scores and smaller differences of scores count as noise
+MAX_COMPARED = 4  # photos with the highest scores that are compared with a view part by part
+MIN_CONTRAST = 1 / 255  # root mean square, the rounding of 8 bits; pictures with less contrast cannot be compared
+IMPOSSIBLE = 1e6  # cost of a pair whose shapes differ
+MIN_PER_TASK, MAX_TASKS = 8, 16  # photos of a task, and tasks; each task reads the pictures of all views
+FIRST_PHOTOS = 256  # evenly spaced photos of a film that are compared first; their best neighbourhoods come next
 
 
 class Assignment(NamedTuple):
-    """The photo of a view, and how it is turned; see :func:`gsmerge.kernels.pictures.turn_picture`."""
+    """The photo of a view, and its orientation, 0 to 7; see :func:`gsmerge.kernels.pictures.turn_picture`."""
 
     photo: int
-    turn: int
+    orientation: int
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
     """Photos that may show the views of a scene."""
 
-    read: Callable[[int], np.ndarray]  # [h,w,3] photo as it is stored, sRGB in [0, 1], of the size of Places or larger
+    read: Callable[[int], np.ndarray]  # [h,w,3] photo as it is stored, sRGB in [0, 1]; may be reduced to SIDE pixels
     count: int
-    tags: Sequence[int]  # turn that each photo's tag of orientation asks for
+    tags: Sequence[int]  # orientation in each photo's EXIF tag, 0 to 7
 
 
 @dataclass(frozen=True, eq=False)
 class _Scores:
-    """Fisher's z of some photos in all views and turns, in units of the noise of wrong pairs."""
+    """Fisher's z of some photos in all views and orientations, in units of the noise of wrong pairs."""
 
     photos: tuple[int, ...]
-    values: np.ndarray  # [v,p,8]; NaN where a photo's shape cannot be that of the views
+    # [v,p,8]; NaN for views without Gaussians, and where an oriented photo is portrait but the views are landscape or
+    # vice versa
+    values: np.ndarray
     correlations: np.ndarray  # [v,p,8]
 
     def of(self, view: int, assignment: Assignment) -> float:
-        """Return the score of a photo in a view, turned as assigned; NaN where that cannot be."""
-        return float(self.values[view, self.photos.index(assignment.photo), assignment.turn])
+        """Return the score of an assignment in a view; NaN where the shapes differ."""
+        return float(self.values[view, self.photos.index(assignment.photo), assignment.orientation])
 
     def fits(self, assignment: Assignment) -> bool:
-        """Return whether a photo, turned as assigned, has a shape that can be that of the views."""
-        return bool(np.isfinite(self.values[:, self.photos.index(assignment.photo), assignment.turn]).any())
+        """Return True if the oriented photo has the shape, portrait or landscape, of the views."""
+        return bool(np.isfinite(self.values[:, self.photos.index(assignment.photo), assignment.orientation]).any())
 
     def best(self) -> np.ndarray:
-        """Return the score ``[v,p]`` of each photo in its best turn."""
+        """Return the score ``[v,p]`` of each photo in its best orientation."""
         return np.nan_to_num(self.values, nan=-np.inf).max(2)
 
-    def turn(self, view: int, photo: int, tag: int) -> int:
-        """Return how a photo is turned: as stored or as its tag says, unless another turn is clearly better."""
+    def choose_orientation(self, view: int, photo: int, tag: int) -> int:
+        """Choose the orientation of a photo: as stored or as tagged, unless another one scores clearly higher."""
         scores = np.nan_to_num(self.values[view, self.photos.index(photo)], nan=-np.inf)
-        return next((turn for turn in (0, tag) if scores[turn] > scores.max() - DOUBT), int(scores.argmax()))
+        likely = (orientation for orientation in (0, tag) if scores[orientation] > scores.max() - SIGNIFICANT)
+        return next(likely, int(scores.argmax()))
 
 
 class Assigner:
-    """Assigns photos to the views of a scene, and keeps what was compared.
+    """Assigns photos to the views of a scene, and caches all comparisons.
 
-    ``show`` makes pictures of the views of a size: small ones, and larger ones where these do not decide.
+    ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side. Small pictures are compared
+    first, larger ones where the small ones do not decide.
     """
 
     def __init__(self, show: Callable[[int], ViewPictures], candidates: Candidates) -> None:
@@ -83,11 +92,11 @@ class Assigner:
         self.candidates, self._show = candidates, show
         self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
         self._offsets = dict[tuple[int, Assignment], PhotoOffsets | None]()
-        self.judged = self._comparer.measure_contrast() > FLAT
+        self.has_contrast = self._comparer.measure_contrast() > MIN_CONTRAST  # [v] the view can be compared
 
     @cached_property
     def shown(self) -> ViewPictures:
-        """What the views show, large enough for parts to be looked up."""
+        """Pictures of the views, large enough to search for parts."""
         return self._show(SIDE)
 
     def score(self, photos: Iterable[int]) -> _Scores:
@@ -95,7 +104,7 @@ class Assigner:
         ids = tuple(dict.fromkeys(photos))
         new = [photo for photo in ids if photo not in self._correlations]
 
-        size = max(TOGETHER, -(-len(new) // TASKS))
+        size = max(MIN_PER_TASK, -(-len(new) // MAX_TASKS))
 
         def compare(first: int) -> np.ndarray:
             return self._comparer.correlate([self.candidates.read(photo) for photo in new[first : first + size]])
@@ -110,123 +119,131 @@ class Assigner:
     def compare(self, view: int, assignment: Assignment) -> float | None:
         """Compare a photo with a view part by part.
 
-        Returns how alike they are, from 1 on, 0 where it was taken from elsewhere, and None where parts do not tell.
+        Returns their similarity, at least 1, if the photo shows the view; 0 if it was taken from elsewhere; None if the
+        parts do not decide.
         """
         offsets = self.find_offsets(view, assignment)
         if offsets is None or offsets.verdict is None:
             return None
-        return 1 + max(offsets.alike, 0.0) if offsets.verdict else 0.0
+        return 1 + max(offsets.similarity, 0.0) if offsets.verdict else 0.0
 
     def find_offsets(self, view: int, assignment: Assignment) -> PhotoOffsets | None:
-        """Find where the parts of a photo lie in what a view shows; None where pictures are too small for parts."""
+        """Find the parts of a photo in the picture of a view; None if the picture is too small for parts."""
         if (view, assignment) not in self._offsets:
-            photo = turn_picture(self.candidates.read(assignment.photo), assignment.turn)
+            photo = turn_picture(self.candidates.read(assignment.photo), assignment.orientation)
             self._offsets[view, assignment] = find_offsets(self.shown, view, np.ascontiguousarray(photo))
         return self._offsets[view, assignment]
 
     def lies_elsewhere(self, view: int, given: Mapping[int, Assignment]) -> bool:
-        """Return whether the parts of a given photo lie farther from their places than those of the others do.
+        """Return True if the parts of a view's photo lie farther from their places than those of the other views do.
 
-        That is more than twice as far as these do in the middle: wrong depth displaces what is drawn in all views, but
-        no farther than it moves the parts of one view apart.
+        The threshold is twice the median distance in the other views. Wrong depth displaces the drawn Gaussians of all
+        views, but no farther than it moves the parts of one view apart.
         """
-        offsets, others = self.find_offsets(view, given[view]), [each for each in given.items() if each[0] != view]
+        offsets = self.find_offsets(view, given[view])
         if offsets is None or offsets.verdict is not False:
             return False
-        known = [each.distances for each in parallel_map(lambda pair: self.find_offsets(*pair), others) if each]
-        distances = np.concatenate([np.zeros(0), *known])
+        pairs = [pair for pair in given.items() if pair[0] != view]
+        of_others = [each.distances for each in parallel_map(lambda pair: self.find_offsets(*pair), pairs) if each]
+        distances = np.concatenate([np.zeros(0), *of_others])
         usual = 2 * float(np.median(distances)) if len(distances) else 0.0
-        return replace(offsets, same=SAME + min(usual, NEAR_PIXELS)).verdict is False
+        return replace(offsets, tolerance=TOLERANCE + min(usual, NEAR_PIXELS)).verdict is False
 
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
-        """Return the photos that names or order give to views, and whether what they show confirms each.
+        """Check the photos that names or their order propose for views.
 
-        A photo stays unless another photo, that is not needed elsewhere, or another turn is clearly more like its view,
-        it is no more like it than wrong pairs are where most photos are more, or its parts lie farther from their
-        places than those of the others do; None in place of those that do not stay. Noise of what is drawn moves the
-        scores and the parts of all photos, so that these themselves say what is to be expected of a right one.
+        Returns the assignment of each view, None where the proposed photo is rejected, and a list that is True where
+        the comparison confirms the photo. A photo is rejected
 
-        Photos that no other assignment makes more alike are confirmed if names are ``exact``; otherwise, and in doubt,
-        the parts tell.
+        - if another orientation, or another photo that no other view needs, scores clearly higher in its view,
+        - if it scores no higher than wrong pairs do, or
+        - if its parts lie farther from their places than the parts of the other proposed photos do.
+
+        Noise of the drawings lowers the scores of all photos and moves their parts. The thresholds therefore follow
+        from the scores and parts of the proposed photos themselves.
+
+        Where names are ``exact``, a photo is confirmed if its score is high and no other assignment raises it. Other
+        photos are confirmed by their parts.
         """
-        out, sure = list[Assignment | None]([None] * len(named)), [False] * len(named)
+        out, confirmed = list[Assignment | None]([None] * len(named)), [False] * len(named)
         given = [(view, photo) for view, photo in enumerate(named) if photo is not None]
         if not given:
-            return out, sure
+            return out, confirmed
         scores = self.score(photo for _, photo in given)
-        usual = {view: Assignment(photo, self._usual_turn(scores, view, photo)) for view, photo in given}
+        proposed = {view: Assignment(photo, self._stored_or_tagged(scores, view, photo)) for view, photo in given}
         columns = [scores.photos.index(photo) for _, photo in given]
-        alike = scores.best()[np.ix_(list(usual), columns)]  # of each given view with each given photo
-        of_names = np.nan_to_num([scores.of(*pair) for pair in usual.items()], nan=-np.inf)
-        best, own = _match(alike), of_names[self.judged[list(usual)]]
-        # half-way from wrong pairs to right ones, if all together are these
-        least = min(DOUBT, float(np.median(own)) / 2) if _exceed_noise(own) else DOUBT
-        for place, (view, assignment) in enumerate(usual.items()):
-            score, most = of_names[place], max(alike[place, place], alike[place, best[place]])
-            # more than wrong pairs, or most of what is seen; and no other photo or turn clearly more
-            like = score > least or scores.correlations[view, columns[place], assignment.turn] ** 2 > 0.5
-            like = like and score > most - DOUBT
-            clear = score > MARGIN and score >= most
-            if clear and exact:
-                out[view], sure[view] = assignment, True
-            elif like or (not self.judged[view] and scores.fits(assignment)):
+        best = scores.best()[np.ix_(list(proposed), columns)]  # of each proposed view with each proposed photo
+        own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)
+        matched, comparable = _match(best), own[self.has_contrast[list(proposed)]]
+        # half-way from wrong pairs to right ones, if the proposed photos together are right
+        least = min(SIGNIFICANT, float(np.median(comparable)) / 2) if _exceed_noise(comparable) else SIGNIFICANT
+        for place, (view, assignment) in enumerate(proposed.items()):
+            score, highest = own[place], max(best[place, place], best[place, matched[place]])
+            # more than wrong pairs have, or more than half of the variance is explained
+            matches = score > least or scores.correlations[view, columns[place], assignment.orientation] ** 2 > 0.5
+            matches = matches and score > highest - SIGNIFICANT
+            is_clear = score > MARGIN and score >= highest
+            if is_clear and exact:
+                out[view], confirmed[view] = assignment, True
+            elif matches or (not self.has_contrast[view] and scores.fits(assignment)):
                 parts = self.compare(view, assignment)
-                out[view] = None if self.lies_elsewhere(view, usual) else assignment
-                sure[view] = bool(parts) or (clear and parts is None) or not self.judged[view]
-        return out, sure
+                out[view] = None if self.lies_elsewhere(view, proposed) else assignment
+                confirmed[view] = bool(parts) or (is_clear and parts is None) or not self.has_contrast[view]
+        return out, confirmed
 
-    def stand_together(self, chosen: Sequence[Assignment | None]) -> bool:
-        """Return whether chosen photos together are like their views, beyond the noise of so many wrong pairs."""
-        given = [(view, each) for view, each in enumerate(chosen) if each is not None and self.judged[view]]
+    def match_together(self, chosen: Sequence[Assignment | None]) -> bool:
+        """Return True if chosen photos together match their views better than as many wrong pairs would."""
+        given = [(view, each) for view, each in enumerate(chosen) if each is not None and self.has_contrast[view]]
         scores = self.score(self._correlations)
         own = [scores.of(*pair) for pair in given]
         return not own or _exceed_noise(np.array(own))
 
-    def _usual_turn(self, scores: _Scores, view: int, photo: int) -> int:
-        """Return 0 for a photo that shows a view as it is stored, or the turn of its tag if that is clearly better."""
+    def _stored_or_tagged(self, scores: _Scores, view: int, photo: int) -> int:
+        """Return the orientation of a photo's tag if it scores clearly higher than the stored orientation, else 0."""
         tag = self.candidates.tags[photo]
         stored, tagged = np.nan_to_num(scores.values[view, scores.photos.index(photo), [0, tag]], nan=-np.inf)
-        return tag if tagged > stored + DOUBT else 0
+        return tag if tagged > stored + SIGNIFICANT else 0
 
     def search(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, Assignment]:
-        """Find the ``photos`` that show ``views``, part by part."""
+        """Find which of ``photos`` show ``views`` by comparing the most similar ones part by part."""
         pairs = [(view, each) for view, likely in self.list_likely(views, photos).items() for each in likely]
         if not pairs:
             return {}
         scores = self.score(self._correlations)
 
         def compare(pair: tuple[int, Assignment]) -> float:
-            alike = self.compare(*pair)
-            if alike is not None:
-                return alike
+            similarity = self.compare(*pair)
+            if similarity is not None:
+                return similarity
             score = scores.of(*pair)
-            return 1 - MARGIN / score if score > MARGIN else 0.0  # less than what parts say
+            return 1 - MARGIN / score if score > MARGIN else 0.0  # always below the similarity of parts
 
         return _choose(pairs, parallel_map(compare, pairs))
 
     def list_likely(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, list[Assignment]]:
-        """List the ``photos`` most alike to each of ``views``; of many a sample is tried first, then those around."""
+        """List the ``photos`` with the highest scores in each of ``views``.
+
+        Of many photos an evenly spaced sample is compared first, then the photos around the best of the sample.
+        """
         if not views or not photos:
             return {}
-        step, tags = -(-len(photos) // AT_ONCE), self.candidates.tags
-        offsets = set(range(0, len(photos), step))
+        step, tags = -(-len(photos) // FIRST_PHOTOS), self.candidates.tags
+        places = set(range(0, len(photos), step))  # of the compared photos
         while True:
-            scores = self.score(photos[place] for place in sorted(offsets))
+            scores = self.score(photos[place] for place in sorted(places))
             best = scores.best()
-            likely = {view: np.argsort(-best[view], kind="stable")[:ALIKE] for view in views}
-            near = {photos.index(scores.photos[column]) for ids in likely.values() for column in ids}
-            around = {place + away for place in near for away in range(1 - step, step)} & set(range(len(photos)))
-            if around <= offsets:
+            columns = {view: np.argsort(-best[view], kind="stable")[:MAX_COMPARED] for view in views}
+            peaks = {photos.index(scores.photos[column]) for ids in columns.values() for column in ids}
+            around = {place + away for place in peaks for away in range(1 - step, step)} & set(range(len(photos)))
+            if around <= places:
                 break
-            offsets, step = offsets | around, 1
-        return {
-            view: [
-                Assignment(scores.photos[column], scores.turn(view, scores.photos[column], tags[scores.photos[column]]))
-                for column in ids
-                if np.isfinite(best[view, column])
-            ]
-            for view, ids in likely.items()
-        }
+            places, step = places | around, 1
+
+        def list_of(view: int) -> list[Assignment]:
+            likely = [scores.photos[column] for column in columns[view] if np.isfinite(best[view, column])]
+            return [Assignment(photo, scores.choose_orientation(view, photo, tags[photo])) for photo in likely]
+
+        return {view: list_of(view) for view in views}
 
 
 def assign_photos(
@@ -237,44 +254,48 @@ def assign_photos(
     exact: bool,
     stored: Candidates | None = None,
 ) -> list[Assignment | None]:
-    """Assign a photo to each view; None where none shows it.
+    """Assign a photo to each view; None where no photo shows the view.
 
-    ``show`` makes pictures of the views of a size. ``named``: the photo that names or order propose for each view. If
-    they are ``exact`` names, most of them right, a view whose photo is not there has none: others have names of their
-    own. ``stored``: the photos as their files have them, where ``candidates`` are those that were brought to the views.
+    ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side. ``named`` is the photo that
+    names or order propose for each view, or None. If names are ``exact`` and most of them prove right, a view whose
+    name has no photo gets none, since each other photo carries the name of its own view. ``stored`` are the photos as
+    stored in their files, if ``candidates`` are resampled to the views.
     """
     assigner = Assigner(show, candidates)
-    out, sure = assigner.confirm(named, exact=exact)
-    they_tell = 2 * sum(each is not None for each in out) > len(out) and assigner.stand_together(out)
-    if exact and they_tell:  # names stand but where something speaks against them
-        left = [view for view, each in enumerate(out) if each is None and named[view] is not None]
+    out, confirmed = assigner.confirm(named, exact=exact)
+    most_match = 2 * sum(each is not None for each in out) > len(out) and assigner.match_together(out)
+    if exact and most_match:  # search only for the views whose proposed photo was rejected
+        unknown = [view for view, each in enumerate(out) if each is None and named[view] is not None]
     else:
-        left = [view for view, known in enumerate(sure) if not known]
-    if not left:
+        unknown = [view for view, is_confirmed in enumerate(confirmed) if not is_confirmed]
+    if not unknown:
         return out
-    used = {each.photo for view, each in enumerate(out) if each is not None and view not in left}
+    used = {each.photo for view, each in enumerate(out) if each is not None and view not in unknown}
     if stored is not None:
         assigner = Assigner(show, stored)
-    others = assigner.search(left, [photo for photo in range(candidates.count) if photo not in used])
-    for view in left:
-        out[view] = others.get(view) or (out[view] if they_tell else None)
+    results = assigner.search(unknown, [photo for photo in range(candidates.count) if photo not in used])
+    for view in unknown:
+        out[view] = results.get(view) or (out[view] if most_match else None)
     return out
 
 
 def _exceed_noise(scores: np.ndarray) -> bool:
-    """Return whether the middle of scores ``[n]``, which no single one moves, is above that of so many wrong pairs."""
-    return bool(len(scores) and np.median(scores) * np.sqrt(len(scores)) > DOUBT)
+    """Return True if the median of scores ``[n]`` is significantly above that of as many wrong pairs.
+
+    No single score moves the median.
+    """
+    return bool(len(scores) and np.median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
 
 
 def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:
-    """Give each photo to one view so that all are most alike."""
-    agree = [(*pair, score) for pair, score in zip(pairs, scores, strict=True) if score > 0]
-    if not agree:
+    """Give each photo to one view so that the sum of the scores is largest."""
+    possible = [(*pair, score) for pair, score in zip(pairs, scores, strict=True) if score > 0]
+    if not possible:
         return {}
-    views = sorted({view for view, _, _ in agree})
-    photos = sorted({assignment.photo for _, assignment, _ in agree})
+    views = sorted({view for view, _, _ in possible})
+    photos = sorted({assignment.photo for _, assignment, _ in possible})
     gains, chosen = np.zeros((len(views), len(photos))), dict[tuple[int, int], Assignment]()
-    for view, assignment, score in agree:
+    for view, assignment, score in possible:
         gains[views.index(view), photos.index(assignment.photo)] = score
         chosen[view, assignment.photo] = assignment
     matched = ((view, photos[column]) for view, column in zip(views, _match(gains), strict=True) if column >= 0)
@@ -282,12 +303,15 @@ def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) ->
 
 
 def _match(scores: np.ndarray) -> np.ndarray:
-    """Return the column of each row of ``scores [r,c]``, each once, so that the sum is largest; -1 for none."""
-    best, out = scores.argmax(1), np.full(len(scores), -1)
-    if len(set(best.tolist())) == len(best):  # which needs no search
-        return np.asarray(best)
-    from scipy.optimize import linear_sum_assignment  # which takes long to load
+    """Choose a column for each row of ``scores [r,c]`` so that the sum is largest.
 
-    rows, columns = linear_sum_assignment(np.where(np.isfinite(scores), -scores, FAR))
+    No column is chosen twice; -1 for a row without a column.
+    """
+    best, out = scores.argmax(1), np.full(len(scores), -1)
+    if len(set(best.tolist())) == len(best):  # the best columns differ, so no search is needed
+        return np.asarray(best)
+    from scipy.optimize import linear_sum_assignment  # here because it takes long to load
+
+    rows, columns = linear_sum_assignment(np.where(np.isfinite(scores), -scores, IMPOSSIBLE))
     out[rows] = columns
     return out

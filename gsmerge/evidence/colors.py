@@ -1,9 +1,10 @@
-"""Whether a change of their colours makes photos look as what the Gaussians show.
+"""Test whether a change of colours makes photos equal to what the Gaussians show.
 
-Each change is a hypothesis with parameters: red and blue in each other's place, a tone curve for each channel, a linear
-map of colours. Pictures are cut into blocks, dealt like the fields of a chess board: what changes one half is fitted to
-the other. A change counts where blocks, which did not choose it, are nearer with it than without by more than their
-noise, and by more than what it leaves. Means of blocks are compared: wrong depth displaces little beyond them.
+A change is a hypothesis with parameters: red and blue exchanged, a tone curve for each channel, or a linear map of
+colours. Pictures are cut into blocks, which are dealt into two halves like the squares of a chess board. The change of
+one half is fitted to the other half, so no block is scored by a change that was fitted to it. A change is accepted if
+it reduces the errors of blocks by more than their noise and by more than half. The errors are those of the means of
+blocks, because wrong depth displaces few Gaussians across a block.
 """
 
 from __future__ import annotations
@@ -20,40 +21,40 @@ from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.runtime.threads import parallel_map
 
 BLOCKS = 12  # along the longer side
-SOLID = 0.2  # least opacity of a block that is compared: what fainter ones show is a few Gaussians
-LEVELS = 33  # quantiles that a tone curve joins
-STEP = 0.05  # what a third of a stop, the least step of cameras, changes middle grey by
-VISIBLE = 0.01  # root mean square of differences that are just seen on plain surfaces
-RIDGE = 1e-6  # of the mean square of colours: keeps grey photos' maps finite
-Change = Callable[[np.ndarray], np.ndarray]  # of colours [...,3]
-Fit = Callable[[np.ndarray, np.ndarray, np.ndarray], Change]  # of colours [n,3] to others [n,3], by weights [n]
+SOLID = 0.2  # least opacity of a block that is compared; fainter blocks show only a few Gaussians
+LEVELS = 33  # number of quantiles of a tone curve
+STEP = 0.05  # change of middle grey by a third of a stop, the smallest exposure step of cameras
+VISIBLE = 0.01  # root mean square of differences that are just visible on plain surfaces
+RIDGE = 1e-6  # ridge of the least squares, relative to the mean square of colours; keeps maps of grey photos finite
+Change = Callable[[np.ndarray], np.ndarray]  # maps colours [...,3]
+Fit = Callable[[np.ndarray, np.ndarray, np.ndarray], Change]  # from colours [n,3] to targets [n,3], weights [n]
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Photos and pictures of v views, as means of blocks."""
+    """Photos of v views and pictures of their Gaussians, as means of blocks."""
 
     photos: np.ndarray  # [v,H,W,3]
-    pictures: np.ndarray  # [v,H,W,3] what the Gaussians show there
-    solid: np.ndarray  # [v,H,W] whether a block is opaque enough to be compared
+    pictures: np.ndarray  # [v,H,W,3] colours of the Gaussians
+    solid: np.ndarray  # [v,H,W] True where a block is opaque enough to be compared
 
     def errors(self, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
-        """Return the mean difference of colours of blocks ``[n]`` of some views; NaN of those that are faint."""
+        """Return the mean difference ``[n]`` between photo and picture of each block of some views; NaN if faint."""
         return self.distances(self.pictures, views)
 
     def distances(self, colors: np.ndarray, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
-        """Return the mean difference of photos from other colours ``[v,H,W,3]``, as :meth:`errors` does."""
+        """Return the mean difference ``[n]`` between photos and ``colors [v,H,W,3]`` of each block; NaN if faint."""
         away = np.abs(self.photos - colors).mean(-1)
         return np.where(self.solid, away, np.nan)[views].reshape(-1)
 
 
 def is_visible(errors: np.ndarray) -> bool:
-    """Return whether errors of blocks ``[n]`` are seen."""
+    """Return True if errors of blocks ``[n]`` are visible."""
     return _sum_squares(errors) > VISIBLE**2 * np.isfinite(errors).sum()
 
 
 def explains(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether errors of blocks ``[n]`` fall by more than their noise, and, in squares, by more than stays."""
+    """Return True if a change reduces the errors of blocks ``[n]`` significantly and halves their sum of squares."""
     return stands_out(before - after) and _sum_squares(before) > 2 * _sum_squares(after)
 
 
@@ -68,9 +69,9 @@ def cut_blocks(pairs: Pairs) -> Blocks:
 
 
 def fit_tones(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Fit a tone curve ``[3,256]``: quantiles of colours become those of targets, proportional at its ends.
+    """Fit a tone curve ``[3,256]`` that maps quantiles of ``colors`` to quantiles of ``targets``.
 
-    Wrong depth and noise hardly change quantiles.
+    The curve is proportional at both ends. Wrong depth and noise hardly change quantiles.
     """
     return np.stack([_join_quantiles(colors[:, channel], targets[:, channel], weights) for channel in range(3)])
 
@@ -84,7 +85,7 @@ def map_tones(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def fit_map(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Fit the linear map ``[4,3]`` of colours, with a constant, to targets by least squares."""
+    """Fit the linear map ``[4,3]`` of colours to targets by least squares; its last row is a constant."""
     columns = np.concatenate([colors, np.ones((len(colors), 1))], 1).astype(np.float64)
     heavy = columns * weights[:, None]
     return solve(
@@ -99,7 +100,7 @@ def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
-    """Return blocks of photos after tone curves, one for each group of views, that were fitted to other blocks."""
+    """Return blocks of photos after a tone curve for each group of views; curves are fitted to the other blocks."""
     toned = pairs.photos.copy()
 
     def fit(group: Sequence[int]) -> None:
@@ -112,13 +113,13 @@ def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
 
 
 def map_blocks(blocks: Blocks) -> Blocks:
-    """Return blocks after a linear map of colours, that was fitted to other blocks."""
+    """Return blocks after a linear map of colours; the map is fitted to the other blocks."""
     mapped = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _map_change)
     return Blocks(mapped, blocks.pictures, blocks.solid)
 
 
 def plain_blocks(blocks: Blocks) -> Blocks:
-    """Return blocks of one colour, the mean of what the Gaussians show in other blocks."""
+    """Return blocks of one colour, the mean colour of the Gaussians in the other blocks."""
     plain = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _plain_change)
     return Blocks(plain, blocks.pictures, blocks.solid)
 
@@ -137,24 +138,24 @@ def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Ch
 
 
 def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: Fit) -> np.ndarray:
-    """Change photos ``[v,h,w,3]`` by what was fitted to all of them: every other block by those between."""
+    """Change photos ``[v,h,w,3]`` by two-fold cross-fitting: each half of the blocks by the fit to the other half."""
     out, side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
     y, x = ((np.arange(size) / side).astype(int) for size in photos.shape[1:3])
-    odd = (y[:, None] + x) % 2 == 1
-    for fold in (odd, ~odd):
+    black_squares = (y[:, None] + x) % 2 == 1  # of the chess board
+    for fold in (black_squares, ~black_squares):
         colors, targets = (each[:, ~fold].reshape(-1, 3) for each in (photos, pictures))
         out[:, fold] = fit(colors, targets, weights[:, ~fold].reshape(-1))(photos[:, fold])
     return out
 
 
 def _join_quantiles(levels: np.ndarray, tones: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the curve ``[256]`` float32 that maps the quantiles of one sample to another, proportional at its ends."""
-    counts = weights > 0
-    if not counts.any():
+    """Return the curve ``[256]`` float32 that maps quantiles of ``levels`` to those of ``tones``, with linear ends."""
+    used = weights > 0
+    if not used.any():
         return np.linspace(0, 1, 256, dtype=np.float32)
-    x, y = (np.round(_weigh_quantiles(values[counts], weights[counts]), 6) for values in (levels, tones))
-    keep = np.concatenate([[True], np.diff(x) > 1 / 255]) & (x > 0) & (x < 1)
-    x, y = x[keep], np.maximum.accumulate(y[keep].clip(0, 1))
+    x, y = (np.round(_weigh_quantiles(values[used], weights[used]), 6) for values in (levels, tones))
+    is_distinct = np.concatenate([[True], np.diff(x) > 1 / 255]) & (x > 0) & (x < 1)
+    x, y = x[is_distinct], np.maximum.accumulate(y[is_distinct].clip(0, 1))
     end = min(1.0, max(y[-1], y[-1] / x[-1])) if len(x) else 1.0
     curve = np.interp(np.arange(256) / 255, [0, *x, 1], [0, *y, end])
     return np.round(curve, 6).astype(np.float32)

@@ -1,7 +1,8 @@
-"""Where the parts of a photo lie in what a view shows: in their places, or moved, as a neighbour's photo has them.
+"""Search for the parts of a photo in the picture of a view, to decide whether the photo was taken from there.
 
-Pictures of neighbouring views are alike as a whole. Parts of one are looked up around their places in the other: where
-one place stands out of all those tried, it says whether the photo was taken from there.
+Pictures of neighbouring views are similar as a whole, but their parts are displaced. Each part of the view's picture is
+searched for around the same place in the photo. If the best place of a part stands out from all others, its offset
+counts: parts of the view's own photo have no offset, parts of a neighbour's photo do.
 """
 
 from __future__ import annotations
@@ -16,89 +17,92 @@ from gsmerge.evidence.scores import MARGIN, NORMAL, find_contrast, fisher_z
 from gsmerge.raster.photos import shrink_pictures
 
 SIDE = 256  # pixels of the longer side of both pictures
-PART, REACH = 32, 12  # pixels of the side of a part, and how far around its place it is looked up
-AROUND = 30  # pixels of the square whose mean contrast is taken from
-TAPS = 64  # of the Fourier transforms, at least PART + 2 REACH
-SAME = 1  # pixels to which a place is one: those of a correlation's peak
-NEAR_PIXELS = 3  # pixels to which parts moved alike: what different depths leave of a motion
+PART, REACH = 32, 12  # pixels: side of a part, and largest offset that is searched
+AROUND = 30  # pixels: side of the square whose mean is subtracted to get contrast
+TAPS = 64  # size of the Fourier transforms, at least PART + 2 REACH
+TOLERANCE = 1  # pixels: offsets up to it count as zero, since the peak of a correlation is that wide
+NEAR_PIXELS = 3  # pixels by which offsets of parts may differ in one common motion, because their depths differ
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoOffsets:
-    """Where the parts of a photo that say where they are lie: in their places, or elsewhere."""
+    """Offsets of those parts of a photo whose place stands out from all others."""
 
-    moves: np.ndarray  # [n,2] pixels down and right to where the parts that say it lie
-    alike: float  # mean of Fisher's z of all parts in their places
-    same: float = SAME  # pixels of a move to which a place is one
+    offsets: np.ndarray  # [n,2] pixels down and right
+    similarity: float  # mean of Fisher's z of all parts at offset zero
+    tolerance: float = TOLERANCE  # pixels: offsets up to it count as zero
 
     @cached_property
     def distances(self) -> np.ndarray:
-        """Pixels ``[n]`` that the parts moved, along the side along which they moved more."""
-        return np.abs(self.moves).max(1)
+        """Length ``[n]`` of the offsets in pixels, as the larger of both components."""
+        return np.abs(self.offsets).max(1)
 
     @property
-    def here(self) -> int:
+    def num_in_place(self) -> int:
         """Number of parts in their places."""
-        return int((self.distances <= self.same).sum())
+        return int((self.distances <= self.tolerance).sum())
 
     @property
-    def elsewhere(self) -> int:
-        """Number of parts elsewhere."""
-        return len(self.moves) - self.here
+    def num_displaced(self) -> int:
+        """Number of parts out of their places."""
+        return len(self.offsets) - self.num_in_place
 
     @property
-    def together(self) -> int:
-        """The most of the parts elsewhere that moved alike."""
-        far = self.moves[self.distances > self.same]
-        return int((np.abs(far[:, None] - far).max(2) <= NEAR_PIXELS).sum(1).max(initial=0))
+    def num_moved_together(self) -> int:
+        """Largest number of displaced parts with about the same offset."""
+        displaced = self.offsets[self.distances > self.tolerance]
+        return int((np.abs(displaced[:, None] - displaced).max(2) <= NEAR_PIXELS).sum(1).max(initial=0))
 
     @property
     def verdict(self) -> bool | None:
-        """Whether the photo was taken from there; None in doubt.
+        """True if the photo was taken from the view, False if it was taken from elsewhere, None in doubt.
 
-        It was if more parts lie here than moved alike, and it was not if more lie elsewhere, by more than the standard
-        error of a fair coin.
+        The photo was taken from the view if more parts are in place than moved together. It was taken from elsewhere if
+        more parts are displaced than in place. Both differences must exceed the standard error of a fair coin.
         """
-        if self.here - self.together > np.sqrt(self.here + self.together):
+        in_place, displaced, together = self.num_in_place, self.num_displaced, self.num_moved_together
+        if in_place - together > np.sqrt(in_place + together):
             return True
-        return False if self.elsewhere - self.here > np.sqrt(self.elsewhere + self.here) else None
+        return False if displaced - in_place > np.sqrt(displaced + in_place) else None
 
 
 def correlate_parts(shown: ViewPictures, view: int, photo: np.ndarray) -> np.ndarray:
-    """Return Fisher's z of the correlations ``[n]`` of a photo's parts with those in the same places of a view."""
+    """Return Fisher's z ``[n]`` of the correlations between parts of a photo and the same parts of a view."""
     weight = shown.weights[view]
     height, width = weight.shape
-    near = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
-    own = find_contrast(shown.pictures[view], weight, AROUND)
+    of_photo = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
+    of_view = find_contrast(shown.pictures[view], weight, AROUND)
     starts = [np.arange(0, side, max(1, PART * max(height, width) // SIDE)) for side in (height, width)]
 
     def add(values: np.ndarray) -> np.ndarray:
         return np.add.reduceat(np.add.reduceat(values.sum(-1) * weight, starts[0], 0), starts[1], 1).reshape(-1)
 
-    return fisher_z(add(near * own) / np.sqrt(np.maximum(add(near * near) * add(own * own), 1e-12)))
+    squares = add(of_photo * of_photo) * add(of_view * of_view)
+    return fisher_z(add(of_photo * of_view) / np.sqrt(np.maximum(squares, 1e-12)))
 
 
 def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffsets | None:
-    """Look up the parts of an upright ``photo [h,w,3]`` in a view of ``shown``, which has up to :data:`SIDE` pixels.
+    """Search for the parts of a view in an upright ``photo [h,w,3]``, which may have any size.
 
-    None if these are so few that there are no parts.
+    ``shown`` are pictures of the views with up to :data:`SIDE` pixels on the longer side. None if they are too small to
+    be cut into parts.
     """
     weight = shown.weights[view]
     height, width = weight.shape
     if min(height, width) < 2 * PART:
         return None
-    near = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
-    own = find_contrast(shown.pictures[view], weight, AROUND)
-    scores = _look_up(np.pad(near, ((REACH, REACH), (REACH, REACH), (0, 0))), own, weight)
+    of_photo = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
+    of_view = find_contrast(shown.pictures[view], weight, AROUND)
+    scores = _score_offsets(np.pad(of_photo, ((REACH, REACH), (REACH, REACH), (0, 0))), of_view, weight)
     middle = np.median(scores, 1)
     noise = NORMAL * np.median(np.abs(scores - middle[:, None]), 1) + 1e-6
-    decided = scores.max(1) - middle > MARGIN * noise
-    moves = np.stack(np.divmod(scores[decided].argmax(1), 2 * REACH + 1), 1) - REACH
-    return PhotoOffsets(moves, float(scores[:, scores.shape[1] // 2].mean()))
+    stand_out = scores.max(1) - middle > MARGIN * noise
+    offsets = np.stack(np.divmod(scores[stand_out].argmax(1), 2 * REACH + 1), 1) - REACH
+    return PhotoOffsets(offsets, float(scores[:, scores.shape[1] // 2].mean()))
 
 
-def _look_up(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return Fisher's z ``[n,(2 REACH + 1)^2]`` of a picture's parts and those around them in a padded photo."""
+def _score_offsets(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return Fisher's z ``[n,(2 REACH + 1)^2]`` of each part of a picture at every offset in a padded photo."""
     rows, columns = (np.arange(0, side - PART + 1, PART) + (side % PART) // 2 for side in weight.shape)
     corners = [(top, left) for top in rows for left in columns]
 

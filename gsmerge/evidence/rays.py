@@ -1,7 +1,8 @@
-"""Find photos whose pixels have Gaussians of their colours on their rays, at whatever depth.
+"""Find photos whose pixels have Gaussians of the same colour on their rays, at any depth.
 
-Models give the Gaussians of a pixel about its colour, and put them on its ray: a wrong depth moves them along it. So
-most pixels of a right photo have one of their colour there, and those of another photo as few as chance gives.
+Models give the Gaussians of a pixel about the colour of that pixel and put them on its ray. A wrong depth only moves
+them along the ray. So most pixels of the right photo have a Gaussian of their colour on their ray. Pixels of a wrong
+photo have one only by chance.
 """
 
 from __future__ import annotations
@@ -17,47 +18,52 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
-SAMPLE_PIXELS = 4096  # of a view, whose rays are looked along
-SAME = 3 / 255  # difference of colours that a rounding of 8 bits and a photo's compression leave
+SAMPLE_PIXELS = 4096  # pixels of a view whose rays are examined
+SAME = 3 / 255  # largest difference of equal colours after rounding to 8 bits and compression of the photo
 
 
 def find_on_rays(scene: Scene, views: Sequence[int], photos: Sequence[np.ndarray]) -> np.ndarray:
-    """Find which of some views' photos have Gaussians of their colours on their rays, as a mask ``[v]``.
+    """Find which photos have Gaussians of their colours on the rays of their views, as a mask ``[v]``.
 
-    ``scene`` is canonical, and ``photos [h,w,3]`` are those that names give to the views, of their size. A photo has
-    them if it has more than half-way from what the views' other photos have there to what all have in the middle on
-    their own; none has where these do not stand out.
+    ``scene`` is canonical. ``photos [h,w,3]`` are those that names give to ``views``, at the size of the views. Each
+    photo is measured in its own view and in all others, as the share of pixels with a Gaussian of their colour. A photo
+    passes if its share in its own view exceeds the mean of two numbers: the largest share of a wrong photo in that
+    view, and the median share of all photos in their own views. No photo passes if that median is not clearly above the
+    shares of wrong pairs.
     """
     shares = measure_on_rays(scene, views, photos)
-    own, others = np.diag(shares).copy(), shares[~np.eye(len(shares), dtype=bool)].reshape(len(shares), -1)
-    if others.size == 0:
+    own, wrong = np.diag(shares).copy(), shares[~np.eye(len(shares), dtype=bool)].reshape(len(shares), -1)
+    if wrong.size == 0:
         return np.zeros(len(own), bool)
-    middle = float(np.median(others))
-    noise = NORMAL * float(np.median(np.abs(others - middle))) + 1 / SAMPLE_PIXELS
+    middle = float(np.median(wrong))
+    noise = NORMAL * float(np.median(np.abs(wrong - middle))) + 1 / SAMPLE_PIXELS
     if not np.median(own) - middle > MARGIN * noise:
         return np.zeros(len(own), bool)
-    return np.asarray(own > (others.max(1) + np.median(own)) / 2)
+    return np.asarray(own > (wrong.max(1) + np.median(own)) / 2)
 
 
 def measure_on_rays(scene: Scene, views: Sequence[int], photos: Sequence[np.ndarray]) -> np.ndarray:
-    """Measure the share ``[v,p]`` of sampled pixels of views with a Gaussian of a photo's colour on their ray."""
+    """Measure the share ``[v,p]`` of sampled pixels of each view with a Gaussian of each photo's colour on their ray.
+
+    Only pixels with any Gaussian on their ray count.
+    """
     g, cameras = scene.gaussians, scene.cameras
     means, scales = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales))
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
     size = cameras.width, cameras.height
-    numbers = np.full(scene.pixels_per_view, -1, np.int32)  # of the pixels that are sampled
+    numbers = np.full(scene.pixels_per_view, -1, np.int32)  # of sampled pixels; -1 for all other pixels
     sample = np.random.default_rng(0).permutation(len(numbers))[:SAMPLE_PIXELS]
     numbers[sample] = np.arange(len(sample), dtype=np.int32)
 
     def measure(view: int) -> np.ndarray:
         ids, pixels, _, areas = project_centres(means, scales, viewmats[view], Ks[view], *size, NEAR_PLANE)
-        rows = np.flatnonzero((numbers[pixels] >= 0) & (areas > 0))  # whose centres lie in the picture
+        rows = np.flatnonzero((numbers[pixels] >= 0) & (areas > 0))  # Gaussians whose centres lie in the picture
         places, colors = numbers[pixels[rows]], sh0_to_rgb(g.sh0[ids[rows], 0]).clip(0, 1)
-        seen = max(1, int(np.count_nonzero(np.bincount(places, minlength=len(sample)))))
+        num_covered = max(1, int(np.count_nonzero(np.bincount(places, minlength=len(sample)))))
         shares = np.zeros(len(photos))
         for number, photo in enumerate(photos):
             apart = np.abs(photo.reshape(-1, 3)[pixels[rows]] - colors).max(1)
-            shares[number] = np.count_nonzero(np.bincount(places[apart <= SAME], minlength=len(sample))) / seen
+            shares[number] = np.count_nonzero(np.bincount(places[apart <= SAME], minlength=len(sample))) / num_covered
         return shares
 
     return np.stack(parallel_map(measure, views))

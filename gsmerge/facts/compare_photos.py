@@ -175,10 +175,10 @@ def find_matching_views(
     sure, on_rays = np.array([each is not None for each in chosen]), np.zeros(len(ids), bool)
     if not sure.all():
         on_rays = find_on_rays(scene, ids, [photos[view] for view in ids])
-    if not (assigner.stand_together(chosen) or on_rays.any()):
+    if not (assigner.match_together(chosen) or on_rays.any()):
         return []
     sure |= on_rays
-    decided = zip(ids, sure, assigner.judged, strict=True)  # but for views that show nothing to go by
+    decided = zip(ids, sure, assigner.has_contrast, strict=True)  # but for views that show nothing to go by
     right = {kinds[view] for view, stands, judged in decided if stands or not judged}
     return [view for view in views if kinds[view] in right]
 

@@ -1,4 +1,4 @@
-"""Filters and lookups in pictures whose bits are the same on every processor: those of OpenCV are not, for these."""
+"""Filter and sample pictures with equal bits on every processor, which OpenCV does not ensure for these operations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmerge.kernels.signature import STATUS, declare, f4
 
 SLOPE, SMOOTH = np.array([-1, 0, 1], np.float32), np.array([1, 2, 1], np.float32)  # Sobel's filters
 Picture = np.ndarray[Any, Any]
-TURNS = 8  # of a picture, as tags of orientation have them: four of it, and four of its mirror image
+ORIENTATIONS = 8  # of a picture, as in EXIF tags: four quarter turns, and four of the mirror image
 CUBIC = -0.75  # slope parameter of the cubic convolution (Keys 1981), OpenCV's
 
 
@@ -47,7 +47,7 @@ def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
 def blur(picture: Picture, sigma: float, size: int | None = None) -> Picture:
     """Blur a picture ``[h,w]`` or ``[h,w,c]`` by a Gaussian of ``sigma`` pixels; float32.
 
-    ``size`` is the odd number of pixels that its filter has, by default what lies within four ``sigma``.
+    ``size`` is the odd number of pixels of the filter, by default all within four ``sigma``.
     """
     size = round(8 * sigma + 1) | 1 if size is None else size
     places = np.arange(size) - size // 2
@@ -77,7 +77,7 @@ def sample_bilinear(picture: Picture, x: np.ndarray, y: np.ndarray) -> Picture:
 def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False) -> Picture:
     """Resize a picture ``[h,w]`` or ``[h,w,c]`` to a larger size in pixels by cubic convolution; float32.
 
-    Outside are the border pixels, or those of the opposite border where it is ``periodic``.
+    Border pixels are repeated outside. If ``periodic``, the picture itself is repeated.
     """
     out: Picture = np.asarray(picture, np.float32)
     for axis, size in ((0, height), (1, width)):
@@ -90,7 +90,10 @@ def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False
 
 
 def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
-    """Return the places of four of ``old`` pixels, and their weights, that make each new pixel: both ``[4,new]``."""
+    """Return the four of ``old`` pixels that each of ``new`` pixels is interpolated from, and their weights ``[4,new]``.
+
+    Pixels may lie outside.
+    """
     places = (np.arange(new) + 0.5) * (old / new) - 0.5
     first = np.floor(places).astype(np.int64)
     away = np.abs(places - first - np.arange(-1, 3)[:, None])
@@ -100,26 +103,30 @@ def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
     return first + np.arange(-1, 3)[:, None], np.where(away <= 1, near, far).astype(np.float32)
 
 
-def turn_picture(picture: Picture, turn: int) -> Picture:
-    """Mirror a picture ``[h,w,...]`` left to right for turns from 4 on, and turn it counterclockwise by quarters."""
-    return np.rot90(picture[:, ::-1] if is_mirrored(turn) else picture, turn % (TURNS // 2))
+def turn_picture(picture: Picture, orientation: int) -> Picture:
+    """Bring a stored picture ``[h,w,...]`` into its ``orientation``, 0 to 7.
+
+    From 4 on the picture is first mirrored left to right. It is then turned counterclockwise by ``orientation % 4``
+    quarters.
+    """
+    return np.rot90(picture[:, ::-1] if is_mirrored(orientation) else picture, orientation % (ORIENTATIONS // 2))
 
 
-def is_mirrored(turn: int) -> bool:
-    """Return whether a turn mirrors pictures."""
-    return turn >= TURNS // 2
+def is_mirrored(orientation: int) -> bool:
+    """Return True if an orientation mirrors pictures."""
+    return orientation >= ORIENTATIONS // 2
 
 
-def turn_back(picture: Picture, turn: int) -> Picture:
+def turn_back(picture: Picture, orientation: int) -> Picture:
     """Undo :func:`turn_picture`."""
-    upright = np.rot90(picture, -(turn % (TURNS // 2)))
-    return upright[:, ::-1] if is_mirrored(turn) else upright
+    upright = np.rot90(picture, -(orientation % (ORIENTATIONS // 2)))
+    return upright[:, ::-1] if is_mirrored(orientation) else upright
 
 
 def count_bars(image: np.ndarray, spread: float) -> tuple[int, int, int, int]:
-    """Count the lines of one colour at each border of a picture ``[h,w,c]``: above, below, left, right.
+    """Count the lines of the bar of one colour at each border of a picture ``[h,w,c]``: above, below, left, right.
 
-    All values of a bar lie within ``spread``. A bar that reaches the middle of the picture counts as none.
+    All values of a bar lie within ``spread``. A bar that reaches the middle of the picture has a count of 0.
     """
     counts = []
     for lines in (image, image[::-1], image.swapaxes(0, 1), image.swapaxes(0, 1)[::-1]):

@@ -259,7 +259,7 @@ def read_photos(
     SceneError if one cannot be read, or has another shape.
     """
     paths = tuple(None if each is None else proposal.pool[each.photo] for each in chosen)
-    turns = tuple(0 if each is None else each.turn for each in chosen)
+    turns = tuple(0 if each is None else each.orientation for each in chosen)
     size = ScenePhotos((), paths, turns).file_size
     if size is None:
         return ScenePhotos()
@@ -419,7 +419,7 @@ def name_by_photos(
     names = [
         name if file is None else _inside(file, proposal) for name, file in zip(camera_file.names, files, strict=True)
     ]
-    turns = [0 if each is None else each.turn for each in chosen]
+    turns = [0 if each is None else each.orientation for each in chosen]
     size = ScenePhotos((), tuple(files), tuple(turns)).file_size
     named = replace(camera_file, names=tuple(names))
     return named if fit is None or size is None else fit.cameras(named, size)
@@ -438,8 +438,8 @@ def describe_assignment(
     count, notes = len(chosen), list[str]()
     moves: dict[str, list[str]] = {"turned": [], "mirrored": []}
     for each in chosen:
-        if each is not None and each.turn != (tag := proposal.tags[each.photo]):
-            kind = "turned" if is_mirrored(each.turn) == is_mirrored(tag) else "mirrored"
+        if each is not None and each.orientation != (tag := proposal.tags[each.photo]):
+            kind = "turned" if is_mirrored(each.orientation) == is_mirrored(tag) else "mirrored"
             moves[kind].append(_inside(proposal.pool[each.photo], proposal))
     for kind, files in moves.items():
         what = f"lie otherwise in their views than their files say: they were {kind}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from panoramas import cut_views, show, shrunk, take_photos
 
-from gsmerge.evidence.assign import AT_ONCE, Assigner, Assignment, Candidates, assign_photos
+from gsmerge.evidence.assign import FIRST_PHOTOS, Assigner, Assignment, Candidates, assign_photos
 from gsmerge.evidence.offsets import SIDE, find_offsets
 from gsmerge.kernels.pictures import turn_back
 
@@ -93,9 +93,9 @@ def test_one_of_noise_is_left_out(views: np.ndarray, photos: list[np.ndarray]) -
 
 def test_some_frames_of_a_film(views: np.ndarray, photos: list[np.ndarray]) -> None:
     """Of many frames a sample is compared; the film dwells on each view."""
-    film = [shrunk(photos[frame * VIEWS // (2 * AT_ONCE)][None], 64)[0] for frame in range(2 * AT_ONCE)]
+    film = [shrunk(photos[frame * VIEWS // (2 * FIRST_PHOTOS)][None], 64)[0] for frame in range(2 * FIRST_PHOTOS)]
     chosen = assign(views[[1, 4]], film, [None, None], exact=False)
-    assert [each and each.photo * VIEWS // (2 * AT_ONCE) for each in chosen] == [1, 4]
+    assert [each and each.photo * VIEWS // (2 * FIRST_PHOTOS) for each in chosen] == [1, 4]
 
 
 def test_parts_tell_a_neighbour_s_photo(views: np.ndarray, photos: list[np.ndarray]) -> None:
@@ -107,7 +107,7 @@ def test_parts_tell_a_neighbour_s_photo(views: np.ndarray, photos: list[np.ndarr
     moved = find_offsets(shown, 2, beside)
     assert moved is not None
     assert moved.verdict is False
-    assert moved.together > moved.here
+    assert moved.num_moved_together > moved.num_in_place
     assert find_offsets(show(views, 32), 2, photos[2]) is None  # too small for parts
 
 

@@ -17,7 +17,7 @@ from gsmerge.evidence.scores import (
     signed_ranks,
     stands_out,
 )
-from gsmerge.kernels.pictures import TURNS, turn_back, turn_picture
+from gsmerge.kernels.pictures import ORIENTATIONS, turn_back, turn_picture
 from gsmerge.raster.photos import shrink_pictures
 
 
@@ -61,7 +61,7 @@ def test_a_photo_that_lies_can_only_stand_turned() -> None:
     turn = int(np.nanargmax(scores[0]))
     upright = turn_picture(np.rot90(take_photos(cut_views(2))[0]), turn)
     np.testing.assert_array_equal(upright, take_photos(cut_views(2))[0])
-    assert TURNS == 8
+    assert ORIENTATIONS == 8
 
 
 def test_transparency_changes_no_score() -> None:
