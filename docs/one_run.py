@@ -353,8 +353,8 @@ def build_section(run: Run) -> str:
         "## 4. build: the arrows",
         text(
             "[`pipeline.py`](../../gsmerge/pipeline.py) calls the files of `stages/` in turn, and `fit/` before it",
-            "finishes. Each line begins with a function. Not shown are `assign` (a row belongs to the superpixel of its",
-            "pixel) and `refine` (networks stay out).",
+            "finishes. Each line begins with a function. Not shown are `assign` (a row belongs to the superpixel of",
+            "its pixel) and `refine` (networks stay out).",
         ),
         "\n".join([
             entry("segment_scene: groups.labels", groups.labels, (VIEW, Y, X)),
@@ -391,9 +391,9 @@ def build_section(run: Run) -> str:
         ),
         text(
             "**`fit_scene`** compares renders with the photos and changes all parameters. Half way it splits the",
-            f"Gaussians with the largest errors, and later it drops those that fade. {len(fitted.gaussians):,} are left;",
-            f"{len(children)} of these come from the pixel's Gaussian. As a test, patches of the photos stay out of the",
-            "first steps, which draw a quarter of the pixels:",
+            "Gaussians with the largest errors, and later it drops those that fade.",
+            f"{len(fitted.gaussians):,} are left; {len(children)} of these come from the pixel's Gaussian.",
+            "As a test, patches of the photos stay out of the first steps, which draw a quarter of the pixels:",
             f"the PSNR of the patches rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
             say(
                 "so the fit is accepted. Otherwise colours alone would be fitted.",
