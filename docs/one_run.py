@@ -352,9 +352,9 @@ def build_section(run: Run) -> str:
     return "\n\n".join([
         "## 4. build: the arrows",
         text(
-            "[`pipeline.py`](../../gsmerge/pipeline.py) calls the files of `stages/` in turn, and `fit/` before the",
-            "last. Functions begin the lines. Not shown are `assign` (a row belongs to the superpixel of its pixel)",
-            "and `refine` (networks stay out).",
+            "[`pipeline.py`](../../gsmerge/pipeline.py) calls the files of `stages/` in turn, and `fit/` before it",
+            "finishes. Each line begins with a function. Not shown are `assign` (a row belongs to the superpixel of",
+            "its pixel) and `refine` (networks stay out).",
         ),
         "\n".join([
             entry("segment_scene: groups.labels", groups.labels, (VIEW, Y, X)),
@@ -391,10 +391,10 @@ def build_section(run: Run) -> str:
         ),
         text(
             "**`fit_scene`** compares renders with the photos and changes all parameters. Half way it splits the",
-            f"Gaussians with the largest errors, and drops those that fade: {len(fitted.gaussians):,} are left, of the",
-            f"pixel's Gaussian {len(children)}. Patches of photos stay out of the first steps, on a quarter of",
-            "pixels, as a test:",
-            f"their PSNR rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
+            "Gaussians with the largest errors, and later it drops those that fade.",
+            f"{len(fitted.gaussians):,} are left; {len(children)} of these come from the pixel's Gaussian.",
+            "As a test, patches of the photos stay out of the first steps, which draw a quarter of the pixels:",
+            f"the PSNR of the patches rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
             say(
                 "so the fit is accepted. Otherwise colours alone would be fitted.",
                 report.accepted and report.method == "full",
@@ -430,9 +430,9 @@ def result_section(run: Run) -> str:
                 "They show the photos better than the input, whose depths are wrong here and there.",
                 report.psnr_after > report.psnr_before,
             ),
-            "The fit has seen these photos, so the report also says how much PSNR views gain that no photo shows. It",
+            "The fit has seen these photos, so the report also estimates the gain in views that no photo shows. For",
             say(
-                "estimates this by runs that leave photos out. A warning would follow if the result were worse.",
+                "this it makes runs that leave photos out. A warning would follow if the result were worse.",
                 report.worse is None and new.low > 0,
             ),
         ),

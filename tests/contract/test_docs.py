@@ -336,20 +336,6 @@ def test_constraints_pin_every_dependency(root: Path) -> None:
     assert expected - set(pinned) == set()
 
 
-def test_architecture_names_every_module(root: Path) -> None:
-    text = (root / "docs" / "internals" / "architecture.md").read_text()
-    modules = {path.stem for path in (root / "gsmerge").iterdir() if not path.name.startswith("_")} - {"py"}
-    assert {name for name in modules if f"`{name}`" not in text and f"`{name}/`" not in text} == set()
-
-
-def test_architecture_says_what_each_file_of_alignment_serves(root: Path) -> None:
-    text = (root / "docs" / "internals" / "architecture.md").read_text().split("## Alignment")[1].split("\n## ")[0]
-    cells = "".join(line.split("|")[1] for line in text.splitlines() if line.startswith("| `"))
-    files = [path for path in (root / "gsmerge" / "alignment").iterdir() if not path.name.startswith("_")]
-    names = {path.stem if path.is_file() else f"{path.name}/" for path in files}
-    assert set(re.findall(r"`([\w/]+)`", cells)) == names
-
-
 def stability_rows(root: Path) -> list[tuple[str, str]]:
     """Numbers and tests of every line of cases."""
     text = re.sub(r"\n  +", " ", (root / "docs" / "internals" / "stability.md").read_text())

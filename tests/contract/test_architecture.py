@@ -1,0 +1,140 @@
+"""The pages on the inside of the package name its rooms, files and definitions, and only those that there are."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "gsmerge"
+INTERNALS = sorted((ROOT / "docs" / "internals").glob("*.md"))
+PAGES = [*INTERNALS, ROOT / "CONTRIBUTING.md", ROOT / "docs" / "reference" / "conventions.md"]
+ARCHITECTURE = ROOT / "docs" / "internals" / "architecture.md"
+# Made by a run, in folders that are not there before
+MADE = {"tests/fuzz/findings"}
+# Of other repositories
+FOREIGN = {"tests/data/set1_lund_door", "colmap_ground_truth"}
+SOURCES = (".py", ".c", ".h", ".toml", ".js", ".html", ".yml", ".sh")
+
+
+def section(title: str, page: Path = ARCHITECTURE) -> str:
+    """The text of a section of a page, without its title."""
+    return page.read_text("utf-8").partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+
+
+def rooms(text: str) -> list[str]:
+    """The rooms of the list, in its order; what follows the colon of a line describes them."""
+    heads = re.findall(r"^- (.+?):", text, re.MULTILINE)
+    return [name for head in heads for name in re.findall(r"`([\w/]+)`", head)]
+
+
+def layers() -> list[str]:
+    """The rooms of the import contract, from the top; those of one layer in its order."""
+    tomllib = pytest.importorskip("tomllib", reason="tomllib comes with Python 3.11")
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
+    (contract,) = [one for one in contracts if one["name"] == "Imports flow down"]
+    return [name for layer in contract["layers"] for name in layer.split(" | ")]
+
+
+def test_rooms_are_those_of_the_import_contract_in_its_order() -> None:
+    assert [room.rstrip("/") for room in rooms(section("Rooms"))] == layers()
+
+
+def test_rooms_are_the_folders_and_modules_of_the_package() -> None:
+    inside = {f"{path.parent.name}/" for path in PACKAGE.glob("*/__init__.py")}
+    inside |= {path.stem for path in PACKAGE.glob("*.py") if not path.stem.startswith("__")}
+    listed = rooms(section("Rooms"))
+    assert set(listed) == inside
+    assert len(listed) == len(inside)
+
+
+def test_the_drawing_has_rooms_alone() -> None:
+    """In its left column; small rooms may be left out."""
+    drawing = ARCHITECTURE.read_text("utf-8").partition("A room may import")[2].partition("One run, from top")[0]
+    lines = [line for line in drawing.splitlines() if line.startswith("    ")]
+    names = [name for line in lines for name in re.findall(r"\w+", line[:35] if "  " in line.strip() else line)]
+    assert len(names) > 20
+    assert set(names) <= {room.rstrip("/") for room in rooms(section("Rooms"))}
+
+
+def arrows() -> list[list[str]]:
+    """The cells of the table of arrows."""
+    lines = [line for line in section("Arrows").splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
+
+
+def test_arrows_are_those_of_the_first_line() -> None:
+    first = re.search(r"^    files -> scene -> (.+) -> ply$", ARCHITECTURE.read_text("utf-8"), re.MULTILINE)
+    assert first is not None
+    assert [row[0] for row in arrows()] == first[1].split(" -> ")
+
+
+def test_functions_of_arrows_are_in_their_files() -> None:
+    for _, functions, files in arrows():
+        modules = [import_module("gsmerge." + name.replace("/", ".")) for name in re.findall(r"`([\w/]+)`", files)]
+        names = re.findall(r"`(\w+)`", functions)
+        assert names
+        for name in names:
+            owners = [value for module in modules for value in (module, *vars(module).values())]
+            assert any(hasattr(owner, name) for owner in owners), name
+
+
+def test_every_file_of_stages_is_an_arrow_or_said_to_be_none() -> None:
+    files = {f"stages/{path.stem}" for path in (PACKAGE / "stages").glob("*.py") if not path.stem.startswith("_")}
+    assert set(re.findall(r"`(stages/\w+)`", section("Arrows"))) == files
+
+
+def test_each_file_of_alignment_says_what_it_serves() -> None:
+    cells = "".join(line.split("|")[1] for line in section("Alignment").splitlines() if line.startswith("| `"))
+    files = [path for path in (PACKAGE / "alignment").iterdir() if not path.name.startswith("_")]
+    names = {path.stem if path.is_file() else f"{path.name}/" for path in files}
+    assert set(re.findall(r"`([\w/]+)`", cells)) == names
+
+
+def code_spans(page: Path) -> Iterator[str]:
+    """What stands between backticks in the text of a page."""
+    text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
+    yield from (span.replace("\n", " ") for span in re.findall(r"`([^`]+)`", text))
+
+
+@cache
+def top() -> tuple[set[str], set[str]]:
+    """The names of folders of the package, and of the repository."""
+    return tuple({path.name for path in folder.iterdir() if path.is_dir()} for folder in (PACKAGE, ROOT))  # type: ignore
+
+
+def is_there(name: str) -> bool:
+    """Whether a path of a page leads to a file or folder of the package, or of the repository."""
+    return any(
+        (base / f"{name}{ending}").exists() for base in (PACKAGE, ROOT, ROOT / "tests") for ending in ("", ".py", ".c")
+    )
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_paths_lead_to_files(page: Path) -> None:
+    folders = set.union(*top())
+    paths = [span for span in code_spans(page) if re.fullmatch(r"[\w.-]+(/[\w.-]+)+/?", span)]
+    own = [path for path in paths if path.split("/")[0] in folders and path.rstrip("/") not in MADE | FOREIGN]
+    assert [path for path in own if not is_there(path.rstrip("/"))] == []
+
+
+@cache
+def words_of_sources() -> set[str]:
+    """All identifiers of the repository's code, tests included, and the names of its files."""
+    files = [path for name in ("gsmerge", "benchmarks", "docs", "tests", "tools", "examples", ".github")
+             for path in (ROOT / name).rglob("*") if path.suffix in SOURCES and path != Path(__file__)]  # fmt: skip
+    texts = [path.read_text("utf-8") for path in (*files, ROOT / "pyproject.toml")]
+    return {path.stem for path in files} | {word for text in texts for word in re.findall(r"\w+", text)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_names_are_in_the_code(page: Path) -> None:
+    """Names with an underscore or a capital inside, which are those of definitions, settings and keys."""
+    spans = [re.sub(r"^--(hint|set) ", "", span) for span in code_spans(page)]
+    names = {name for span in spans for name in re.findall(r"\b(?:[A-Za-z]+_\w+|[A-Z][a-z]+[A-Z]\w+)\b", span)}
+    assert sorted(names - words_of_sources() - FOREIGN) == []

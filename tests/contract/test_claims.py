@@ -1,0 +1,253 @@
+"""Sentences of pages that quote a number have the number that the code has today.
+
+Each row is the text of a page, with its numbers taken from the module that defines them. A number that changes in the
+code, or in the page, or a sentence that is rewritten, fails here.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from gsmerge import plan, types
+from gsmerge.alignment import cameras as cameras_off
+from gsmerge.alignment import layouts, rows_first, score
+from gsmerge.alignment.registration import register
+from gsmerge.compaction import blocks, left_out, new_views, partition, search
+from gsmerge.evidence import colors
+from gsmerge.facts import compare_photos, confirm_depths, exposure, holes, move_poses, scene_size, views
+from gsmerge.fit import outside, photo_sizes, schedule, stage
+from gsmerge.fit import report as fit_report
+from gsmerge.io import bounds, photo_files
+from gsmerge.io.formats import depth_maps, ply
+from gsmerge.kernels.raster import blend
+from gsmerge.kernels.superpixels import bass
+from gsmerge.measure import drawings, error_maps, fog
+from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
+from gsmerge.networks.options import RESIDUAL, SLOTS
+from gsmerge.pages import data, splats
+from gsmerge.pipeline import NEAR_INPUT
+from gsmerge.raster import metrics, photos, tiled_view
+from gsmerge.runtime import estimate, work
+from gsmerge.settings.budget import DEVICES
+from gsmerge.settings.compact import RECIPES
+from gsmerge.settings.extend import ExtendOptions
+from gsmerge.settings.fit import FitOptions, Tuning
+from gsmerge.settings.stages import MAX_CHILDREN, SHARE, MatchOptions
+from gsmerge.stages import sky
+
+ROOT = Path(__file__).parents[2]
+FIT, RATES, PAPER = FitOptions(), Tuning(), RECIPES["paper"]
+DECISIONS, LARGE, NETWORKS = (f"docs/internals/{name}.md" for name in ("decisions", "large-scenes", "networks"))
+COMPACT, CONVERT, EVALUATE, HOW_MANY, PHOTOS, STATES, VIEW, SHARP = (
+    f"docs/guide/{name}.md"
+    for name in ("compact", "convert", "evaluate", "how-many", "photos", "states", "view", "sharp")
+)
+CONVENTIONS, EXPORTERS, FORMATS, REPORT = (
+    f"docs/reference/{name}.md" for name in ("conventions", "exporters", "formats", "report")
+)
+NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+FRACTIONS = {2: "half", 3: "third", 4: "quarter", 5: "fifth", 12: "twelfth"}
+
+
+def percent(share: float) -> str:
+    """A share as pages write it."""
+    return f"{100 * share:.3g} %"
+
+
+def part(share: float) -> str:
+    """A share as a word, such as a quarter."""
+    return FRACTIONS[round(1 / share)]
+
+
+def word(number: int, *, ordinal: bool = False) -> str:
+    """A small number as a word."""
+    return {5: "fifth", 7: "seventh"}[number] if ordinal else NUMBERS[number]
+
+
+def million(number: int) -> str:
+    """A number of millions."""
+    return f"{number / 1e6:g} million"
+
+
+def degree(number: int) -> str:
+    """Gigabytes for a million Gaussians with harmonics of a degree."""
+    return f"{1e-3 * round((estimate.memory_bytes(10**6, num_rest=3 * ((number + 1) ** 2 - 1)) - FIXED) / 1e6):.2f}"
+
+
+FIXED = estimate.memory_bytes(0)
+CLAIMS: dict[str, tuple[str, ...]] = {
+    DECISIONS: (
+        f"It starts with {percent(stage.START)} of the Gaussians, splits those with the largest error"
+        f" {part(schedule.GROWTH)} way, and averages the last {part(RATES.average_share)} of its steps",
+        f"The first {percent(FIT.half_res_part)} of the steps draw a {part(1 / schedule.STRIDE**2)} of the pixels",
+        f"After {percent(RATES.outside_from)} of the steps, every {word(RATES.outside_every, ordinal=True)} step also"
+        " looks at the scene [from outside]",
+        f"{move_poses.SAMPLE_PIXELS:,} pixels of a view are looked up in {word(move_poses.NEIGHBOURS)} neighbours",
+        f"bring the greys together at {word(len(move_poses.SIDES))} sizes",
+        f"for {word(bass.NUM_ROUNDS)} rounds superpixels are split and merged in turn, with {word(bass.NUM_PASSES)}"
+        " label passes after each round",
+        f"variance {100 * bass.COLOUR_DEVIATION:g}², 10^{len(str(int(bass.PRIOR_SHAPE))) - 1} pseudo-observations, mean"
+        f" deviation {100 * bass.MEAN_DEVIATION:g}",
+        f"\N{GREEK SMALL LETTER ALPHA} is {bass.ALPHA:g}",
+    ),
+    LARGE: (
+        f"Scenes of more than {million(plan.WHOLE_GAUSSIANS)} Gaussians with pixels are compacted in blocks of views"
+        f" (`blocks`): one block for every {million(plan.BLOCK_GAUSSIANS)} Gaussians",
+        f"Scenes of more than {plan.WHOLE_VIEWS} views get one block for every {plan.BLOCK_VIEWS} views, if the blocks"
+        f" cut at most a {part(partition.MOST_CUT)}",
+        f"Each block also takes views of its neighbours, a {part(partition.SHARED)} of the number of its own",
+        f"A block asks for up to {'twice' if blocks.MOST_DENSITY == 2 else blocks.MOST_DENSITY} as many superpixels",
+        f"at {blocks.SEAM_RATE:g} times the usual ones, and fall to a tenth",
+        f"{word(blocks.SEAM_LOOKS)} for each photo that shows many of them, or {word(blocks.ROOM_LOOKS)} if at least"
+        f" {part(blocks.MOSTLY_SEAMS)} of all Gaussians are at seams",
+        f"The default takes {plan.EFFORTS['default'].steps} steps for up to {plan.USUAL_VIEWS} views",
+        f"A lost block is done again, up to {word(work.RETRIES)} times",
+        f"| GB per million | {' | '.join(map(degree, range(5)))} |",
+    ),
+    NETWORKS: (
+        f"A correction has {RESIDUAL} columns",
+        f"heads for K = {', '.join(map(str, SLOTS))};",
+        f"| 0.6 MB, {load_checkpoint(IN_PACKAGE['shipped']).networks.num_parameters:,} parameters"
+        f" | 1.0 MB, {load_checkpoint(IN_PACKAGE['paper']).networks.num_parameters:,} parameters |",
+    ),
+    "docs/internals/notebook.md": (
+        f"**Kept**: {plan.EFFORTS['best'].steps} steps for `best`",
+        f"samples for {FIT.half_res_part:g} of the steps".replace(" 0.", " ."),
+        f"a weight that grows from 0 to {RATES.edge_weight:g} over the run",
+        f"(**kept**: every {word(RATES.outside_every, ordinal=True)}, {outside.PLACES})",
+        f"no fit from {NEAR_INPUT:g} dB on",
+        f"step sizes {plan.RENDERS_STEPS:g} times the usual",
+    ),
+    COMPACT: (
+        f"--effort draft`: {plan.EFFORTS['draft'].steps} steps, no merging across views",
+        f"--effort fast`: {plan.EFFORTS['fast'].steps} steps",
+        f"--effort best`: {plan.EFFORTS['best'].steps} steps",
+        f"An estimate needs {word(left_out.LEAST_VIEWS)} photos, a result of at most {percent(new_views.MOST_SHARE)} of"
+        " the Gaussians",
+        f"If they confirm less than {part(confirm_depths.POOR)} of it, the result will be poor",
+        f"shows its photos more than {metrics.MAX_LOSS:g} dB worse than the input".replace(" 0.", " ."),
+        f"They show the photos at most {plan.KEPT_LOSS:g} dB worse than it does",
+        f"at least {plan.KEPT_PSNR:g} dB against the input's",
+        f"moved by up to {cameras_off.MAX_PX:g} pixels",
+        f"With more than {word(plan.USUAL_VIEWS)} views the fit takes more steps. Scenes of more than"
+        f" {million(plan.WHOLE_GAUSSIANS)} Gaussians or {plan.WHOLE_VIEWS} views are compacted in blocks",
+        f"a quarter of {word(views.REPORT_VIEWS)} photos, of {word(plan.EFFORTS['draft'].report_views)} in drafts",
+    ),
+    CONVERT: (
+        f"at the upper border of at least {word(sky.LEAST_VIEWS)} photos and a {part(sky.LEAST_SHARE)} of all",
+        f"{word(int(sky.FAR))} times as far away as the rest",
+        f"below 1/{1 / FIT.min_contribution:g} in every picture",
+    ),
+    EVALUATE: (
+        f"of the {word(error_maps.NEIGHBORS)} nearest",
+        f"yellow is {error_maps.MOST:g} of the range or more",
+        f"They start from {word(fog.VIEWS)} input views",
+        f"have at most {fog.SIDE} pixels on the longer side",
+        f"its opacity is below {fog.EMPTY:g} in the whole square of {fog.MARGIN} x {fog.MARGIN} pixels around",
+        f"those whose mean depth in the result is below {fog.VEIL:g} of the input's",
+        f"with an opacity above {fog.SOLID:g} in the input: those with one below {fog.OPEN:g} in the result",
+        f"Such a Gaussian is at least {word(int(fog.RATIOS[0]))} times as long as its second axis",
+        f"it is longer than {percent(fog.LONG)} of the width",
+        f"There are up to {outside.PLACES} of them, or as many as photos if these are more",
+        f"steps back by {outside.LOW[0]:g} d to {outside.HIGH[0]:g} d",
+        f"Far fog above {fit_report.HAZE:g} and worst veils above {fog.VEILED:g} are plain to see",
+    ),
+    HOW_MANY: (
+        f"gsmerge keeps at most {SHARE.replace('%', ' %')} of a scene",
+        f"at most what the device draws fluidly: {', '.join(f'{count:,}' for count in DEVICES.values())}",
+        f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {plan.LONE_K} for a single",
+        f"counts PSNR plus {search.SSIM_DB:g} dB times SSIM",
+        f"That is {percent(confirm_depths.MOST)} of the input if other views confirm at least"
+        f" {percent(confirm_depths.SOUND)} of the depth. It falls to {percent(confirm_depths.FEWEST)} if they confirm"
+        f" {percent(confirm_depths.WRONG)} or less",
+        f"tries up to {word(search.MAX_TRIED)} numbers, or {word(search.MAX_RUNS)} where no photo is left out",
+        f"With {word(left_out.LEAST_VIEWS)} views or more, both leave out some views",
+    ),
+    PHOTOS: (
+        f"differs by {colors.STEP:g} of the range, averaged over {len(compare_photos.WINDOW)} x"
+        f" {len(compare_photos.WINDOW)} pixels",
+        f"at least {photo_sizes.MIN_AUTO_SCALE:g} times as many pixels a side",
+        f"narrower than a {part(holes.LARGE)} of the picture",
+        f"less than {percent(holes.PART)} of the picture",
+        f"exposures differ by more than {percent(exposure.DIFFERENT)} at random",
+        f"at least a {part(1 - exposure.NEARER)} closer",
+        f"A white pixel counts as {word(int(types.PROTECTED))}",
+    ),
+    STATES: (f"those of at most {ExtendOptions().max_views} views",),
+    VIEW: (
+        f"more than {splats.MAX_GAUSSIANS:,} Gaussians",
+        f"Of more than {data.MAX_VIEWS} views",
+        f"or {' x '.join(map(str, drawings.PLACED_SIZE))} without cameras",
+        f"at most {drawings.GIF_SIDE} pixels a side",
+        f"a second shows {drawings.FPS:g} of them, or {drawings.GIF_FPS:g} of a GIF",
+    ),
+    SHARP: (f"Each photo needs {register.MIN_MATCHES} points in common with another one",),
+    CONVENTIONS: (
+        f"a low-pass of {tiled_view.EPS2D:g} square pixels on every footprint",
+        f"none is above {blend.MAX_ALPHA:g}",
+        f"a Gaussian window of {metrics.WINDOW} x {metrics.WINDOW} pixels, sigma {metrics.SIGMA:g}",
+        f"larger than a {part(scene_size.LARGE)} of the scene",
+        f"base colours are beyond {scene_size.BRIGHT:g}",
+        f"logits of opacities (within +-{ply.MAX_LOGIT:g})",
+    ),
+    EXPORTERS: (
+        f"is at most {part(rows_first._PLAIN_PX)} a pixel in every view",
+        f"{', '.join(map(str, layouts.PER_PIXEL[:-1]))} or {layouts.PER_PIXEL[-1]} Gaussians per pixel",
+        f"the nearest {percent(layouts.DEPTH_SHARE)} of each view",
+        f"lie within {score.MAX_MEDIAN_PX:g} pixels of their pixels (median), and {word(int(score.SHUFFLED_MARGIN))}"
+        " times as close as with shuffled pixels",
+        f"up to {cameras_off.MAX_PX:g} pixels off (median; {percent(cameras_off.MAX_SHARE)} of the side",
+    ),
+    FORMATS: (
+        f"a ball of {depth_maps.SIGMA:g} pixels and opacity {depth_maps.OPACITY:g}",
+        f"harmonics of degree 0 to {ply.MAX_READ_DEGREE}",
+        f"which is {ply.THIN:g} of the smaller one",
+        f"may hold {bounds.MAX_FILES:,} files and folders",
+    ),
+    REPORT: (
+        f"of up to {views.MAX_SCORED_VIEWS} views with `--quality`",
+        f"null if it covers {percent(photos.WHOLE)} or more",
+        f"less than {metrics.POOR:g} dB from its input",
+        f"(at most {metrics.MAX_PSNR:g}, for equal pictures)",
+        f"`psnr_kept` ({plan.KEPT_PSNR:g}) or `loss_kept` ({plan.KEPT_LOSS:g})",
+    ),
+    "SECURITY.md": (
+        f"{bounds._FREE_MEMORY / 1e6:g} MB + {bounds._MEMORY_PER_BYTE} x its bytes of memory",
+        f"{20e-6 * bounds._FREE_STEPS:g} s + {20 / bounds._BYTES_PER_STEP:g} s per MB of processor time",
+        f"64 MB + {photo_files._MEMORY_PER_BYTE} x its bytes",
+        f"{photo_files._FREE_PHOTOS / 1e6:g} MB + {photo_files._PHOTOS_PER_BYTE} x their bytes",
+    ),
+    "docs/results.md": (
+        f"Boxes reach to one standard deviation. They match from an IoU of {MatchOptions().iou:g} on, latents from a"
+        f" cosine of {MatchOptions().similarity:g} on",
+        f"{str(PAPER['superpixels']).replace('%', ' %')} superpixels before merging",
+    ),
+}
+
+
+@cache
+def words_of(page: str) -> str:
+    """The text of a page in one line."""
+    return " ".join((ROOT / page).read_text("utf-8").split())
+
+
+def missing(text: str, quotes: tuple[str, ...]) -> list[str]:
+    """The quotes that a text does not have; a number goes on no further than in its quote."""
+    return [quote for quote in quotes if not re.search(rf"(?<![\d.,]){re.escape(quote)}(?!\d)", text)]
+
+
+@pytest.mark.parametrize("page", CLAIMS)
+def test_numbers_of_pages_are_those_of_the_code(page: str) -> None:
+    assert missing(words_of(page), CLAIMS[page]) == []
+
+
+@pytest.mark.parametrize("page", CLAIMS)
+def test_another_number_is_seen(page: str) -> None:
+    """A page in which each number is another one has none of the quotes with digits."""
+    quotes = tuple(quote for quote in CLAIMS[page] if re.search(r"\d", quote))
+    falsified = re.sub(r"\d+", lambda number: str(int(number[0]) + 1), words_of(page))
+    assert missing(falsified, quotes) == list(quotes)
