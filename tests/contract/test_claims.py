@@ -29,7 +29,6 @@ from gsmerge.measure import drawings, error_maps, fog
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
 from gsmerge.pages import data, splats
-from gsmerge.pipeline import NEAR_INPUT
 from gsmerge.raster import metrics, photos, tiled_view
 from gsmerge.runtime import estimate, work
 from gsmerge.settings.budget import DEVICES
@@ -38,6 +37,7 @@ from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.fit import FitOptions, Tuning
 from gsmerge.settings.stages import MAX_CHILDREN, SHARE, MatchOptions
 from gsmerge.stages import sky
+from gsmerge.stages.fit_pairs import NEAR_INPUT
 
 ROOT = Path(__file__).parents[2]
 FIT, RATES, PAPER = FitOptions(), Tuning(), RECIPES["paper"]

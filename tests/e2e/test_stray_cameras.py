@@ -70,9 +70,8 @@ def test_photos_that_do_not_show_the_scene_are_a_doubt_too(smallest_copy: Path, 
     assert outcome.err == f"{ERROR}{note}\n"
     words = ("batch", smallest_copy, "-o", smallest_copy.parent / "out", *FEW[:2], "--set", "fit=none", *FEW[4:])
     assert note in run(*words, code=0).out
-    assert run(*words, "--strict", code=4).err.endswith(
-        "1 of 1 scenes have cameras or photos beside them of other scenes\n"
-    )
+    expected = "1 of 1 scenes have cameras or photos beside them of other scenes\n"
+    assert run(*words, "--strict", code=4).err.endswith(expected)
 
 
 @pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")], ids=str)
