@@ -396,7 +396,7 @@ def build_section(run: Run) -> str:
             "As a test, patches of the photos stay out of the first steps, which draw a quarter of the pixels:",
             f"the PSNR of the patches rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
             say(
-                "so the fit is accepted. Otherwise colours alone would be fitted.",
+                "so the fit is accepted.",
                 report.accepted and report.method == "full",
             ),
         ),
@@ -415,7 +415,7 @@ def result_section(run: Run) -> str:
         "## 5. make_result: what comes out",
         text(
             "[`compaction/result.py`](../../gsmerge/compaction/result.py) moves the Gaussians back into the world of",
-            "the file, and measures result and input alike.",
+            "the file, and measures both.",
         ),
         "\n".join([
             entry("result.gaussians.means", gaussians.means, child),
@@ -432,7 +432,7 @@ def result_section(run: Run) -> str:
             ),
             "The fit has seen these photos, so the report also estimates the gain in views that no photo shows. For",
             say(
-                "this it makes runs that leave photos out. A warning would follow if the result were worse.",
+                "this it makes runs that leave photos out.",
                 report.worse is None and new.low > 0,
             ),
         ),
