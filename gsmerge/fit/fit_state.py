@@ -44,12 +44,15 @@ class FitState:
         rows = np.flatnonzero(~region.contains(self.x[:, :SIZE]) & ~self.fixed)
         self.x[rows, :SIZE] = self.splats.means[rows] = region.clamp(self.x[rows, :SIZE])
 
+    def update_harmonics(self) -> None:
+        """Bring ``splats.sh0`` up to date with the base colours, in place, if there are higher harmonics."""
+        if self.splats.shN.shape[1] > 0:
+            np.divide(self.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=self.splats.sh0)
+
     def view_colors(self) -> np.ndarray | None:
         """Return the colours for the rasterizer; None if it evaluates the harmonics, which are updated first."""
-        if self.splats.shN.shape[1] == 0:
-            return self.colors
-        np.divide(self.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=self.splats.sh0)
-        return None
+        self.update_harmonics()
+        return self.colors if self.splats.shN.shape[1] == 0 else None
 
 
 def start_state(gaussians: Gaussians) -> FitState:

@@ -195,7 +195,7 @@ class Step:
     mode: DrawMode
     view: int
     background: np.ndarray  # [3] float32
-    kept: np.ndarray | None  # [n] bool, the Gaussians that dropout leaves in; None: all
+    mask: np.ndarray | None  # [n] bool, Gaussians that are drawn; dropout leaves out the others; None: all are drawn
     sample: Sample = WHOLE_PHOTO  # The pixels of the photo that are drawn
 
 
@@ -215,17 +215,17 @@ class Schedule:
         """Draw step ``number`` (from 1) for ``count`` Gaussians; every view comes once per round."""
         if not self.queue:
             self.queue = self.rng.permutation(len(self.run.job.photos[0])).tolist()
-        view, background, kept = self.queue.pop(), self.rng.random(3, dtype=np.float32), None
+        view, background, mask = self.queue.pop(), self.rng.random(3, dtype=np.float32), None
         job = self.run.job
         if job.num_judged is not None and job.photos[0].empty is None:  # renders are black where the scene is empty
             background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
-            kept = self.rng.random(count, dtype=np.float32) >= self.run.dropout
+            mask = self.rng.random(count, dtype=np.float32) >= self.run.dropout
         mode, sample = self.run.draw_mode(number, progress), WHOLE_PHOTO
         if mode.stride > 1:
             sample = Sample(mode.stride, *OFFSETS[self.turns[view] % len(OFFSETS)])
             self.turns[view] += 1
-        return Step(number, progress, mode, view, background, kept, sample)
+        return Step(number, progress, mode, view, background, mask, sample)
 
 
 def loss_weights(rates: Tuning, progress: float) -> tuple[float, float]:
