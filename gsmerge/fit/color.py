@@ -1,8 +1,8 @@
-"""Gaussians -> fitted Gaussians: colours that reproduce the input photos best.
+"""Fit the colours of Gaussians to the photos.
 
-With geometry, opacity and order fixed, every pixel is linear in the colours, so the best ones solve
-a sparse linear system whose matrix is one splat and one transposed splat; a few preconditioned
-conjugate-gradient steps do.
+While geometry, opacities and order stay, every pixel is linear in the colours. So the best colours solve a sparse
+linear system, whose matrix is one splat and one transposed splat. A few preconditioned conjugate-gradient steps are
+enough.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Gaussians
 
 MAX_RETRIES = 2
-HOLDOUT = 4  # times the share: the last steps see everything, and a small sample misjudges a scene of few views
+# Factor on the share of held-out patches: few patches would misjudge a scene of few views, and the last steps use all
+HOLDOUT = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,7 @@ class ColorSystem:
     train: list[np.ndarray]  # [h,w] of every view: 0 on the held-out patches, 1 elsewhere
     weights: list[np.ndarray]  # [h,w] of the pixels of every view
     gains: np.ndarray  # [v,3] exposures
-    precision: np.ndarray | float  # [n,1] prior added to the diagonal, by which earlier photos pull offsets to 0; or 0
+    precision: np.ndarray | float  # [n,1] prior of earlier photos on offsets of 0, added to the diagonal; or 0
 
     def _image(self, view: int, x: np.ndarray) -> np.ndarray:
         return self.drawn.images[view] + apply(self.drawn.views[view], x)

@@ -1,6 +1,6 @@
-"""Edges of the views, at which a fit cuts its Gaussians: nothing says how far they reach beyond.
+"""Edges of the views, at which a fit cuts its Gaussians, since no photo says how far they reach beyond.
 
-What crosses the edges of all views hangs around the scene as a soft rim, and as clouds, for whoever steps back.
+To a viewer who steps back, Gaussians across the edges of all views are a soft rim and clouds around the scene.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from gsmerge.pooling import principal_axes
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
-# Distances from one Gaussian to the next by which the edges are moved out, if the Gaussians of the result were spread
-# evenly over all photos: border pixels show those that are centred beside them, too
+# How far the edges are moved out, in distances from one Gaussian to the next if the result were spread evenly over all
+# photos. Border pixels also show Gaussians that are centred outside of the picture
 MARGIN = 2.0
 ROWS = 16384  # Gaussians per piece of work
 
@@ -44,16 +44,16 @@ def find_edges(cameras: Cameras, count: int) -> Edges:
     right, bottom = ((size + margin - middles) / focals).T
     zero, one = np.zeros(num), np.ones(num)
     sides = (-one, zero, left), (one, zero, -right), (zero, -one, top), (zero, one, -bottom)
-    seen = np.stack([np.stack(side, 1) for side in sides], 1)  # by the camera
-    seen /= np.sqrt((seen**2).sum(2, keepdims=True))
-    normals = np.stack([matmul(some, viewmat[:3, :3]) for some, viewmat in zip(seen, viewmats, strict=True)])
+    local = np.stack([np.stack(side, 1) for side in sides], 1)  # in the camera's axes
+    local /= np.sqrt((local**2).sum(2, keepdims=True))
+    normals = np.stack([matmul(rows, viewmat[:3, :3]) for rows, viewmat in zip(local, viewmats, strict=True)])
     return Edges(normals, (normals * camera_centres(viewmats)[:, None]).sum(2))
 
 
 def cut_state(state: FitState, edges: Edges) -> None:
     """Cut the Gaussians of a state at the edges of all views, in place, except those that are fixed.
 
-    The limits of their means are about what is left, those of their scales stay.
+    The limits of their means move to the centres of what is left; those of their scales stay.
     """
     splats, x = state.splats, state.x
     means, covars, is_cut = splats.means.copy(), np.empty((len(x), 3, 3)), np.zeros(len(x), np.uint8)
@@ -68,6 +68,6 @@ def cut_state(state: FitState, edges: Edges) -> None:
     sizes = np.maximum(log(scales), state.min_sizes[rows, None])
     x[rows, :SIZE], x[rows, SIZE:QUAT], x[rows, QUAT:LOGIT] = means[rows], sizes, quats
     state.x0[rows, :SIZE] = means[rows]
-    state.x0[rows, SIZE:QUAT] = np.sort(state.x0[rows, SIZE:QUAT], 1)  # as those of the new axes, which rise
-    state.m[rows, :LOGIT] = 0  # it was along other axes
+    state.x0[rows, SIZE:QUAT] = np.sort(state.x0[rows, SIZE:QUAT], 1)  # as the scales of the new axes rise
+    state.m[rows, :LOGIT] = 0  # momentum was along the old axes
     splats.means[rows], splats.scales[rows], splats.quats[rows] = means[rows], exp(x[rows, SIZE:QUAT]), quats

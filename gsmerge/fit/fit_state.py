@@ -12,7 +12,7 @@ from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.raster import Splats
 from gsmerge.types import SH_C0, Gaussians
 
-# What rows of a state carry along, beside what follows from their parameters
+# What rows of a state carry along in addition to what follows from their parameters
 CARRIED = ("x0", "m", "v", "units", "box_shares", "min_sizes", "origins", "fixed")
 
 
@@ -27,29 +27,32 @@ class FitState:
     units: np.ndarray  # [n] size: geometric mean of the two largest scales at the start
     box_shares: np.ndarray  # [n] share of the box about the start for means and scales
     min_sizes: np.ndarray  # [n] least log scale of each Gaussian
-    origins: np.ndarray  # [n] row of the start that each comes from
-    fixed: np.ndarray  # [n] bool, whether it stays as it is
+    origins: np.ndarray  # [n] row of the start that each Gaussian comes from
+    fixed: np.ndarray  # [n] bool, whether each Gaussian stays as it is
     splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
-    colors: np.ndarray  # [n,3] base colours
+    colors: np.ndarray  # [n,3] base colours, sRGB
 
     def __getitem__(self, rows: np.ndarray) -> FitState:
         """Return the state of some Gaussians, by mask or by row."""
-        kept = state_of(self.x[rows], self.splats.shN[rows])
+        state = state_of(self.x[rows], self.splats.shN[rows])
         for name in CARRIED:
-            setattr(kept, name, getattr(self, name)[rows])
-        return kept
+            setattr(state, name, getattr(self, name)[rows])
+        return state
 
     def keep_inside(self, region: Region) -> None:
         """Move centres outside of a region to its border, in place, except those of fixed Gaussians."""
         rows = np.flatnonzero(~region.contains(self.x[:, :SIZE]) & ~self.fixed)
         self.x[rows, :SIZE] = self.splats.means[rows] = region.clamp(self.x[rows, :SIZE])
 
+    def update_harmonics(self) -> None:
+        """Bring ``splats.sh0`` up to date with the base colours, in place, if there are higher harmonics."""
+        if self.splats.shN.shape[1] > 0:
+            np.divide(self.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=self.splats.sh0)
+
     def view_colors(self) -> np.ndarray | None:
         """Return the colours for the rasterizer; None if it evaluates the harmonics, which are updated first."""
-        if self.splats.shN.shape[1] == 0:
-            return self.colors
-        np.divide(self.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=self.splats.sh0)
-        return None
+        self.update_harmonics()
+        return self.colors if self.splats.shN.shape[1] == 0 else None
 
 
 def start_state(gaussians: Gaussians) -> FitState:

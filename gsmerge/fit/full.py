@@ -1,26 +1,26 @@
-"""Gaussians -> fitted Gaussians: a short optimisation of all parameters, confined to a box about the start.
+"""Fit all parameters of Gaussians to photos, by a short optimisation that is confined to a box about the start.
 
-One view per step: L1 of pixels and of their differences, and structural similarity, on a random
-background, samples of the photos' pixels first, Adam with rates in units of each Gaussian's own size. Longer runs
-begin with fewer Gaussians than they may have and spend the rest where the error is.
+Each step draws one view over a random background. Its loss is the L1 of pixels and of their differences, and structural
+similarity. Adam's rates are in units of each Gaussian's own size. The first steps draw samples of the photos' pixels.
+Long runs begin with fewer Gaussians than they may have, and add the rest where the error is.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsmerge.fit.averages import RecentMean, TailMean
 from gsmerge.fit.edges import cut_state
 from gsmerge.fit.fit_state import FitState, gaussians_of, start_state
 from gsmerge.fit.growth import FAINT, drop_faint, grow_to
 from gsmerge.fit.report import TIME_SPENT, FitReport, FitResult
-from gsmerge.fit.schedule import CLEARS, CUTS, GROWTH, PROBE, FitRun, Schedule, affordable_steps, begins
-from gsmerge.fit.steps import make_optimiser
+from gsmerge.fit.schedule import CLEARS, CUTS, GROWTH, PROBE, FitRun, Schedule, affordable_steps
+from gsmerge.fit.steps import Optimiser, make_optimiser
 from gsmerge.fit.survey import Survey, score_state, survey_photos
 from gsmerge.kernels.elementary import log
-from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.raster.metrics import decibels
 from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import Tuning
@@ -32,102 +32,154 @@ def fit_full(
 ) -> FitResult:
     """Fit all parameters of Gaussians to the photos of a run.
 
-    The result after the first steps is kept if it beats the start on held-out patches; otherwise the start is
-    returned. The full-size steps then use every patch. ``survey``: survey of the Gaussians, if made already; ``fixed``:
-    mask ``[n]`` of Gaussians that stay unchanged.
+    Held-out patches are scored once the first steps are done. If they are no better than at the start, the start is
+    returned; otherwise the other steps follow, which use every patch.
+
+    Args:
+        gaussians: The n Gaussians to start from.
+        run: Photos and options.
+        survey: Survey of the Gaussians; None: it is made here.
+        fixed: ``[n]`` bool, Gaussians that stay unchanged; None: none.
+
+    Returns:
+        The fitted Gaussians, or the start itself, and a report.
     """
-    job, options, schedule, tail = run.job, run.job.options, Schedule(run), TailMean()
+    fit = start_fit(gaussians, run, survey, fixed)
+    while fit.step < fit.steps:
+        if fit.progress >= run.half_part:  # before it grows: halves that were never fitted show less
+            score_fit(fit)
+        if fit.is_refused:
+            break
+        renew_state(fit)
+        take_step(fit)
+        keep_to_time(fit)
+        report_step(fit)
+    score_fit(fit)
+    return end_fit(fit, gaussians)
+
+
+@dataclass(eq=False)
+class FullFit:
+    """A full fit that is under way."""
+
+    run: FitRun
+    optimiser: Optimiser
+    schedule: Schedule
+    state: FitState
+    before: float  # PSNR (dB) of the held-out patches at the start
+    steps: int  # Steps to take; a time budget may change their number
+    after: float | None = None  # PSNR (dB) of the held-out patches after the first steps; None: not scored
+    step: int = 0  # Steps taken
+    last: float = -1.0  # Progress at which the last step was taken; -1 before the first step
+    error: RecentMean = field(default_factory=RecentMean)  # Mean squared error, which progress shows
+    tail: TailMean = field(default_factory=TailMean)  # Parameters over the last steps
+    started: float = field(default_factory=time.perf_counter)  # Time of the start, seconds
+
+    @property
+    def progress(self) -> float:
+        """The share of the steps that are taken."""
+        return self.step / self.steps
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether held-out patches were scored and are no better than at the start."""
+        return self.after is not None and self.after <= self.before
+
+    @property
+    def half(self) -> Photos:
+        """The photos at half size, at the poses that the fit has reached."""
+        return self.optimiser.photos[1]
+
+    def reaches(self, *parts: float) -> bool:
+        """Return whether the next step is the first one at or after one of the ``parts`` of the run."""
+        return any(self.last < part <= self.progress for part in parts)
+
+
+def start_fit(gaussians: Gaussians, run: FitRun, survey: Survey | None, fixed: np.ndarray | None) -> FullFit:
+    """Return a full fit before its first step."""
     state, optimiser = start_state(gaussians), make_optimiser(run)
     if fixed is not None:
         state.fixed[:] = fixed
     survey = survey_photos(gaussians, run) if survey is None else survey
-    state.box_shares[:], state.min_sizes[:] = limit_moves(survey, options.tuning)
-    half, judged = optimiser.photos[1], not options.judged
-    before = after = survey.score
-    step, steps, last, error, grows, looks = 0, options.steps, -1.0, 0.0, options.grows, 0
-    started = time.perf_counter()
-    while step < steps:
-        part = step / steps
-        if part >= run.half_part and not judged:  # before growth: halves that were never fitted show less
-            after, judged = score_state(state, run, half), True
-            if after <= before:
-                break
-        if grows and begins((*CLEARS, *CUTS, GROWTH), last, part):
-            state, tail = renew_state(state, run, half, last, part), TailMean()
-        drawn = schedule.draw(step + 1, part, len(state.x))
-        looks = 1 if begins((run.half_part,), last, part) else min(looks + 1, 10)  # anew with photos of full size
-        error += (optimiser.step(state, drawn) - error) / looks
-        step, last = step + 1, part
-        outside_view = run.outside_view(step, part)
-        if outside_view is not None:
-            optimiser.clear_veils(state, drawn, outside_view)
-        if job.region is not None:
-            state.keep_inside(job.region)
-        if step > steps * (1 - options.tuning.average_share):
-            tail.add(state.x)
-        if options.time_budget is not None and step == PROBE:
-            steps = affordable_steps(time.perf_counter() - started, run)
-        if job.progress:
-            job.progress(step, steps, decibels(error), run.half_part)
-    if not judged:
-        after = score_state(state, run, half)
-    if options.judged and after <= before:
-        why = f"held-out patches of the photos were no better after {step} steps"
-        return gaussians, FitReport("none", False, step, before, after, why, origins=np.arange(len(gaussians)))
-    if grows and last < GROWTH:  # a time budget may end before the growth
-        state = grow_to(state, half, job.count)
-    why = TIME_SPENT if options.time_budget is not None else "all steps done"
-    fitted = gaussians_of(tail.of(state.x), state.splats.shN)
-    return fitted, FitReport("full", True, step, before, after, why, optimiser.viewmats, origins=state.origins)
+    state.box_shares[:], state.min_sizes[:] = limit_moves(survey, run.job.options.tuning)
+    return FullFit(run, optimiser, Schedule(run), state, survey.score, run.job.options.steps)
 
 
-def renew_state(state: FitState, run: FitRun, half: Photos, before: float, now: float) -> FitState:
-    """Grow a state, drop its faint Gaussians and cut it at the views' edges, as is due between two parts of a run.
+def score_fit(fit: FullFit) -> None:
+    """Score a fit on held-out patches, unless it is scored already or none are held out."""
+    if fit.after is None and fit.run.job.options.judged:
+        fit.after = score_state(fit.state, fit.run, fit.half)
 
-    Rows and axes then mean others than before.
+
+def renew_state(fit: FullFit) -> None:
+    """Grow the state, drop its faint Gaussians, and cut it at the edges of the views, where each is due.
+
+    Its rows and axes then have another meaning, so the mean of the last steps begins anew.
     """
-    job, options = run.job, run.job.options
-    if begins((GROWTH,), before, now):
-        state = grow_to(state, half, job.count)
-    if job.fixed is None and options.min_contribution > 0 and begins(CLEARS, before, now):
-        state = grow_to(state, half, job.count, FAINT) if options.fills else drop_faint(state, FAINT)
-    if job.edges is not None and begins(CUTS, before, now):
-        cut_state(state, job.edges)
-    return state
+    job, options = fit.run.job, fit.run.job.options
+    if not options.grows or not fit.reaches(GROWTH, *CLEARS, *CUTS):
+        return
+    if fit.reaches(GROWTH):
+        fit.state = grow_to(fit.state, fit.half, job.count)
+    if fit.reaches(*CLEARS) and job.fixed is None and options.min_contribution > 0:
+        fit.state = grow_to(fit.state, fit.half, job.count, FAINT) if options.fills else drop_faint(fit.state, FAINT)
+    if fit.reaches(*CUTS) and job.edges is not None:
+        cut_state(fit.state, job.edges)
+    fit.tail = TailMean()
+
+
+def take_step(fit: FullFit) -> None:
+    """Take a step on a photo, and one on a view from outside where it is due."""
+    run, progress = fit.run, fit.progress
+    step = fit.schedule.draw(fit.step + 1, progress, len(fit.state.x))
+    if fit.reaches(run.half_part):  # whole photos have another error than samples
+        fit.error.restart()
+    fit.error.add(fit.optimiser.step(fit.state, step))
+    outside_view = run.outside_view(step.number, progress)
+    if outside_view is not None:
+        fit.optimiser.clear_veils(fit.state, step, outside_view)
+    if run.job.region is not None:
+        fit.state.keep_inside(run.job.region)
+    fit.step, fit.last = step.number, progress
+    if fit.step > fit.steps * (1 - run.job.options.tuning.average_share):
+        fit.tail.add(fit.state.x)
+
+
+def keep_to_time(fit: FullFit) -> None:
+    """Choose the number of steps by the time that the first ``PROBE`` steps took, if there is a time budget."""
+    if fit.run.job.options.time_budget is not None and fit.step == PROBE:
+        fit.steps = affordable_steps(time.perf_counter() - fit.started, fit.run)
+
+
+def report_step(fit: FullFit) -> None:
+    """Report progress after a step."""
+    if fit.run.job.progress:
+        fit.run.job.progress(fit.step, fit.steps, decibels(fit.error.mean), fit.run.half_part)
+
+
+def end_fit(fit: FullFit, start: Gaussians) -> FitResult:
+    """Return the result of a fit, which is the ``start`` if held-out patches got no better, and a report."""
+    options, after = fit.run.job.options, fit.before if fit.after is None else fit.after
+    if fit.is_refused:
+        why = f"held-out patches of the photos were no better after {fit.step} steps"
+        rows = np.arange(len(start))
+        return start, FitReport("none", False, fit.step, fit.before, after, why, origins=rows)
+    state = fit.state
+    if options.grows and fit.last < GROWTH:  # a time budget may end before the growth
+        state = grow_to(state, fit.half, fit.run.job.count)
+    why = TIME_SPENT if options.time_budget is not None else "all steps done"
+    fitted, viewmats = gaussians_of(fit.tail.of(state.x), state.splats.shN), fit.optimiser.viewmats
+    return fitted, FitReport("full", True, fit.step, fit.before, after, why, viewmats, origins=state.origins)
 
 
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
     """Return the share ``[n]`` of its box that each Gaussian may use, and its least log scale ``[n]``.
 
-    The share lies between ``single_view_share`` and 1, by the effective number of photos that show the Gaussian: (sum
-    w)^2 / sum w^2 of its blending weights w in the photos. The least scale is ``min_scale`` pixels of the largest photo
-    that shows it nearest (the 3D filter of Mip-Splatting); there is none if no photo shows it.
+    The share is the effective number of photos that show the Gaussian, less 1, between ``single_view_share`` and 1. For
+    its blending weights w in the photos this number is (sum w)^2 / sum w^2. The least scale is ``min_scale`` pixels of
+    the largest photo that shows the Gaussian from nearest (the 3D filter of Mip-Splatting), and none if no photo does.
     """
     photos_each = survey.sums**2 / np.maximum(survey.squares, 1e-12)
     box_shares = np.clip(photos_each - 1, rates.single_view_share, 1).astype(np.float32)
     pixels = np.where(np.isfinite(survey.pixels), survey.pixels, 0)
     return box_shares, log(rates.min_scale * pixels).astype(np.float32)
-
-
-@dataclass
-class TailMean:
-    """Mean of the parameters ``[n,14]`` over the last steps, which are noisy."""
-
-    total: np.ndarray | None = None
-    count: int = 0
-
-    def add(self, x: np.ndarray) -> None:
-        """Add the parameters after a step; start anew if the number of Gaussians has changed."""
-        if self.total is None or len(self.total) != len(x):
-            self.total, self.count = 0 * x, 0
-        self.count += 1
-        self.total += x
-
-    def of(self, x: np.ndarray) -> np.ndarray:
-        """Return the mean with normalised quaternions; ``x`` itself without steps with this number of Gaussians."""
-        if self.total is None or len(self.total) != len(x):
-            return x
-        mean = self.total / self.count
-        quats = mean[:, QUAT:LOGIT]
-        quats /= (quats * quats).sum(1)[:, None] ** 0.5
-        return mean

@@ -1,4 +1,4 @@
-"""Growth of the Gaussians under optimisation: those with the largest errors are halved."""
+"""Add Gaussians to those under optimisation by splitting the ones with the largest errors."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from gsmerge.raster import composite, splat_adjoint, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import in_turn
 
-OFFSET = 0.7  # of the halves from the middle, in standard deviations; their own shrinks so that the sum keeps its own
-FADED = 0.005  # opacity that is as good as none; halves of what has more have at least 1 / 255, which renderers draw
-FAINT = 0.02  # opacity of Gaussians that late in a run are on their way to none: without them it takes .9 of the time
-DEPTH = 0.8  # of the halves' optical depth: two narrower ones with 0.7 would cover the same, a little more closes gaps
+# Distance of halves from the middle of their parent, in its standard deviations. Those of the halves shrink so that the
+# pair has the parent's
+OFFSET = 0.7
+FADED = 0.005  # opacity that counts as none; halves of more opaque Gaussians have 1 / 255 or more, so they are drawn
+FAINT = 0.02  # opacity of Gaussians that late in a run will fade away; without them the run takes .9 of the time
+# Optical depth of a half, as a share of its parent's. Halves are narrower, so that two of 0.7 cover as much as the
+# parent; a little more closes gaps
+DEPTH = 0.8
 
 
 def drop_faint(state: FitState, least: float) -> FitState:
-    """Drop the Gaussians with an opacity below ``least``; of a faint scene most stay."""
+    """Drop the Gaussians with an opacity below ``least``, or below the median if that is less, as in a faint scene."""
     opacities = state.splats.opacities
     return state[opacities >= min(least, float(lower_median(opacities)))] if len(opacities) else state
 
@@ -27,7 +31,7 @@ def drop_faint(state: FitState, least: float) -> FitState:
 def grow_to(state: FitState, half: Photos, count: int, least: float = FADED) -> FitState:
     """Drop Gaussians with an opacity below ``least``, then split others until there are ``count``.
 
-    There are fewer where no visible one is left to split. ``half``: the half-size photos, whose errors decide which
+    There are fewer if no visible Gaussian is left to split. The errors of the half-size photos ``half`` decide which
     Gaussians are split.
     """
     state = drop_faint(state, least)
@@ -49,34 +53,38 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
     num = min(count - len(state.x), int((masses > 0).sum()))
     if num <= 0:
         return state, masses
-    picked = np.sort(np.argsort(-masses, kind="stable")[:num])
-    parents, rows = state.x[picked], np.arange(num)
+    worst = np.sort(np.argsort(-masses, kind="stable")[:num])
+    parents, rows = state.x[worst], np.arange(num)
     longest = parents[:, SIZE:QUAT].argmax(1)
     reach = OFFSET * exp(parents[rows, SIZE + longest])
     rotations = quat_to_rotmat(parents[:, QUAT:LOGIT])
     shift = rotations[rows, :, longest] * reach[:, None]
     halves = parents.copy()
     halves[rows, SIZE + longest] += 0.5 * log(1 - OFFSET**2)
-    clear = 1 / (1 + exp(halves[:, LOGIT].astype(np.float64)))  # 1 - opacity
-    halves[:, LOGIT] = log(1 / power(clear, DEPTH) - 1)
+    transmittances = 1 / (1 + exp(halves[:, LOGIT].astype(np.float64)))  # 1 - opacity
+    halves[:, LOGIT] = log(1 / power(transmittances, DEPTH) - 1)
     x = np.concatenate([state.x, halves])
-    x[picked] = halves
-    x[picked, :3] -= shift
+    x[worst] = halves
+    x[worst, :3] -= shift
     x[len(state.x) :, :3] += shift
-    source = np.concatenate([np.arange(len(state.x)), picked])
+    source = np.concatenate([np.arange(len(state.x)), worst])
     grown = state_of(x, state.splats.shN[source])
-    old = np.ones(len(x), bool)
-    old[picked] = old[len(state.x) :] = False
-    grown.x0[old], grown.units[old] = state.x0[old[: len(state.x)]], state.units[old[: len(state.x)]]
+    is_half = np.zeros(len(x), bool)
+    is_half[worst] = is_half[len(state.x) :] = True
+    unsplit = ~is_half[: len(state.x)]
+    grown.x0[~is_half], grown.units[~is_half] = state.x0[unsplit], state.units[unsplit]
     for name in set(CARRIED) - {"x0", "units"}:
         getattr(grown, name)[:] = getattr(state, name)[source]
     masses = masses[source]
-    masses[~old] /= 2
+    masses[is_half] /= 2
     return grown, masses
 
 
 def error_masses(state: FitState, half: Photos) -> np.ndarray:
-    """Sum ``[n]`` blending weight times absolute pixel error, as it counts, of each Gaussian over half-size photos."""
+    """Sum each Gaussian's blending weight times the absolute pixel error over half-size photos: ``[n]``.
+
+    Errors count by the importance of their pixels.
+    """
 
     def one_view(view: int) -> np.ndarray:
         tiled = tile_view(state.splats, **half.camera(view))
@@ -87,6 +95,6 @@ def error_masses(state: FitState, half: Photos) -> np.ndarray:
         return splat_adjoint(tiled, errors)[:, 0]
 
     masses = np.zeros(len(state.x))
-    for of_view in in_turn(one_view, range(len(half))):
-        masses += of_view
+    for view_masses in in_turn(one_view, range(len(half))):
+        masses += view_masses
     return masses

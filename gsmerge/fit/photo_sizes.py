@@ -1,4 +1,4 @@
-"""Scene -> photos for a fit: at full and at half size, and larger where its photos are larger."""
+"""Read the photos of a scene for a fit: at full size, at half size, and larger ones if its photos are larger."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import PicturedScene, Scene
 
-AUTO_SCALE = 2.0  # most that "auto" looks at: steps cost as many pixels, and photos beyond that are rarely sharp
-MIN_AUTO_SCALE = 1.25  # below it "auto" leaves it at the views' size
-ALIKE = 0.01  # of the scale: the rounding of sizes
-PATCH = 32  # pixels, at most
-HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
+AUTO_SCALE = 2.0  # largest scale of "auto": a step takes time by its pixels, and larger photos are rarely sharp
+MIN_AUTO_SCALE = 1.25  # least scale that "auto" uses; below it photos have the size of the views
+ALIKE = 0.01  # share of a scale that rounding of sizes may change
+PATCH = 32  # side of a held-out patch, pixels, at most
+HIDDEN = np.float32(1e-9)  # weight of pixels that neither count nor are held out
 
 
 def fit_photos(scene: PicturedScene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
-    """Return the photos at full and half size, and larger if ``photo_scale`` is above 1, which goes into the record."""
+    """Return the photos at full and half size, and larger ones if ``photo_scale``, which is recorded, is above 1."""
     views = range(len(scene)) if views is None else views
     photos = _with_empty(scene_photos(scene), scene)[views], _with_empty(scene_photos(scene, 2), scene)[views]
     scale = 1.0 if options.photo_scale == "auto" else options.photo_scale
@@ -100,7 +100,7 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
     """Return training weights ``[h,w]`` float32 per view: 0 on held-out patches, the photo's weights elsewhere.
 
-    Pixels that count less are not held out; those that do not count at all have the weight ``HIDDEN``.
+    Pixels with a weight below 1 are not held out; those with a weight of 0 get the weight ``HIDDEN``.
     """
     return [training_weight(photos, view, share, seed) for view in range(len(photos))]
 
@@ -108,7 +108,7 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
 def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.ndarray:
     """Return the training weights ``[h,w]`` float32 of one view; see :func:`training_weights`.
 
-    Of patches in which the photo counts somewhere at least one is held out.
+    At least one of the patches in which the photo counts is held out, if there are several.
     """
     size = max(1, min(PATCH, min(photos.height, photos.width) // 4))
     rows, columns = -(-photos.height // size), -(-photos.width // size)
@@ -127,7 +127,7 @@ def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.nd
 
 
 def _counting_patches(photos: Photos, view: int, size: int) -> np.ndarray:
-    """Return a mask ``[r,c]`` of the patches in which the photo counts fully somewhere, and shows the scene."""
+    """Return a mask ``[r,c]`` of the patches with a pixel that counts fully and shows the scene."""
     assert photos.weights is not None
     counts = photos.weights[view] == 1
     if photos.empty is not None:
@@ -168,14 +168,14 @@ def exposure_gains(
 ) -> np.ndarray:
     """Return factors ``[v,3]`` float32 from renders to the photos' exposure, with geometric mean one.
 
-    They are least squares solutions on the weighted pixels, per view and channel; ones if no view differs by
+    They are least-squares solutions on the weighted pixels, for each view and channel. All are 1 if no view differs by
     ``min_gain``.
     """
 
     def one_view(view: int) -> np.ndarray:
         image, weight = images[view], weights[view][..., None]
         with_photo, with_image = (
-            (weight * other * image).sum((0, 1), dtype=np.float64) for other in (photos[view], image)
+            (weight * picture * image).sum((0, 1), dtype=np.float64) for picture in (photos[view], image)
         )
         return np.clip(with_photo / np.maximum(with_image, 1e-9), 1 / max_gain, max_gain)
 

@@ -11,9 +11,9 @@ from gsmerge.fit.outside import Outside
 from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
 
-SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, in steps: .3 to .6 on two captures
+SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, in units of one on all: .3 to .6 on two captures
 TIME_SPENT = "time budget spent"  # why a fit ended
-HAZE = 0.05  # far fog above which a result gets a note: plain to see in a viewer
+HAZE = 0.05  # far fog above which a result gets a note, as it is plain to see in a viewer
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class FitReport:
     holdout_after: float  # The same after it
     stopped: str  # Why it ended
     viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
-    # Mean opacity of the result, in [0, 1], seen from outside where the input shows nothing; None: it fills every view
+    # Mean opacity of the result, in [0, 1], seen from outside where the input is empty; None: it is nowhere empty
     fog: float | None = None
-    # [n] row of the start that each Gaussian comes from; None: not known
+    # [n] row of the start that each Gaussian comes from; None: unknown
     origins: np.ndarray | None = field(default=None, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
@@ -47,7 +47,7 @@ class Fitted:
     gaussians: Gaussians  # Canonical Gaussians
     cameras: Cameras  # The scene's cameras, canonical, moved where the fit moved them
     report: FitReport | None  # What the fit did; None where nothing was fitted
-    outside: Outside | None = None  # Where it was to put nothing; None: not known
+    outside: Outside | None = None  # Views from outside that kept it clear of fog; None: none
 
 
 def record_fit(report: FitReport, planned: int) -> None:
@@ -63,9 +63,9 @@ def record_fit(report: FitReport, planned: int) -> None:
 
 
 def report_steps(step: int, steps: int, photos: float, half_part: float) -> None:
-    """Report progress of the fit: the steps that are done, as their time counts, and PSNR (dB) of the last photos.
+    """Report progress of the fit: the steps that are done, by their time, and the PSNR (dB) of the last photos.
 
-    The first share ``half_part`` of the steps draws samples of the photos.
+    The first share ``half_part`` of the steps draws samples of the photos, which takes less time.
     """
     half = half_part * steps
     done, total = (count - (1 - SAMPLE_COST) * min(count, half) for count in (step, steps))

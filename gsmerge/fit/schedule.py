@@ -1,8 +1,8 @@
-"""The steps of a full fit: how each draws, which view, background and Gaussians it takes, how far it goes."""
+"""Plan the steps of a full fit: the view, background and Gaussians of each, how it draws them, and its rates."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,29 +16,30 @@ from gsmerge.raster.photos import WHOLE_PHOTO, Photos, Sample
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
 
 GROWTH = 0.5  # part of the run after which Gaussians are added
-# Parts of the run after which Gaussians are cut at the views' edges: early, so that the photos are fitted without what
-# lies beyond, and until the mean of the last steps begins, as what is cut grows again
+# Parts of the run after which Gaussians are cut at the edges of the views. The first cuts come early, so that photos
+# are fitted without what lies beyond. Gaussians grow again after a cut, so there are cuts until the mean of the last
+# steps begins
 CUTS = (0.0, 0.15, 0.3, 0.5, 0.7)
-CLEARS = (0.6, 0.7, 0.8)  # and those after which faint Gaussians are dropped from runs that grow
+CLEARS = (0.6, 0.7, 0.8)  # parts after which faint Gaussians are dropped, of runs that grow
 FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
 MANY_STEPS = 150
-# Most of the first steps draw a sample of each photo's pixels, another one each time that they come back to it. It
-# costs as much as a photo of half the size, and shows details that this one has lost.
+# Most of the first steps draw a sample of a photo's pixels, each time another one. A sample costs as much as the photo
+# at half size, and shows details that are lost at half size.
 STRIDE = 2
-OFFSETS = ((0, 0), (1, 1), (1, 0), (0, 1))  # of the samples, columns and rows, in turn
-SAMPLED_STEPS = 30  # shorter runs see too little of what samples leave out: .07 dB less at 20, 1 dB at 7
+OFFSETS = ((0, 0), (1, 1), (1, 0), (0, 1))  # columns and rows of the samples, one after the other
+SAMPLED_STEPS = 30  # shorter runs draw too few samples to see all pixels: .07 dB less at 20 steps, 1 dB at 7
 DROPOUT = 0.1  # share of the Gaussians that a step leaves out with few views
-LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS that look at each view often
-LONG_LOOKS = 30
-LARGE_STEPS = (0, 2)  # of every five, look at larger photos; with more of them the views' own size gets worse
+LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS that draw each view LONG_ROUNDS times
+LONG_ROUNDS = 30
+LARGE_STEPS = (0, 2)  # of every five, those that draw larger photos; with more of them the views' own size gets worse
 PROBE = 6  # steps that are timed to keep to a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
-# How steps draw, in turn: whether at half size, the low-pass as a share of the viewers' own, and
-# whether small Gaussians are made clearer by what it adds to them. Some viewers do that, enlarged
-# twice the low-pass is a quarter, and from afar it covers more of the scene: what was fitted to one way alone looks
-# thin or fat in the others (Mip-Splatting, Yu et al. 2024). The first steps too look from near and from afar, since
-# they find the sizes of the Gaussians.
+# Draw modes of steps, one after the other: 1 for half size or 0 for full size, the low-pass as a share of the viewers'
+# own, and whether small Gaussians are made fainter by what the low-pass adds to them. Some viewers do that. In a view
+# that is enlarged twice the low-pass is a quarter, and from afar it covers more of the scene. What is fitted to one
+# mode alone looks thin or fat in the other ones (Mip-Splatting, Yu et al. 2024). The first steps, in which Gaussians
+# find their sizes, have several modes too.
 FIRST_MODES = (0, 1.0, False), (0, 0.25, False), (0, 1.0, False), (1, 1.0, False)
 DRAW_MODES = (
     (0, 1.0, True), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
@@ -54,20 +55,20 @@ Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the 
 class FitJob:
     """Photos to fit to, with options and start conditions."""
 
-    photos: tuple[Photos, ...]  # At full and at half size, and larger if the fit is to see them
+    photos: tuple[Photos, ...]  # At full size, at half size, and larger ones if the fit uses them
     options: FitOptions
     count: int = 0  # Gaussians to grow to, where the run is long enough
     seed: int = 0
     progress: Progress | None = None  # Called after each step
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
-    # Where renders stand for photos, how many of them, the first ones, a result has to show better; None: photos, all
+    # Number of the first photos that the result is scored on, where renders stand for photos; None: all photos
     num_judged: int | None = None
-    outside: Outside | None = None  # Views in which some steps clear fog and veils; None: none
-    edges: Edges | None = None  # At which Gaussians are cut; None: they may reach anywhere
-    region: Region | None = None  # In which their centres stay; None: everywhere
+    outside: Outside | None = None  # Views from outside, in which some steps clear fog and veils; None: no such steps
+    edges: Edges | None = None  # Edges of the views, at which Gaussians are cut; None: no cuts
+    region: Region | None = None  # Region in which centres stay; None: everywhere
 
-    def judges(self, size: int) -> Photos:
-        """Return the photos that a result has to show better, at a size as of :class:`DrawMode`."""
+    def scored_photos(self, size: int) -> Photos:
+        """Return the photos that a result is scored on, at a size as of :class:`DrawMode`."""
         photos = self.photos[size]
         return photos[range(len(photos))[: self.num_judged]]
 
@@ -78,29 +79,29 @@ class DrawMode:
 
     size: int  # Of the photos: 0 full, 1 half, 2 larger
     eps2d: float  # Low-pass, pixels squared of this size
-    antialiased: bool = False  # Whether small Gaussians are made clearer by it
-    stride: int = 1  # Distance of the pixels that are drawn, those between are left out
+    antialiased: bool = False  # Whether small Gaussians are made fainter by what the low-pass adds to them
+    stride: int = 1  # Distance of the pixels that are drawn; pixels in between are left out
 
 
 @dataclass(frozen=True)
 class FitRun:
-    """A full fit as it was prepared: weights of the pixels, dropout, and the share of the first steps."""
+    """A prepared full fit: weights of the pixels, dropout, and the share of the first steps."""
 
     job: FitJob
-    # [h,w] float32 of each photo at half size: 0 on held-out patches, if the fit is judged by them, `HIDDEN`
-    # on pixels that neither steps nor scores use, 1 elsewhere
+    # [h,w] float32 weights of each photo at half size: 0 on held-out patches, if the fit is scored on them, `HIDDEN` on
+    # pixels that neither steps nor scores use, 1 elsewhere
     weights: list[np.ndarray]
-    # The same as a step uses them, at every size, times the importance of the pixels: 0 on hidden pixels; at full
-    # size not 0 on held-out patches, and larger photos count everywhere
+    # [h,w] float32 weights in steps, of each photo at each size: 0 on hidden pixels, elsewhere the importance of the
+    # pixel. Held-out patches are 0 at half size alone
     step_weights: tuple[list[np.ndarray], ...]
     dropout: float  # Share of the Gaussians that a step leaves out
-    half_part: float  # Share of the steps, the first ones, that draw a quarter of the pixels
-    samples: bool = True  # Whether most draw samples of the photos; otherwise all draw photos of half the size
-    # [h,w] bool of each photo at full size: the pixels that count in the first steps; None: those of the others
+    half_part: float  # Share of the first steps, which draw a quarter of the pixels
+    samples: bool = True  # Whether most of the first steps draw samples of photos; otherwise all draw half-size photos
+    # [h,w] bool of each photo at full size: pixels that count in the first steps; None: the same as in all other steps
     first_pixels: tuple[np.ndarray, ...] | None = None
 
     def weight(self, step: Step) -> np.ndarray:
-        """Return the weights ``[h,w]`` of the pixels that a step draws; the first steps leave out held-out patches."""
+        """Return the weights ``[h,w]`` of the pixels that a step draws; held-out patches are 0 in the first steps."""
         weight = self.step_weights[step.mode.size][step.view][step.sample.pixels]
         if step.mode.stride == 1 or self.first_pixels is None:
             return np.ascontiguousarray(weight)
@@ -116,35 +117,30 @@ class FitRun:
     def draw_mode(self, step: int, progress: float) -> DrawMode:
         """Return how step ``step`` (from 1) draws the scene.
 
-        Samples of the photos come first, then whole ones, both drawn in turn in the ways of different viewers. Larger
-        photos in between show what an enlarged view shows.
+        The first steps draw samples of the photos, the other ones whole photos, both in the modes of different viewers.
+        Steps on larger photos in between show what an enlarged view shows.
         """
         photos, first = self.job.photos, progress < self.half_part
         if first and not self.samples:
             return DrawMode(1, photos[1].eps2d)
-        if len(photos) > 2 and first:  # from near the larger ones show it
+        if len(photos) > 2 and first:  # larger photos will show the scene from near
             return DrawMode(0, photos[0].eps2d, stride=STRIDE)
         if len(photos) > 2 and step % 5 in LARGE_STEPS:
             return DrawMode(2, photos[2].eps2d)
         modes = FIRST_MODES if first else DRAW_MODES
         size, share, antialiased = modes[step % len(modes)]
-        # From afar costs short runs more than it gains; beside larger photos, which are for looking
-        # closely, every third such look is enough
+        # Half-size photos cost short runs more than they gain. Where larger photos show the scene from near, a third of
+        # the half-size steps is enough
         if not self.job.options.grows or (len(photos) > 2 and step % 3):
             size = 0
         return DrawMode(size, share * photos[0].eps2d, antialiased, STRIDE if first and size == 0 else 1)
-
-
-def begins(parts: Sequence[float], before: float, now: float) -> bool:
-    """Return whether one of the ``parts`` of a run begins after the part ``before``, and not after ``now``."""
-    return any(before < part <= now for part in parts)
 
 
 def prepare_fit(job: FitJob) -> FitRun:
     """Prepare a fit: held-out patches, pixels outside masks, and dropout where there are few views."""
     photos, options = job.photos, job.options
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
-    long = options.steps >= max(LONG_STEPS, LONG_LOOKS * len(photos[0]))
+    long = options.steps >= max(LONG_STEPS, LONG_ROUNDS * len(photos[0]))
     default = DROPOUT if few else LONG_DROPOUT if long else 0.0
     dropout = default if options.dropout is None else options.dropout
     everywhere, *larger = (_weigh(_weights_of(level), level) for level in (photos[0], *photos[2:]))
@@ -155,16 +151,16 @@ def prepare_fit(job: FitJob) -> FitRun:
         first_pixels = tuple((weight != 0) & (weight != HIDDEN) for weight in whole)
         weights = reduced(whole, photos[1])
         trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights]
-        if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
+        if len(photos[0]) == 1:  # no other photo shows what is held out, so the fit is scored on all pixels
             weights = [np.where(weight == 1, np.float32(0), weight) for weight in weights]
     step_weights = everywhere, _weigh(trained, photos[1]), *larger
     return FitRun(job, weights, step_weights, dropout, options.half_res_part, _can_sample(job), first_pixels)
 
 
 def _can_sample(job: FitJob) -> bool:
-    """Return whether a sample of the photos' pixels shows each Gaussian: there are at least as many as Gaussians.
+    """Return whether the first steps may draw samples of photos, which takes as many pixels as there are Gaussians.
 
-    Cameras that move need photos that are blurred: what is a pixel away is still seen.
+    While cameras move, photos have to be blurred instead, so that a pose that is a pixel away still has a gradient.
     """
     photos, options = job.photos[0], job.options
     pixels = len(photos) * (photos.width // STRIDE) * (photos.height // STRIDE)
@@ -188,44 +184,44 @@ def _weigh(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of the fit: view, background, draw mode, and the Gaussians kept."""
+    """One step of the fit: view, background, draw mode, and the Gaussians that are drawn."""
 
     number: int  # From 1
     progress: float  # Share of the steps before it
     mode: DrawMode
     view: int
     background: np.ndarray  # [3] float32
-    kept: np.ndarray | None  # [n] bool, the Gaussians that dropout leaves in; None: all
-    sample: Sample = WHOLE_PHOTO  # The pixels of the photo that are drawn
+    mask: np.ndarray | None  # [n] bool, Gaussians that are drawn; dropout leaves out the rest; None: all are drawn
+    sample: Sample = WHOLE_PHOTO  # Pixels of the photo that are drawn
 
 
 class Schedule:
     """Draws the order of views, the backgrounds and the dropped Gaussians of all steps from one seed.
 
-    One generator draws everything, a step's dropout after its background: a generator of its own
-    for dropout would change all results of few views and of long runs.
+    One generator draws everything, and a step's dropout after its background. A generator of its own for dropout would
+    change the results of few views and of long runs.
     """
 
     def __init__(self, run: FitRun):
         self.run, self.rng = run, np.random.default_rng(run.job.seed)
-        self.queue: list[int] = []
-        self.turns = list(range(len(run.job.photos[0])))  # of the samples of each view, to begin in different ones
+        self.views_left: list[int] = []  # of the round over all views
+        self.samples = list(range(len(run.job.photos[0])))  # number of each view's next sample; views begin differently
 
     def draw(self, number: int, progress: float, count: int) -> Step:
-        """Draw step ``number`` (from 1) for ``count`` Gaussians; every view comes once per round."""
-        if not self.queue:
-            self.queue = self.rng.permutation(len(self.run.job.photos[0])).tolist()
-        view, background, kept = self.queue.pop(), self.rng.random(3, dtype=np.float32), None
+        """Draw step ``number`` (from 1) for ``count`` Gaussians; a round over all views has each view once."""
+        if not self.views_left:
+            self.views_left = self.rng.permutation(len(self.run.job.photos[0])).tolist()
+        view, background, mask = self.views_left.pop(), self.rng.random(3, dtype=np.float32), None
         job = self.run.job
         if job.num_judged is not None and job.photos[0].empty is None:  # renders are black where the scene is empty
             background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
-            kept = self.rng.random(count, dtype=np.float32) >= self.run.dropout
+            mask = self.rng.random(count, dtype=np.float32) >= self.run.dropout
         mode, sample = self.run.draw_mode(number, progress), WHOLE_PHOTO
         if mode.stride > 1:
-            sample = Sample(mode.stride, *OFFSETS[self.turns[view] % len(OFFSETS)])
-            self.turns[view] += 1
-        return Step(number, progress, mode, view, background, kept, sample)
+            sample = Sample(mode.stride, *OFFSETS[self.samples[view] % len(OFFSETS)])
+            self.samples[view] += 1
+        return Step(number, progress, mode, view, background, mask, sample)
 
 
 def loss_weights(rates: Tuning, progress: float) -> tuple[float, float]:
@@ -240,20 +236,20 @@ def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     return (np.repeat(each, [3, 3, 4, 1, 3]) * power(decay, progress)).astype(np.float32)
 
 
-def first_decay(rates: Tuning, looks: float) -> float:
-    """Return the decay of the first moment after so many looks at each view.
+def first_decay(rates: Tuning, rounds: float) -> float:
+    """Return the decay of Adam's first moment after a number of rounds over all views.
 
-    Its mean reaches over two steps that show a Gaussian at first, and over one more for each four looks at the views:
-    early on gradients change from step to step, later they differ between views most.
+    Momentum grows during the fit: it averages two steps that show a Gaussian at first, and one step more after every
+    four rounds. Early on gradients change from step to step; later they differ most between views.
     """
-    return min(rates.beta1, 1 - 1 / (2 + looks / 4))
+    return min(rates.beta1, 1 - 1 / (2 + rounds / 4))
 
 
 def affordable_steps(seconds: float, run: FitRun) -> int:
     """Return how many steps fit into the time budget, given the ``seconds`` of the first PROBE steps.
 
-    A step on a whole photo costs up to three times as much; a step on larger photos costs more in proportion to their
-    pixels.
+    A step on a whole photo takes up to three times as long as one of those. A step on a larger photo takes longer in
+    proportion to its pixels.
     """
     budget, coarse = run.job.options.time_budget, run.half_part
     assert budget is not None

@@ -1,4 +1,4 @@
-"""The stage of the fit: which Gaussians stay, and which parameters are fitted."""
+"""The stage of the fit: drop Gaussians that no photo shows, and choose which parameters of the rest are fitted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsmerge.fit.edges import find_edges
 from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.growth import grow_to
-from gsmerge.fit.outside import look_outside, score_fog
+from gsmerge.fit.outside import place_outside_views, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob, prepare_fit
@@ -22,8 +22,8 @@ from gsmerge.runtime.record import choose, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-CLOSE = 1.0  # dB that the held-out patches must gain; after less, the whole photos are compared
-ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
+CLOSE = 1.0  # gain of the held-out patches, dB, below which whole photos are compared as well
+ALWAYS = float("inf")  # the same after the full fit failed, as its start may be the end of another fit
 START = 0.57  # share of the Gaussians that a run which grows begins with
 
 
@@ -38,22 +38,22 @@ def fit_scene(
 ) -> Fitted:
     """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene, if a fit is asked for.
 
-    ``num_judged``: where renders stand for photos, how many of the views, the first ones, the result has to show
-    better; None: photos, all.
+    ``num_judged`` is the number of the first views that the result is scored on, where renders stand for photos. None:
+    there are photos, and it is scored on all.
     """
     if options.fit == "none":
         return Fitted(decoded.gaussians, scene.cameras, None)
     with stage("fit"):
         photos = fit_photos(scene, options, views)
         choose(start_count=len(decoded.gaussians))
-        if decoded.exact and not options.grows:  # then nothing is left out either
+        if decoded.exact and not options.grows:  # then no Gaussian is dropped either
             options = replace(options, min_contribution=0.0)
         job = FitJob(photos, options, decoded.count, seed, report_steps, decoded.fixed, num_judged)
-        outside = look_outside(scene, decoded.gaussians, job.judges(1), options)
+        outside = place_outside_views(scene, decoded.gaussians, job.scored_photos(1), options)
         edges = None if options.beyond else find_edges(scene.cameras, decoded.count)
         job = replace(job, outside=outside, edges=edges, region=scene.region)
         gaussians, report = fit(decoded.gaussians, job)
-        if scene.region is not None:  # what grew last took no step since
+        if scene.region is not None:  # Gaussians that grew last took no step since
             gaussians = replace(gaussians, means=scene.region.clamp(gaussians.means).astype(np.float32))
         record_fit(report, options.steps)
     cameras = scene.cameras
@@ -67,7 +67,7 @@ def fit_scene(
 def fit(gaussians: Gaussians, job: FitJob) -> FitResult:
     """Drop Gaussians that no photo shows, and fit the rest to the photos.
 
-    If the full fit does not improve held-out patches of the photos, the colour fit is tried.
+    If the full fit does not improve held-out patches of the photos, colours alone are fitted.
     """
     fitted, report = _choose_fit(gaussians, job)
     if job.outside is not None:
@@ -78,43 +78,43 @@ def fit(gaussians: Gaussians, job: FitJob) -> FitResult:
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
     """Run :func:`fit` on a job with its views from outside."""
     options = job.options
-    run, judges = prepare_fit(job), job.judges(0)
+    run, scored = prepare_fit(job), job.scored_photos(0)
     survey = survey_photos(gaussians, run)
     keep = survey.visible(options.min_contribution)
-    kept, rows = gaussians[keep], np.flatnonzero(keep)
+    start, rows = gaussians[keep], np.flatnonzero(keep)
     fixed = None if job.fixed is None else job.fixed[rows]
-    fitted, report = _better_of(judges, kept, *fit_full(kept, run, survey[keep], fixed), CLOSE)
+    fitted, report = _better_of(scored, start, *fit_full(start, run, survey[keep], fixed), CLOSE)
     if report.accepted:
         assert report.origins is not None
         return fitted, replace(report, origins=rows[report.origins])
     if not options.judged:
-        return kept, replace(report, origins=rows)
+        return start, replace(report, origins=rows)
     if options.grows:  # the stages before left room for a growth that did not happen
-        state = grow_to(start_state(kept), job.photos[1], job.count)
+        state = grow_to(start_state(start), job.photos[1], job.count)
         fitted, report = _fit_colors(gaussians_of(state.x, state.splats.shN), job)
         if report.accepted:
-            fitted, report = _better_of(judges, kept, fitted, report, ALWAYS)
+            fitted, report = _better_of(scored, start, fitted, report, ALWAYS)
         if report.accepted:
             return fitted, replace(report, origins=rows[state.origins])
-        return kept, replace(report, origins=rows)
+        return start, replace(report, origins=rows)
     fitted, report = _fit_colors(gaussians, job)
-    fitted, report = _better_of(judges, kept, fitted[keep], report, ALWAYS)
+    fitted, report = _better_of(scored, start, fitted[keep], report, ALWAYS)
     return fitted, replace(report, origins=rows)
 
 
 def _fit_colors(gaussians: Gaussians, job: FitJob) -> FitResult:
     """Fit base colours alone to the half-size photos."""
-    from gsmerge.fit.color import draw, fit_colors  # few fits come here
+    from gsmerge.fit.color import draw, fit_colors  # few fits need it
 
     half = job.photos[1]
     return fit_colors(gaussians, draw(gaussians, half), half, job.options, job.seed)
 
 
 def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport, close: float) -> FitResult:
-    """Return the fitted Gaussians, or their start if held-out patches hardly gained and whole photos got worse.
+    """Return the fitted Gaussians, or their start if whole photos got worse.
 
-    Further steps of the default size only scatter Gaussians that are fitted already. After a gain of ``close`` dB or
-    more the photos are not compared.
+    Photos are compared where held-out patches gained less than ``close`` dB. A fit of Gaussians that are fitted already
+    only scatters them, by steps of the default size.
     """
     if not report.accepted or report.holdout_after - report.holdout_before >= close:
         return after, report

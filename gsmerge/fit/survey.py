@@ -1,4 +1,4 @@
-"""Look at the photos during a fit: what they show of each Gaussian, and how well Gaussians show them."""
+"""Survey what the photos show of each Gaussian of a fit, and score how well Gaussians show the photos."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from gsmerge.raster.photos import NEAR_PLANE, Photos, photo_errors, render_photo
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
-JUDGES, ENOUGH = 12, 6  # photos that judge a fit, at most; in so many a Gaussian is looked at, if they may show it
-FEWER = 0.03  # share of what a photo may show that is looked at in fewer
+MOST_SCORED = 12  # photos, at most, that a fit is scored on
+ENOUGH = 6  # photos of a survey that are enough for a Gaussian that they may show
+FEWER = 0.03  # share of the Gaussians that a photo may show that may have fewer
 SAMPLE_GAUSSIANS = 4096  # Gaussians by which photos are chosen
 
 
@@ -26,8 +27,8 @@ SAMPLE_GAUSSIANS = 4096  # Gaussians by which photos are chosen
 class Survey:
     """Facts that half-size photos show about each of the n Gaussians that a fit starts from."""
 
-    score: float  # PSNR (dB) of the held-out patches of these pictures
-    inside: np.ndarray  # [n] bool, whether some photo's frustum may hold it
+    score: float  # PSNR (dB) of the held-out patches
+    inside: np.ndarray  # [n] bool, whether it may be in the frustum of some photo
     peaks: np.ndarray  # [n] float32 largest blending weight
     sums: np.ndarray  # [n] float64 blending weights summed over all photos, pixels
     squares: np.ndarray  # [n] float64 squares of each photo's sum, summed
@@ -43,9 +44,9 @@ class Survey:
 
 
 def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
-    """Draw Gaussians into half-size photos of a fit, of many into some, and collect what they show of each.
+    """Draw Gaussians into the half-size photos of a fit, or some of them, and collect what these show of each.
 
-    The other sizes, full size first, tell the size of the finest pixel.
+    The size of the finest pixel is that of the largest photos.
     """
     photos = run.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
@@ -56,11 +57,11 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
         focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
         return drawn.ids, drawn.depths / focal, *survey(drawn, colors)
 
-    views, judges, images = choose_looks(gaussians, half), judging_views(len(half)), []
+    views, scored, images = choose_views(gaussians, half), scored_views(len(half)), []
     inside, peaks = np.zeros(count, bool), np.zeros(count, np.float32)
     sums, squares, pixels = np.zeros(count), np.zeros(count), np.full(count, np.inf, np.float32)
     for view, (ids, sizes, image, weights, most) in zip(views, in_turn(one_view, views), strict=True):
-        if view in judges:
+        if view in scored:
             images.append(image)
         inside[ids] = True
         peaks[ids] = np.maximum(peaks[ids], most)
@@ -70,27 +71,31 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
     return Survey(score_images(images, run, half), inside, peaks, sums, squares, pixels)
 
 
-def choose_looks(gaussians: Gaussians, photos: Photos) -> list[int]:
-    """Choose the photos of a survey: those that judge, and others of which much would be looked at in too few."""
+def choose_views(gaussians: Gaussians, photos: Photos) -> list[int]:
+    """Choose the photos of a survey.
+
+    They are those that a fit is scored on, and each further one with many Gaussians that fewer than ``ENOUGH`` of the
+    photos so far may show.
+    """
     means = gaussians.means[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
     pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
     inside = (depths > NEAR_PLANE) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
-    chosen = judging_views(len(photos))
-    looks = inside[chosen].sum(0)
+    chosen = scored_views(len(photos))
+    num_photos = inside[chosen].sum(0)
     for view in spread_views(len(photos)):
-        if view not in chosen and (inside[view] & (looks < ENOUGH)).sum() > FEWER * inside[view].sum():
+        if view not in chosen and (inside[view] & (num_photos < ENOUGH)).sum() > FEWER * inside[view].sum():
             chosen.append(view)
-            looks += inside[view]
+            num_photos += inside[view]
     return sorted(chosen)
 
 
-def judging_views(count: int) -> list[int]:
-    """Choose the photos out of ``count`` that judge a fit, at most ``JUDGES``."""
-    return sorted(spread_views(count)[:JUDGES])
+def scored_views(count: int) -> list[int]:
+    """Choose the photos out of ``count`` that a fit is scored on, at most ``MOST_SCORED``."""
+    return sorted(spread_views(count)[:MOST_SCORED])
 
 
 def spread_views(count: int) -> list[int]:
-    """Order views so that however many come first are spread over all."""
+    """Order views so that the first ones, whatever their number, are spread over all."""
     return sorted(range(count), key=lambda view: f"{view:032b}"[::-1])
 
 
@@ -109,18 +114,18 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
     return peak, inside
 
 
-def score_images(images: Sequence[np.ndarray], plan: FitRun, half: Photos) -> float:
-    """Return the PSNR (dB) of renders of the judging half-size photos on held-out patches; NaN if none is held out."""
-    options, views = plan.job.options, judging_views(len(half))
+def score_images(images: Sequence[np.ndarray], run: FitRun, half: Photos) -> float:
+    """Return the PSNR (dB) of renders of the :func:`scored_views` on held-out patches; NaN if none are held out."""
+    options, views = run.job.options, scored_views(len(half))
     if not options.judged:
         return float("nan")
-    return holdout_psnr(images, half[views], [plan.weights[view] for view in views], options.tuning.min_gain)
+    return holdout_psnr(images, half[views], [run.weights[view] for view in views], options.tuning.min_gain)
 
 
-def score_state(state: FitState, plan: FitRun, half: Photos) -> float:
+def score_state(state: FitState, run: FitRun, half: Photos) -> float:
     """Return the PSNR (dB) of a state on the held-out patches of the half-size photos; see :func:`score_images`."""
-    views = judging_views(len(half))
-    return score_images(render_photos(state.splats, half, colors=state.view_colors(), views=views), plan, half)
+    views = scored_views(len(half))
+    return score_images(render_photos(state.splats, half, colors=state.view_colors(), views=views), run, half)
 
 
 def photo_error(gaussians: Gaussians, photos: Photos) -> float:

@@ -94,13 +94,19 @@ def gradients_of(
     with use_threads() as threads:
         parallel_map(tiles, tile_ranges(tiled, threads, WORTH))
         parallel_map(project, _blocks(m, threads))
-    viewmat = None
-    if poses is not None:
-        pose = poses.sum(0, dtype=np.float64)
-        viewmat = np.zeros((4, 4))
-        viewmat[:3, 3] = pose[9:]
-        viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], splats.origin)
+    viewmat = None if poses is None else viewmat_gradient(poses, splats.origin)
     return Gradients(tiled.ids, means, quats, scales, opacities, tints, viewmat)
+
+
+def viewmat_gradient(poses: Array, origin: Array) -> Array:
+    """Sum the gradients ``[blocks,POSE]`` of :func:`project_backward` to the gradient ``[4,4]`` float64 of the viewmat.
+
+    ``origin [3]`` is that of the splats.
+    """
+    pose, viewmat = poses.sum(0, dtype=np.float64), np.zeros((4, 4))
+    viewmat[:3, 3] = pose[9:]
+    viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], origin)
+    return viewmat
 
 
 def color_gradients(

@@ -185,6 +185,11 @@ def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, thread
     return conics, depths, boxes
 
 
+def hides_most(num_intersections: int, num_visible: int) -> bool:
+    """Return whether a view has so many intersections that most of its Gaussians are hidden behind others."""
+    return num_intersections > max(MANY, MANY_EACH * num_visible)
+
+
 def _bin(
     order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
 ) -> tuple[Array, Array]:
@@ -193,7 +198,7 @@ def _bin(
     boxes = boxes.view(np.uint64).reshape(-1).take(order).view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], tile_height, tile_width), spans))
-    if counts.sum() > max(MANY, MANY_EACH * len(order)):
+    if hides_most(int(counts.sum()), len(order)):
         return _bin_open(order, boxes, conics, tile_height, tile_width, threads)
     isect_offsets = np.concatenate([[0], np.cumsum(counts.sum(0))])
     cursors = isect_offsets[:-1] + np.cumsum(counts, 0) - counts

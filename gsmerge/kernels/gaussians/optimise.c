@@ -124,7 +124,8 @@ static inline void gather(Block *b, int64_t j, Step s, const float *scale, float
 
 API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m, float *restrict v,
                  const float *restrict units, const float *restrict box_shares,
-                 const float *restrict min_sizes, const int32_t *restrict ids,
+                 const float *restrict min_sizes, const uint8_t *restrict fixed,
+                 const int32_t *restrict ids,
                  const float *restrict g_means, const float *restrict g_quats,
                  const float *restrict g_scales, const float *restrict g_opacities,
                  const float *restrict g_colors, const float *restrict rates,
@@ -149,18 +150,22 @@ API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m,
             .opacity_reg = regs[0],
             .scale_reg = regs[1]};
   Block b = {0};
-  for (int64_t start = first; start < last; start += BLOCK) {
-    int64_t size = mini(BLOCK, last - start);
-    const int32_t *rows = ids + start;
+  for (int64_t next = first; next < last;) {
+    int64_t rows[BLOCK], gradients[BLOCK], size = 0;
+    for (; next < last && size < BLOCK; next++) {
+      rows[size] = ids[next];
+      gradients[size] = next;
+      size += !fixed[ids[next]];
+    }
     for (int64_t j = 0; j < size; j++) {
-      int64_t i = rows[j], g = start + j;
+      int64_t i = rows[j], g = gradients[j];
       b.unit[j] = units[i];
       b.share[j] = box_shares[i];
       gather(&b, j, s, scales + 3 * i, opacities[i], g_means + 3 * g, g_quats + 4 * g,
              g_scales + 3 * g, g_opacities[g], g_colors + 3 * g);
     }
     for (int64_t j = 0; j < size; j++) {
-      int64_t at = COLUMNS * (int64_t)rows[j];
+      int64_t at = COLUMNS * rows[j];
       move(&b, j, s, x + at, x0 + at, m + at, v + at);
     }
     confine_groups(&b, s);
@@ -176,7 +181,7 @@ API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m,
     }
     for (int q = 0; q < 4 * BLOCK; q++) b.visible[q] = exp4(b.visible[q]);
     for (int64_t j = 0; j < size; j++) {
-      for (int c = 0; c < 3; c++) scales[3 * (int64_t)rows[j] + c] = b.visible[4 * j + c];
+      for (int c = 0; c < 3; c++) scales[3 * rows[j] + c] = b.visible[4 * j + c];
       opacities[rows[j]] = 1.f / (1.f + b.visible[4 * j + 3]);
     }
   }

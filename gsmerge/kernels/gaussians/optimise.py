@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
+from gsmerge.kernels.signature import STATUS, f4, i4, i8, native, u1
 
 # columns of the state: mean 3, log scale 3, quaternion 4, opacity logit 1, colour 3
 MEAN, SIZE, QUAT, LOGIT, COLOR, COLUMNS = 0, 3, 6, 10, 11, 14
@@ -13,15 +13,15 @@ MAX_LOGIT, MIN_LOGIT = np.float32(6.9), np.float32(-5.5)
 
 @native(
     STATUS, x=f4("n", COLUMNS, out=True), x0=f4("n", COLUMNS), m=f4("n", COLUMNS, out=True),
-    v=f4("n", COLUMNS, out=True), units=f4("n"), box_shares=f4("n"), min_sizes=f4("n"), ids=i4("k"),
-    g_means=f4("k", 3), g_quats=f4("k", 4), g_scales=f4("k", 3), g_opacities=f4("k"), g_colors=f4("k", 3),
+    v=f4("n", COLUMNS, out=True), units=f4("n"), box_shares=f4("n"), min_sizes=f4("n"), fixed=u1("n"),
+    ids=i4("k"), g_means=f4("k", 3), g_quats=f4("k", 4), g_scales=f4("k", 3), g_opacities=f4("k"), g_colors=f4("k", 3),
     rates=f4(COLUMNS), limits=f4(5), betas=f4(2), regs=f4(2), step=i8(least=1), first=i8(least=0, most="k"),
     last=i8(least="first", most="k"), means=f4("n", 3, out=True), quats=f4("n", 4, out=True),
     scales=f4("n", 3, out=True), opacities=f4("n", out=True), colors=f4("n", 3, out=True),
 )  # fmt: skip
 def adam(
-    x, x0, m, v, units, box_shares, min_sizes, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits,
-    betas, regs, step, first, last, means, quats, scales, opacities, colors,
+    x, x0, m, v, units, box_shares, min_sizes, fixed, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates,
+    limits, betas, regs, step, first, last, means, quats, scales, opacities, colors,
 ):  # fmt: skip
     """Take an Adam step of rows ``ids[first]`` to ``ids[last - 1]`` of ``x [n,COLUMNS]``; clip to the box about ``x0``.
 
@@ -32,6 +32,7 @@ def adam(
     Args:
         box_shares: ``[n]`` of the limits of mean and log scale that each Gaussian may use.
         min_sizes: ``[n]`` least log scale of each, whatever the box.
+        fixed: ``[n]`` uint8, rows with another number than 0 keep their parameters and moments.
         ids: ``[k]`` rows with a gradient, each once; the gradients have k rows.
         rates: Of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
         limits: Of the mean (in sizes), log scale, logit; by how much the largest log scale may exceed the second, or

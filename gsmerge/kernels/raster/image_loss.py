@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, declare, f4, i8
+from gsmerge.kernels.signature import STATUS, f4, i8, native
 
 SIDE = 7  # of the windows, pixels
 C1, C2 = np.float32(1e-4), np.float32(9e-4)  # SSIM's constants for a data range of 1
@@ -19,21 +19,18 @@ EDGE_ROWS = 7  # of differences, weights and what they give
 CHUNK, PAD = 96, 9  # values that are summed at a time, and beside a row
 
 
-# terms and rows are overwritten, of a width rounded up to CHUNK, and PAD
-_loss_gradient = declare(
-    "loss_gradient", STATUS, image=f4("height", "width"), photo=f4("height", "width"), weight=f4("height", "pixels"),
-    ssim_lambda=f4(), edge_weight=f4(), first=i8(least=0, most="height"), last=i8(least="first", most="height"),
-    gradient=f4("height", "width", out=True), errors=f4("height", out=True), terms=f4(ROWS, TERMS, "room", out=True),
-    rows=f4(EDGE_ROWS, "room", out=True),
-)  # fmt: skip
-
-
 def room_of(width):
     """Return the length of a buffer for a row of ``width`` pixels."""
     return -(-3 * width // CHUNK) * CHUNK + PAD
 
 
-def image_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors):
+@native(
+    STATUS, image=f4("height", "width"), photo=f4("height", "width"), weight=f4("height", "pixels"),
+    ssim_lambda=f4(), edge_weight=f4(), first=i8(least=0, most="height"), last=i8(least="first", most="height"),
+    gradient=f4("height", "width", out=True), errors=f4("height", out=True), terms=f4(ROWS, TERMS, "room", out=True),
+    rows=f4(EDGE_ROWS, "room", out=True),
+)  # fmt: skip
+def loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows):
     """Write the gradient of (1 - ssim_lambda) |e| + ssim_lambda (1 - SSIM) + edge_weight |difference of e|.
 
     e is ``image - photo``; differences of e are taken to the next pixel of a row and of a column. Pixels have weights,
@@ -48,8 +45,5 @@ def image_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, 
         last: Last row, exclusive.
         gradient: ``[h,3w]`` float32, the rows are written, divided by the number of pixels.
         errors: ``[h]`` float32, weighted squared error of each row, written.
+        terms, rows: Buffers as long as :func:`room_of` says, overwritten.
     """
-    room = room_of(image.shape[1] // 3)
-    terms = np.empty((ROWS, TERMS, room), np.float32)
-    rows = np.empty((EDGE_ROWS, room), np.float32)
-    _loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows)

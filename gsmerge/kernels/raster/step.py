@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from gsmerge.kernels.gaussians.optimise import COLUMNS
 from gsmerge.kernels.raster.image_loss import EDGE_ROWS, ROWS, TERMS
-from gsmerge.kernels.raster.project import CAMERA, CONIC, SUMS
-from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u8
+from gsmerge.kernels.raster.project import CAMERA, CONIC, POSE, SUMS
+from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1, u8
 
-PHASES = ("cull", "project", "count", "deal", "blend", "loss", "backward", "update")
+# Where most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" stands in for "deal"
+PHASES = ("cull", "project", "count", "count_open", "deal", "deal_open", "blend", "loss", "backward", "update")
 PIECE = 1 << 13  # Gaussians that are culled or projected by one thread at a time
 
 # State of the fit, buffers over its n Gaussians, over tiles, over intersections and over pixels, then what a step sets
@@ -20,19 +21,21 @@ STEP = Table(
     ("step", "num_visible", "num_intersections", "next", "arrived", "failed"),
     means=f4("n", 3, out=True), quats=f4("n", 4, out=True), scales=f4("n", 3, out=True), opacities=f4("n", out=True),
     colors=f4("n", 3, out=True), x=f4("n", COLUMNS, out=True), x0=f4("n", COLUMNS), m=f4("n", COLUMNS, out=True),
-    v=f4("n", COLUMNS, out=True), units=f4("n"), box_shares=f4("n"), min_sizes=f4("n"), drawn=f4("n"),
-    ids=i4("n", out=True), num_kept=i8("pieces", out=True), conics=f4("n", CONIC, out=True),
-    depths=f4("n", out=True), tints=f4("n", 3, out=True), boxes=i2("n", 4, out=True), order=i4("n", out=True),
-    keys=u8("n", out=True), spare=u8("n", out=True), ordered_boxes=i2("n", 4, out=True),
-    sums=f4("n", SUMS, out=True), g_means=f4("n", 3, out=True), g_quats=f4("n", 4, out=True),
-    g_scales=f4("n", 3, out=True), g_opacities=f4("n", out=True), g_colors=f4("n", 3, out=True),
+    v=f4("n", COLUMNS, out=True), units=f4("n"), box_shares=f4("n"), min_sizes=f4("n"), fixed=u1("n"),
+    sh0=f4("n", 1, 3), shN=f4("n", "num", 3), drawn=f4("n"), ids=i4("n", out=True),
+    num_kept=i8("pieces", out=True), conics=f4("n", CONIC, out=True), depths=f4("n", out=True),
+    tints=f4("n", 3, out=True), boxes=i2("n", 4, out=True), order=i4("n", out=True), keys=u8("n", out=True),
+    spare=u8("n", out=True), ordered_boxes=i2("n", 4, out=True), sums=f4("n", SUMS, out=True),
+    g_means=f4("n", 3, out=True), g_quats=f4("n", 4, out=True), g_scales=f4("n", 3, out=True),
+    g_opacities=f4("n", out=True), g_colors=f4("n", 3, out=True), g_poses=f4("blocks", POSE, out=True),
     corners=i8("spans", "num_corners", out=True), counts=i8("spans", "tiles", out=True),
-    offsets=i8("ends", out=True), flatten_ids=i4("room", out=True), slots=f4("room", SUMS, out=True),
-    image=f4("height", "width", 3, out=True), transmittance=f4("height", "width", out=True),
-    gradient=f4("height", "width", 3, out=True), errors=f4("height", out=True),
-    terms=f4("threads", ROWS, TERMS, "line", out=True), rows=f4("threads", EDGE_ROWS, "line", out=True),
-    photo=f4("height", "width", 3), weight=f4("height", "width"), camera=f4(CAMERA), background=f4(3),
-    loss_weights=f4(2), rates=f4(COLUMNS), limits=f4(5), betas=f4(2), regs=f4(2),
+    offsets=i8("ends", out=True), light=f4("tiles", out=True), flatten_ids=i4("room", out=True),
+    slots=f4("room", SUMS, out=True), image=f4("height", "width", 3, out=True),
+    transmittance=f4("height", "width", out=True), gradient=f4("height", "width", 3, out=True),
+    errors=f4("height", out=True), terms=f4("threads", ROWS, TERMS, "line", out=True),
+    rows=f4("threads", EDGE_ROWS, "line", out=True), photo=f4("height", "width", 3), weight=f4("height", "width"),
+    camera=f4(CAMERA), eye=f4(3), background=f4(3), loss_weights=f4(2), rates=f4(COLUMNS), limits=f4(5), betas=f4(2),
+    regs=f4(2),
 )  # fmt: skip
 
 

@@ -31,6 +31,7 @@ class Run:
     units: np.ndarray
     box_shares: np.ndarray
     min_sizes: np.ndarray
+    fixed: np.ndarray
     means: np.ndarray
     quats: np.ndarray
     scales: np.ndarray
@@ -65,8 +66,8 @@ def make_run(count: int, seed: int = 0) -> Run:
     opacities = 1 / (1 + elementary.exp(-x[:, LOGIT]))
     min_sizes = np.full(count, -np.inf, np.float32)
     return Run(
-        x, x.copy(), zeros, zeros.copy(), units, box_shares, min_sizes, x[:, MEAN].copy(), x[:, TURN].copy(),
-        elementary.exp(x[:, SIZE:QUAT]), opacities, x[:, COLOR:].copy(),
+        x, x.copy(), zeros, zeros.copy(), units, box_shares, min_sizes, np.zeros(count, np.uint8),
+        x[:, MEAN].copy(), x[:, TURN].copy(), elementary.exp(x[:, SIZE:QUAT]), opacities, x[:, COLOR:].copy(),
     )  # fmt: skip
 
 
@@ -85,7 +86,7 @@ def step_kernel(run: Run, g: Wanted, step: int, pieces: list[int] | None = None,
     edges = pieces or [0, len(g.ids)]
     for first, last in pairwise(edges):
         adam(
-            run.x, run.x0, run.m, run.v, run.units, run.box_shares, run.min_sizes,
+            run.x, run.x0, run.m, run.v, run.units, run.box_shares, run.min_sizes, run.fixed,
             g.ids, g.means, g.quats, g.scales, g.opacities, g.colors,
             rates.astype(np.float32), LIMITS.astype(np.float32), BETAS.astype(np.float32), REGS, step, first, last,
             run.means, run.quats, run.scales, run.opacities, run.colors,
@@ -141,6 +142,20 @@ def test_steps_match_the_slow_twin() -> None:
         step_slowly(slow, g, step)
     for name in ("m", "v", "x", "means", "quats", "scales", "opacities", "colors"):
         np.testing.assert_allclose(getattr(run, name), getattr(slow, name), rtol=2e-4, atol=2e-5, err_msg=name)
+
+
+def test_fixed_rows_take_no_step() -> None:
+    """The others take the same step, whatever their number, as without gradients of the fixed ones."""
+    run, g = make_run(40), gradients(40, seed=1)
+    run.fixed[::3] = 1
+    free, start = run.copy(), run.copy()
+    step_kernel(run, g, 1)
+    of_free = run.fixed[g.ids] == 0
+    step_kernel(free, Wanted(*(np.ascontiguousarray(column[of_free]) for column in vars(g).values())), 1)
+    for f in fields(run):
+        np.testing.assert_array_equal(getattr(run, f.name), getattr(free, f.name), err_msg=f.name)
+        np.testing.assert_array_equal(getattr(run, f.name)[::3], getattr(start, f.name)[::3], err_msg=f.name)
+    assert not np.array_equal(run.x, start.x)
 
 
 def test_colours_that_begin_outside_the_range_may_stay_there() -> None:

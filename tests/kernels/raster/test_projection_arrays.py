@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from messages import refuses
+from slow_steps import differentiate_rows
 
 from gsmerge.kernels.elementary import exp, sin
 from gsmerge.kernels.raster import image_loss, project, sh
@@ -204,8 +205,7 @@ def test_loss_has_the_same_bits_on_every_processor(each_target: Any, size: tuple
 
     def run() -> list[np.ndarray]:
         gradient, errors = np.empty_like(image), np.empty(height, np.float32)
-        weights = np.float32(0.2), np.float32(1.2)
-        image_loss.image_gradient(image, photo, weight, *weights, 0, height, gradient, errors)
+        differentiate_rows(image, photo, weight, 0.2, 1.2, 0, height, gradient, errors)
         return plain([gradient, errors])
 
     gradient, _ = each_target(run)
@@ -218,4 +218,4 @@ def test_memory_of_the_loss_that_is_too_small_is_refused() -> None:
     terms, rows = (np.empty((*shape, image_loss.CHUNK), np.float32) for shape in ((12, 3), (7,)))
     outputs = image.copy(), weight[:, 0].copy(), terms, rows
     with refuses(ValueError, "loss_gradient", "indices"):
-        image_loss._loss_gradient(image, image, weight, 0.2, 1.2, 0, 4, *outputs)
+        image_loss.loss_gradient(image, image, weight, 0.2, 1.2, 0, 4, *outputs)

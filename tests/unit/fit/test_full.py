@@ -215,8 +215,8 @@ def test_views_take_turns_and_dropout_follows_the_growth(
     assert len(fit_full(start, run)[0]) == len(start) + 20
     assert run.dropout == DROPOUT > 0
     assert [step.number for step in taken] == list(range(1, 321))
-    assert (len(taken[0].kept), len(taken[-1].kept)) == (len(start), len(start) + 20)
-    assert 0.8 < np.concatenate([step.kept for step in taken]).mean() < 1
+    assert (len(taken[0].mask), len(taken[-1].mask)) == (len(start), len(start) + 20)
+    assert 0.8 < np.concatenate([step.mask for step in taken]).mean() < 1
     views = [step.view for step in taken]
     assert all(sorted(views[i : i + 3]) == [0, 1, 2] for i in range(0, 318, 3))
 

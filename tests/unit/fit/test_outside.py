@@ -19,8 +19,8 @@ from gsmerge.fit.outside import (
     RIM,
     VEIL,
     Outside,
-    look_outside,
     mark_empty,
+    place_outside_views,
     score_fog,
     veil_gradients,
 )
@@ -43,7 +43,7 @@ def outside(truth: Gaussians, photos: Pair) -> Outside:
 
 def look(reference: Gaussians, photos: Pair) -> Outside:
     """See how far views from outside look into Gaussians without pixels."""
-    views = look_outside(scenes.bare(reference), reference, photos[1], OPTIONS)
+    views = place_outside_views(scenes.bare(reference), reference, photos[1], OPTIONS)
     assert views is not None
     return views
 
@@ -81,8 +81,8 @@ def test_views_stand_behind_and_around(outside: Outside, truth: Gaussians, photo
 
 def test_a_scene_that_shows_nothing_has_none(truth: Gaussians, photos: Pair) -> None:
     faint = replace(truth[:5], opacities=np.full(5, 0.3, np.float32), scales=np.full((5, 3), 1e3, np.float32))
-    assert look_outside(scenes.bare(faint), truth, photos[1], OPTIONS) is None
-    assert look_outside(scenes.bare(truth[:0]), faint, photos[1], OPTIONS) is None
+    assert place_outside_views(scenes.bare(faint), truth, photos[1], OPTIONS) is None
+    assert place_outside_views(scenes.bare(truth[:0]), faint, photos[1], OPTIONS) is None
 
 
 def test_views_see_as_far_as_the_scene_shows_something(outside: Outside, truth: Gaussians) -> None:

@@ -13,8 +13,8 @@ from gsmerge.fit import FitJob, FitOptions, FitReport, fit, stage
 from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
-from gsmerge.fit.outside import look_outside, score_fog
-from gsmerge.fit.survey import JUDGES, choose_looks, judging_views, peak_weights, score_images, survey_photos
+from gsmerge.fit.outside import place_outside_views, score_fog
+from gsmerge.fit.survey import MOST_SCORED, choose_views, peak_weights, score_images, scored_views, survey_photos
 from gsmerge.raster import composite, contributions, make_splats, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.types import SH_C0
@@ -32,7 +32,7 @@ def visible(gaussians: Gaussians, photos: Photos) -> np.ndarray:
 
 def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
-    outside = look_outside(scenes.bare(truth), start, photos[1], QUICK)
+    outside = place_outside_views(scenes.bare(truth), start, photos[1], QUICK)
     assert outside is not None
     result, report = fit(start, FitJob(photos, QUICK, seed=4, outside=outside))
     expected, own = fit_full(start, scenes.run_for(photos, QUICK, seed=4, outside=outside))
@@ -125,9 +125,9 @@ def test_many_photos_are_surveyed_by_some_that_look_everywhere(truth: Gaussians)
     places = np.zeros((500, 3), np.float32)
     places[:, 0], places[:, 2] = np.linspace(-0.4, 40, 500), 2
     points = replace(truth[np.zeros(500, int)], means=places)
-    assert choose_looks(points, photos_of(np.zeros(9))) == list(range(9))
-    near = choose_looks(points, photos_of(np.linspace(0, 0.001, 40)))
-    assert near == judging_views(40)
-    assert len(near) == JUDGES
+    assert choose_views(points, photos_of(np.zeros(9))) == list(range(9))
+    near = choose_views(points, photos_of(np.linspace(0, 0.001, 40)))
+    assert near == scored_views(40)
+    assert len(near) == MOST_SCORED
     assert np.diff(near).max() <= 8
-    assert choose_looks(points, photos_of(np.arange(40.0))) == list(range(40))  # each surface is in two
+    assert choose_views(points, photos_of(np.arange(40.0))) == list(range(40))  # each surface is in two

@@ -1,0 +1,52 @@
+"""Averages over the last steps of a fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
+
+RECENT = 10
+
+
+@dataclass
+class RecentMean:
+    """Mean of about the last ``RECENT`` numbers."""
+
+    mean: float = 0.0
+    count: int = 0  # Numbers that count, at most RECENT
+
+    def add(self, number: float) -> None:
+        """Add a number."""
+        self.count = min(self.count + 1, RECENT)
+        self.mean += (number - self.mean) / self.count
+
+    def restart(self) -> None:
+        """Let only the numbers from the next one on count."""
+        self.count = 0
+
+
+@dataclass
+class TailMean:
+    """Mean of the parameters ``[n,14]`` over the last steps, since those of one step are noisy."""
+
+    total: np.ndarray | None = None
+    count: int = 0  # Steps that are added
+
+    def add(self, x: np.ndarray) -> None:
+        """Add the parameters after a step; begin anew if the number of Gaussians has changed."""
+        if self.total is None or len(self.total) != len(x):
+            self.total, self.count = 0 * x, 0
+        self.count += 1
+        self.total += x
+
+    def of(self, x: np.ndarray) -> np.ndarray:
+        """Return the mean with normalised quaternions; ``x`` itself without steps with this number of Gaussians."""
+        if self.total is None or len(self.total) != len(x):
+            return x
+        mean = self.total / self.count
+        quats = mean[:, QUAT:LOGIT]
+        quats /= (quats * quats).sum(1)[:, None] ** 0.5
+        return mean

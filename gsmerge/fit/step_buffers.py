@@ -1,0 +1,124 @@
+"""Buffers of the steps of a fit, with which a step is a few calls of the native library.
+
+Memory is allocated and arguments are checked once for many steps. A slow twin in the tests takes the same steps by
+single calls of the kernels, with the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsmerge.fit.fit_state import FitState
+from gsmerge.kernels.raster import image_loss
+from gsmerge.kernels.raster.project import BLOCK, CAMERA, CONIC, POSE, SUMS, TILE
+from gsmerge.kernels.raster.step import PHASES, PIECE, STEP, fit_phase
+from gsmerge.kernels.signature import FilledTable
+from gsmerge.raster.gradient import viewmat_gradient
+from gsmerge.raster.tiled_view import cache_line_rows, hides_most
+from gsmerge.runtime.threads import parallel_map
+
+SPARE = 1.25  # room that is allocated, as a multiple of the intersections of a view that needs more
+OF_STATE = ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors")
+OF_SPLATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+# Arrays that each step sets, with their lengths
+OF_STEP = {
+    "camera": CAMERA, "eye": 3, "background": 3, "loss_weights": 2, "rates": 14, "limits": 5, "betas": 2, "regs": 2,
+}  # fmt: skip
+
+
+@dataclass(eq=False)
+class StepBuffers:
+    """Buffers for the steps of a state, with a filled table for each size of the photos."""
+
+    state: FitState
+    threads: int
+    moves_camera: bool = False  # Whether steps compute the gradient of the viewmat
+    gaussians: dict[str, np.ndarray] = field(default_factory=dict)  # Buffers over Gaussians, and those of a step
+    room: dict[str, np.ndarray] = field(default_factory=dict)  # Buffers over intersections
+    tables: dict[tuple[int, int], tuple[FilledTable, list[Callable[[], None]]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.state.x)
+        widths = {"tints": 3, "sums": SUMS, "g_means": 3, "g_quats": 4, "g_scales": 3, "g_colors": 3}
+        self.gaussians |= {name: np.empty((n, width), np.float32) for name, width in widths.items()}
+        self.gaussians |= {name: np.empty(n, np.float32) for name in ("depths", "g_opacities")}
+        self.gaussians |= {name: np.empty((n, 4), np.int16) for name in ("boxes", "ordered_boxes")}
+        self.gaussians |= {name: np.empty(n, np.int32) for name in ("ids", "order")}
+        self.gaussians |= {name: np.empty(n, np.uint64) for name in ("keys", "spare")}
+        self.gaussians |= {name: np.zeros(size, np.float32) for name, size in OF_STEP.items()}
+        self.gaussians |= {"conics": cache_line_rows(n, CONIC), "num_kept": np.empty(-(-n // PIECE), np.int64)}
+        self.gaussians |= {"g_poses": np.empty((-(-n // BLOCK) * self.moves_camera, POSE), np.float32)}
+        self.gaussians |= {"fixed": self.state.fixed.view(np.uint8)}
+        self.gaussians |= {name: getattr(self.state, name) for name in OF_STATE}
+        self.gaussians |= {name: getattr(self.state.splats, name) for name in OF_SPLATS}
+        self._make_room(1)
+
+    def take(
+        self, number: int, photo: np.ndarray, weight: np.ndarray, drawn: np.ndarray, numbers: dict[str, np.ndarray]
+    ) -> tuple[float, np.ndarray | None]:
+        """Take step ``number`` on a photo ``[h,w,3]`` whose pixels weigh ``weight [h,w]``.
+
+        Args:
+            drawn: ``[n]`` float32, the opacities to draw.
+            numbers: The arrays of ``OF_STEP``: camera and its centre, background, constants of loss and optimiser.
+
+        Returns:
+            The sum of squared errors, and the gradient ``[4,4]`` of the viewmat; None if the camera does not move.
+        """
+        self.state.update_harmonics()
+        for name, values in numbers.items():
+            self.gaussians[name][:] = values
+        table = self._table(photo, weight, drawn)
+        table["failed"], table["step"] = 0, number
+        self._run(weight.shape, "cull", "project", "count")
+        is_open = hides_most(table["num_intersections"], table["num_visible"])
+        if is_open:  # lists end where their tiles are opaque, or they would be too long
+            self._run(weight.shape, "count_open")
+        if table["num_intersections"] > len(self.room["flatten_ids"]):
+            self._make_room(int(SPARE * table["num_intersections"]))
+            return self.take(number, photo, weight, drawn, numbers)
+        self._run(weight.shape, "deal_open" if is_open else "deal", "blend", "loss", "backward", "update")
+        error = float(table.arrays["errors"].sum(dtype=np.float64))
+        if not self.moves_camera:
+            return error, None
+        poses = self.gaussians["g_poses"][: -(-table["num_visible"] // BLOCK)]
+        return error, viewmat_gradient(poses, self.state.splats.origin)
+
+    def _make_room(self, count: int) -> None:
+        """Allocate buffers for ``count`` intersections, and drop the tables with the old ones."""
+        self.tables.clear()
+        self.room = {"flatten_ids": np.empty(count, np.int32), "slots": np.empty((count, SUMS), np.float32)}
+
+    def _table(self, photo: np.ndarray, weight: np.ndarray, drawn: np.ndarray) -> FilledTable:
+        """Return the table for the size of a photo, filled with the photo, its weights and the drawn opacities."""
+        of_step = {"photo": photo, "weight": weight, "drawn": drawn}
+        if weight.shape not in self.tables:
+            table = STEP.fill(self.gaussians | self.room | self._pixel_buffers(*weight.shape) | of_step)
+            calls = [fit_phase.prepare(table.values, phase) for phase in range(len(PHASES))]
+            self.tables[weight.shape] = table, calls
+        table = self.tables[weight.shape][0]
+        for name, array in of_step.items():
+            table.point(name, array)
+        return table
+
+    def _pixel_buffers(self, height: int, width: int) -> dict[str, np.ndarray]:
+        """Allocate buffers over the pixels and the tiles of a photo."""
+        columns, lines, line = -(-width // TILE), -(-height // TILE), image_loss.room_of(width)
+        spans, tiles, corners = 2 * self.threads, columns * lines, (columns + 1) * (lines + 1)
+        shapes: dict[str, tuple[int, ...]] = {
+            "image": (height, width, 3), "gradient": (height, width, 3), "transmittance": (height, width),
+            "errors": (height,), "terms": (self.threads, image_loss.ROWS, image_loss.TERMS, line),
+            "rows": (self.threads, image_loss.EDGE_ROWS, line), "light": (tiles,),
+        }  # fmt: skip
+        counts = {"corners": (spans, corners), "counts": (spans, tiles), "offsets": (tiles + 1,)}
+        pictures = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+        return pictures | {name: np.empty(shape, np.int64) for name, shape in counts.items()}
+
+    def _run(self, size: tuple[int, int], *phases: str) -> None:
+        """Run phases one after the other on a photo of a size, each on all threads."""
+        calls = self.tables[size][1]
+        for phase in phases:
+            parallel_map(lambda call: call(), [calls[PHASES.index(phase)]] * self.threads)
