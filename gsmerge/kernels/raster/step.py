@@ -1,7 +1,7 @@
 """One step of a fit, from projection to the optimiser, as a table of buffers and phases that work through it.
 
-The kernels are those of the modules beside this one, and so are the bits. What a step needs is checked once, when the
-table is filled; then a phase is a call without arguments on every thread, see ``gsmerge/kernels/raster/step.c``.
+The kernels and their bits are those of the other modules. What a step needs is checked once, when the table is filled.
+Then a phase is one call without arguments on every thread, see ``gsmerge/kernels/raster/step.c``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from gsmerge.kernels.raster.image_loss import EDGE_ROWS, ROWS, TERMS
 from gsmerge.kernels.raster.project import CAMERA, CONIC, POSE, SUMS
 from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1, u8
 
-# Where most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" stands in for "deal"
+# Where most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces "deal". The list of
+# a tile then ends where no light passes the Gaussians in front
 PHASES = ("cull", "project", "count", "count_open", "deal", "deal_open", "blend", "loss", "backward", "update")
 PIECE = 1 << 13  # Gaussians that are culled or projected by one thread at a time
 
@@ -43,6 +44,6 @@ STEP = Table(
 def fit_phase(table, phase):
     """Work on a phase of a step until it is finished; each of the ``threads`` makes one such call.
 
-    A phase begins when all calls of the phase before have ended. After "count" the table holds the number of
-    intersections, and the buffers must have room for them before the next phase.
+    A phase begins when all calls of the phase before have ended. After "count" and "count_open" the table holds the
+    number of intersections, and the buffers must have room for them before the next phase.
     """
