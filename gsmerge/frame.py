@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.geometry import camera_depths, lower_median, project
+from gsmerge.geometry import camera_depths, lower_median, move_region, project
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene, SceneT
@@ -97,6 +97,6 @@ def sample_rows(scene: Scene) -> np.ndarray:
 def canonicalise(scene: SceneT, frame: Frame | None = None) -> tuple[SceneT, Frame]:
     """Move a scene into the canonical ``frame``, by default its own; return the scene and the frame."""
     frame = frame or scene_frame(scene)
-    region = None if scene.region is None else scene.region.enter(frame.origin, frame.unit)
+    region = None if scene.region is None else move_region(scene.region, frame.origin, frame.unit)
     gaussians, cameras = frame.enter(scene.gaussians), frame.enter_cameras(scene.cameras)
     return replace(scene, gaussians=gaussians, cameras=cameras, region=region), frame

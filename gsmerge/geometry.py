@@ -8,11 +8,12 @@ from typing import TypeVar
 
 import numpy as np
 
+from gsmerge.arrays import Array
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import SH_C0, Array, Cameras, Gaussians, SceneT
+from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
 
 State = TypeVar("State")  # what a descent moves
 MORTON_BITS = 21  # per axis: three fit into 63 bits
@@ -413,40 +414,32 @@ class Similarity:
 IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
 
 
-@dataclass(frozen=True, eq=False)
-class Region:
-    """A box, which may be turned, or a sphere: means of points inside lie inside, as both are convex."""
+def move_region(region: Region, origin: np.ndarray, unit: float) -> Region:
+    """Move a region into a frame of another origin and unit, whose positions are float32."""
+    middle, half = (region.middle - origin) / unit, region.half / unit
+    own = float(np.finfo(np.float32).eps) * float(np.abs(middle).max() + half.max())
+    return replace(region, middle=middle, half=half, rounding=region.rounding / unit + own)
 
-    middle: np.ndarray  # ``[3]``
-    half: np.ndarray  # ``[3]`` half of each side of a box; three times the radius of a sphere
-    axes: np.ndarray  # ``[3,3]`` rotation into the directions of the sides
-    is_sphere: bool
-    rounding: float = 0.0  # of stored positions, by which clamped ones stay away from the border
 
-    def enter(self, origin: np.ndarray, unit: float) -> Region:
-        """Move the region into a frame of another origin and unit, whose positions are float32."""
-        middle, half = (self.middle - origin) / unit, self.half / unit
-        own = float(np.finfo(np.float32).eps) * float(np.abs(middle).max() + half.max())
-        return replace(self, middle=middle, half=half, rounding=self.rounding / unit + own)
+def lies_inside(region: Region, points: np.ndarray) -> np.ndarray:
+    """Return a mask ``[n]`` of the ``points [n,3]`` inside a region, border included."""
+    local = matmul(points - region.middle, region.axes.T)
+    slack = 4 * float(np.finfo(np.float64).eps) * (np.abs(region.middle).max() + region.half.max())
+    if region.is_sphere:
+        return np.asarray(np.square(local).sum(1) <= (region.half[0] + slack) ** 2)
+    return np.asarray((np.abs(local) <= region.half + slack).all(1))
 
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return a mask ``[n]`` of the ``points [n,3]`` inside, border included."""
-        local = matmul(points - self.middle, self.axes.T)
-        slack = 4 * float(np.finfo(np.float64).eps) * (np.abs(self.middle).max() + self.half.max())
-        if self.is_sphere:
-            return np.asarray(np.square(local).sum(1) <= (self.half[0] + slack) ** 2)
-        return np.asarray((np.abs(local) <= self.half + slack).all(1))
 
-    def clamp(self, points: np.ndarray) -> np.ndarray:
-        """Return the points inside that are nearest to ``points [n,3]``, in float64."""
-        local = matmul(points - self.middle, self.axes.T)
-        most = np.maximum(self.half - self.rounding, self.half / 2)
-        if self.is_sphere:
-            lengths = np.sqrt(np.square(local).sum(1, keepdims=True))
-            local *= np.minimum(1.0, most[0] / np.maximum(lengths, most[0]))
-        else:
-            local = np.clip(local, -most, most)
-        return np.asarray(self.middle + matmul(local, self.axes))
+def clamp_inside(region: Region, points: np.ndarray) -> np.ndarray:
+    """Return the points of a region that are nearest to ``points [n,3]``, in float64."""
+    local = matmul(points - region.middle, region.axes.T)
+    most = np.maximum(region.half - region.rounding, region.half / 2)
+    if region.is_sphere:
+        lengths = np.sqrt(np.square(local).sum(1, keepdims=True))
+        local *= np.minimum(1.0, most[0] / np.maximum(lengths, most[0]))
+    else:
+        local = np.clip(local, -most, most)
+    return np.asarray(region.middle + matmul(local, region.axes))
 
 
 def mean_pose_frame(viewmats: np.ndarray) -> Similarity:

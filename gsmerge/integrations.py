@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array, like
 from gsmerge.errors import SceneError
 from gsmerge.geometry import normalize, rotmat_to_quat
 from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.matrices import eigh, invert
-from gsmerge.types import Array, as_array, like
 
 _OTHER_SIZE = 0.1  # share by which a principal point is farther from the middle than one of this size ever is
 _BYTES = 255.0  # largest value of an image of bytes

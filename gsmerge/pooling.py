@@ -7,11 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.geometry import camera_depths
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.pool import decompose, pool
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Gaussians, Pixels, Scene, to_float32
+from gsmerge.types import FeatureGaussians, Gaussians, Pixels, Scene
 
 Rule = Literal["depth", "paper"]
 

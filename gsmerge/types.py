@@ -17,81 +17,16 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gsmerge.errors import refuse_without_torch
+from gsmerge.arrays import Array, as_array, as_pictures, as_tensor, check_shape, concat_rows
 
 if TYPE_CHECKING:
     import torch
 
-    from gsmerge.geometry import Region
-
 SceneT = TypeVar("SceneT", bound="Scene")
 StrPath = str | os.PathLike[str]
-Array = NDArray[Any]  # or a torch tensor where a docstring allows one, which type checkers do not see
 
 SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0: rgb = 0.5 + SH_C0 * sh0
-
-
-def _expect(name: str, array: Array, shape: tuple[int | str, ...]) -> None:
-    ok = array.ndim == len(shape) and all(
-        isinstance(want, str) or want == have for want, have in zip(shape, array.shape, strict=True)
-    )
-    if not ok:
-        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
-
-
-def as_array(values: Array) -> np.ndarray:
-    """Return an array, or a tensor on any device, as a NumPy array without gradient; copied only if needed."""
-    return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
-
-
-def as_pictures(images: Array) -> np.ndarray:
-    """Return pictures ``[...,3]`` as sRGB in [0, 1], those of uint8 divided by 255.
-
-    Raises ValueError for numbers that are more than one level of 255 beyond.
-    """
-    pictures = as_array(images)
-    if pictures.dtype == np.uint8:
-        return np.multiply(pictures, np.float32(1 / 255), dtype=np.float32)
-    low, high = (float(pictures.min()), float(pictures.max())) if pictures.size else (0.0, 0.0)
-    if not (low >= -1 / 255 and high <= 1 + 1 / 255):
-        remedy = "divide them by 255" if low >= 0 and 1.5 < high <= 255 else "clip them"
-        raise ValueError(f"images: expected sRGB in [0, 1], or uint8, got {low:.4g} to {high:.4g}; {remedy}")
-    return pictures
-
-
-def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor:
-    """Return an array or a tensor as a tensor on a device; on the CPU it shares the array's memory."""
-    with refuse_without_torch():
-        import torch
-
-    return torch.as_tensor(values, device=device)
-
-
-def to_float32(values: np.ndarray) -> np.ndarray:
-    """Round an array to float32; numbers beyond its range become infinite."""
-    with np.errstate(over="ignore"):
-        return values.astype(np.float32)
-
-
-def like(values: np.ndarray, template: Array) -> Any:
-    """Convert ``values`` to the type of ``template``: a NumPy array, or a tensor on the same device."""
-    return as_tensor(values, template.device) if hasattr(template, "detach") else values
-
-
-def concat_rows(parts: Sequence[Array], axis: int = 0) -> Any:
-    """Concatenate arrays, or tensors, along ``axis``."""
-    if all(isinstance(part, np.ndarray) for part in parts):
-        return np.concatenate(parts, axis)
-    import torch
-
-    return torch.cat([torch.as_tensor(part) for part in parts], axis)
-
-
-def concat_columns(parts: Sequence[Array]) -> Array:
-    """Put the columns of arrays or of tensors side by side."""
-    return concat_rows(parts, 1)
 
 
 @dataclass(frozen=True)
@@ -124,12 +59,12 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
-        _expect("means", self.means, (n, 3))
-        _expect("quats", self.quats, (n, 4))
-        _expect("scales", self.scales, (n, 3))
-        _expect("opacities", self.opacities, (n,))
-        _expect("sh0", self.sh0, (n, 1, 3))
-        _expect("shN", self.shN, (n, "k-1", 3))
+        check_shape("means", self.means, (n, 3))
+        check_shape("quats", self.quats, (n, 4))
+        check_shape("scales", self.scales, (n, 3))
+        check_shape("opacities", self.opacities, (n,))
+        check_shape("sh0", self.sh0, (n, 1, 3))
+        check_shape("shN", self.shN, (n, "k-1", 3))
         if self.shN.shape[1] not in (0, 3, 8, 15, 24):
             raise ValueError(f"shN: expected 0, 3, 8, 15 or 24 coefficients, got {self.shN.shape[1]}")
 
@@ -210,8 +145,8 @@ class Cameras:
 
     def __post_init__(self) -> None:
         c = self.viewmats.shape[0]
-        _expect("viewmats", self.viewmats, (c, 4, 4))
-        _expect("Ks", self.Ks, (c, 3, 3))
+        check_shape("viewmats", self.viewmats, (c, 4, 4))
+        check_shape("Ks", self.Ks, (c, 3, 3))
         if self.width < 1 or self.height < 1:
             raise ValueError(f"expected a positive image size, got {self.width} x {self.height}")
 
@@ -352,6 +287,17 @@ class Pixels:
         return rows, Pixels(np.concatenate(homes), np.array(fronts, np.int32).reshape(shape), own=self.own)
 
 
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A box, which may be rotated, or a sphere. Both are convex, so means of points inside lie inside."""
+
+    middle: np.ndarray  # [3]
+    half: np.ndarray  # [3] half of each side of a box; the radius of a sphere, in each of the three
+    axes: np.ndarray  # [3,3] rotation into the directions of the sides
+    is_sphere: bool
+    rounding: float = 0.0  # of stored positions: clamped ones stay so far inside the border
+
+
 @dataclass(frozen=True)
 class Scene:
     """Gaussians, and the views that they were made from or that see them.
@@ -394,11 +340,11 @@ class Scene:
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
         if self.pixels is not None:
-            _expect("homes", self.pixels.homes, (len(self.gaussians),))
-            _expect("fronts", self.pixels.fronts, (v, h, w))
+            check_shape("homes", self.pixels.homes, (len(self.gaussians),))
+            check_shape("fronts", self.pixels.fronts, (v, h, w))
         for name in PER_PIXEL:
             if getattr(self, name) is not None:
-                _expect(name, getattr(self, name), (v, h, w, 3) if name == "images" else (v, h, w))
+                check_shape(name, getattr(self, name), (v, h, w, 3) if name == "images" else (v, h, w))
         for what, values in (("view names", self.names), ("large photos", getattr(self.large_photos, "ids", None))):
             if values is not None and len(values) != v:
                 raise ValueError(f"expected {v} {what}, got {len(values)}")
@@ -411,6 +357,11 @@ class Scene:
         images = ", images" if self.images is not None else ""
         own = ", of pixels" if self.has_own_pixels else ""
         return f"Scene({len(self.gaussians):,} Gaussians, {views}{images}{own})"
+
+    @staticmethod
+    def of(gaussians: Gaussians, cameras: Cameras) -> Scene:
+        """Make a scene of Gaussians and cameras alone, whose views have numbers for names."""
+        return Scene(gaussians, cameras, None, None, tuple(f"view {view}" for view in range(len(cameras))))
 
     def numpy(self) -> Scene:
         """Return the same scene with NumPy arrays in place of tensors, images in [0, 1]; ValueError for others."""
@@ -497,7 +448,7 @@ class PicturedScene(Scene):
     empty: np.ndarray | None = None
 
     @staticmethod
-    def of(scene: Scene, images: np.ndarray, masks: np.ndarray | None) -> PicturedScene:
+    def with_pictures(scene: Scene, images: np.ndarray, masks: np.ndarray | None) -> PicturedScene:
         """Return a scene with pictures ``[v,h,w,3]``, sRGB in [0, 1], and the masks of the pixels that count."""
         columns = {field.name: getattr(scene, field.name) for field in fields(Scene)}
         return PicturedScene(**columns | {"images": images, "masks": masks})
@@ -515,7 +466,7 @@ class Groups:
     counts: tuple[int, ...]  # Superpixels of each view
 
     def __post_init__(self) -> None:
-        _expect("labels", self.labels, (len(self.counts), "h", "w"))
+        check_shape("labels", self.labels, (len(self.counts), "h", "w"))
 
     def __len__(self) -> int:
         return sum(self.counts)
@@ -565,10 +516,10 @@ class FeatureGaussians:
     def __post_init__(self) -> None:
         g = self.means.shape[0]
         for name in ("weights", "masses", "extinctions", "gains", "footprints", "views"):
-            _expect(name, getattr(self, name), (g,))
-        _expect("covars", self.covars, (g, 3, 3))
-        _expect("starts", self.starts, (g + 1,))
-        _expect("latents", self.latents, (g, "d"))
+            check_shape(name, getattr(self, name), (g,))
+        check_shape("covars", self.covars, (g, 3, 3))
+        check_shape("starts", self.starts, (g + 1,))
+        check_shape("latents", self.latents, (g, "d"))
 
     def __len__(self) -> int:
         return self.means.shape[0]

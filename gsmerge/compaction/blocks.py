@@ -321,7 +321,7 @@ def join_views(chosen: Sequence[tuple[PicturedScene, list[int]]]) -> PicturedSce
             first += 1
         free_pages([scene.images, images])
     joined = concat_scenes([subset(scene.without_pictures(), ids) for scene, ids in chosen], images)
-    return PicturedScene.of(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
+    return PicturedScene.with_pictures(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
 
 
 def _view_weights(splats: Splats, parts: Sequence[BlockStart]) -> Iterator[tuple[int, int, np.ndarray]]:

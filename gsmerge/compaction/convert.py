@@ -192,7 +192,7 @@ def _clean(
     elif stored is not None:
         cameras = to_cameras(stored)
     placed = place_viewpoints(gaussians) if cameras is None else cameras
-    frame = scene_frame(Scene(gaussians, placed, None, None, tuple(map(str, range(len(placed))))))
+    frame = scene_frame(Scene.of(gaussians, placed))
     canonical = frame.enter(replace(gaussians, means=gaussians.means.astype(np.float64)))
     return clean(canonical, options.clean, frame.enter_cameras(placed), images, frame.leave)
 

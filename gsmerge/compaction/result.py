@@ -13,6 +13,7 @@ from weakref import ReferenceType
 import numpy as np
 
 from gsmerge.arguments import check_arguments
+from gsmerge.arrays import to_float32
 from gsmerge.compaction.new_views import SIDE, NewViews, Trial
 from gsmerge.compaction.outputs import write_result
 from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
@@ -30,7 +31,7 @@ from gsmerge.raster.photos import NEAR_PLANE, WHOLE, PhotoScore, scene_photos, s
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
 from gsmerge.stages.prune import ROUNDING
-from gsmerge.types import Cameras, Gaussians, Scene, StrPath, to_float32
+from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 
 if TYPE_CHECKING:
     import torch
@@ -107,8 +108,7 @@ class CompactResult:
             scene = self.scene() if isinstance(self.scene, ReferenceType) else self.scene
         if scene is not None:
             return view(scene, self)
-        names = tuple(f"view {i}" for i in range(len(self.cameras)))
-        return view(Scene(self.gaussians, self.cameras, None, None, names))
+        return view(Scene.of(self.gaussians, self.cameras))
 
     def __repr__(self) -> str:
         levels = f", {len(self.coarser)} coarser level(s)" if self.coarser else ""

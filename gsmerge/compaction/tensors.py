@@ -19,6 +19,7 @@ from gsmerge.alignment import (
     sample_pixels,
     w_seems_last,
 )
+from gsmerge.arrays import Array, as_array, to_float32
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError
@@ -37,7 +38,7 @@ from gsmerge.io.cameras.camera_file import (
 from gsmerge.io.formats.read import clear_invalid, clear_rows, find_empty
 from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
-from gsmerge.types import NO_CAMERAS, Array, Cameras, Gaussians, Pixels, Scene, as_array, to_float32
+from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

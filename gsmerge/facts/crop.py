@@ -10,12 +10,12 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.holes import usual_opacity
 from gsmerge.facts.views import take_rows
 from gsmerge.frame import canonicalise
-from gsmerge.geometry import Region, rgb_to_sh0, turn_by
+from gsmerge.geometry import lies_inside, rgb_to_sh0, turn_by
 from gsmerge.raster import render_in_turn
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import parse_crop
-from gsmerge.types import Scene
+from gsmerge.types import Region, Scene
 
 MOSTLY = 0.5  # of what a pixel shows, from which on it shows the inside more than the outside
 
@@ -32,7 +32,7 @@ def find_region(crop: str) -> Region:
 
 def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
     """Return a mask ``[n]`` of the world-frame centres ``[n,3]`` inside a crop, border included."""
-    return find_region(crop).contains(means)
+    return lies_inside(find_region(crop), means)
 
 
 def crop_scene(scene: Scene, crop: str) -> Scene:
@@ -41,7 +41,7 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
     Counts, fit and scores are then those of what is left. UsageError if that is nothing.
     """
     means, region = scene.gaussians.means, find_region(crop)
-    inside = region.contains(means)
+    inside = lies_inside(region, means)
     count = int(inside.sum())
     if count == 0:
         remedy = "gsmerge inspect says where the scene is"

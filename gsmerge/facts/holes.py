@@ -15,7 +15,7 @@ import numpy as np
 
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import fill_gaps
-from gsmerge.geometry import nearest_views, rgb_to_sh0
+from gsmerge.geometry import lies_inside, nearest_views, rgb_to_sh0
 from gsmerge.kernels.compare_views import add_differences
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
@@ -112,7 +112,7 @@ def _add_holes(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edg
     holes[[view for view in range(len(scene)) if view not in edges]] = False
     places = np.flatnonzero(holes)
     if scene.region is not None:
-        inside = scene.region.contains(added.means)
+        inside = lies_inside(scene.region, added.means)
         added, places = added[inside], places[inside]
     if len(places):
         note(f"{len(added):,} pixels that Gaussians hardly cover, or not at all, get the colours of their pictures")

@@ -133,12 +133,12 @@ def add_judges(scene: Scene) -> Scene:
 def blank_pictures(scene: Scene) -> PicturedScene:
     """Replace the photos by black pictures that take no memory."""
     shape = len(scene), scene.cameras.height, scene.cameras.width, 3
-    return PicturedScene.of(scene, np.broadcast_to(np.float32(0), shape), None)
+    return PicturedScene.with_pictures(scene, np.broadcast_to(np.float32(0), shape), None)
 
 
 def draw_pictures(scene: Scene) -> PicturedScene:
     """Render a canonical scene into its views and use the renders as its pictures."""
-    return PicturedScene.of(scene, render(scene.gaussians, scene.cameras).images.clip(0, 1), None)
+    return PicturedScene.with_pictures(scene, render(scene.gaussians, scene.cameras).images.clip(0, 1), None)
 
 
 def draw_around(scene: PicturedScene) -> PicturedScene:

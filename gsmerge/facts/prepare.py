@@ -208,7 +208,7 @@ def _with_pictures(
 ) -> tuple[PicturedScene, tuple[int, ...]]:
     """Return a scene with pictures, made by ``stand_in`` if no photo shows it, and the views whose photos show it."""
     if scene.images is not None:
-        pictured, views = compare_photos(PicturedScene.of(scene, scene.images, scene.masks), look)
+        pictured, views = compare_photos(PicturedScene.with_pictures(scene, scene.images, scene.masks), look)
         if views:
             return pictured, views
     return stand_in(replace(scene, images=None, large_photos=None, masks=None)), ()
@@ -248,7 +248,7 @@ def judged_pictures(scene: Scene) -> tuple[Scene, bool]:
     with record_part(silent=True) as record:
         canonical = canonicalise(scene)[0]
         if scene.images is not None:
-            compared, views = compare_photos(PicturedScene.of(canonical, scene.images, scene.masks))
+            compared, views = compare_photos(PicturedScene.with_pictures(canonical, scene.images, scene.masks))
             if views or not has_colors:
                 if canonical.has_own_pixels:
                     equalise_exposure(compared, views, "auto")

@@ -54,7 +54,7 @@ def add_row_colors(scene: Scene, *, given: bool = False) -> PicturedScene:
     detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE else ""
     if detail or not given:  # else a note has said it
         note((f"photos do not count: {ROW_COLORS} stand in for them" if given else NO_PHOTOS) + detail)
-    return PicturedScene.of(scene, images, None if masks.all() else masks)
+    return PicturedScene.with_pictures(scene, images, None if masks.all() else masks)
 
 
 @dataclass(frozen=True, eq=False)

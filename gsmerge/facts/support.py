@@ -44,8 +44,7 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
 def count_views_in_world(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """Count the views, at least one, that show each of n Gaussians of their own world, ``[n]`` int32."""
-    names = tuple(map(str, range(len(cameras))))
-    frame = scene_frame(Scene(gaussians, cameras, None, None, names))
+    frame = scene_frame(Scene.of(gaussians, cameras))
     return count_views(frame.enter(gaussians), frame.enter_cameras(cameras))
 
 

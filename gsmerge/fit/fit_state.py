@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.geometry import Region
+from gsmerge.geometry import clamp_inside, lies_inside
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.raster import Splats
-from gsmerge.types import SH_C0, Gaussians
+from gsmerge.types import SH_C0, Gaussians, Region
 
 # What rows of a state carry along in addition to what follows from their parameters
 CARRIED = ("x0", "m", "v", "units", "box_shares", "min_sizes", "origins", "fixed")
@@ -41,8 +41,8 @@ class FitState:
 
     def keep_inside(self, region: Region) -> None:
         """Move centres outside of a region to its border, in place, except those of fixed Gaussians."""
-        rows = np.flatnonzero(~region.contains(self.x[:, :SIZE]) & ~self.fixed)
-        self.x[rows, :SIZE] = self.splats.means[rows] = region.clamp(self.x[rows, :SIZE])
+        rows = np.flatnonzero(~lies_inside(region, self.x[:, :SIZE]) & ~self.fixed)
+        self.x[rows, :SIZE] = self.splats.means[rows] = clamp_inside(region, self.x[rows, :SIZE])
 
     def update_harmonics(self) -> None:
         """Bring ``splats.sh0`` up to date with the base colours, in place, if there are higher harmonics."""

@@ -10,10 +10,10 @@ import numpy as np
 from gsmerge.fit.edges import Edges
 from gsmerge.fit.outside import Outside
 from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weights
-from gsmerge.geometry import Region
 from gsmerge.kernels.elementary import power
 from gsmerge.raster.photos import WHOLE_PHOTO, Photos, Sample
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
+from gsmerge.types import Region
 
 GROWTH = 0.5  # part of the run after which Gaussians are added
 # Parts of the run after which Gaussians are cut at the edges of the views. The first cuts come early, so that photos

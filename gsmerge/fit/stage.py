@@ -16,6 +16,7 @@ from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob, prepare_fit
 from gsmerge.fit.survey import photo_error, survey_photos
+from gsmerge.geometry import clamp_inside
 from gsmerge.raster import make_splats
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.record import choose, stage
@@ -54,7 +55,7 @@ def fit_scene(
         job = replace(job, outside=outside, edges=edges, region=scene.region)
         gaussians, report = fit(decoded.gaussians, job)
         if scene.region is not None:  # Gaussians that grew last took no step since
-            gaussians = replace(gaussians, means=scene.region.clamp(gaussians.means).astype(np.float32))
+            gaussians = replace(gaussians, means=clamp_inside(scene.region, gaussians.means).astype(np.float32))
         record_fit(report, options.steps)
     cameras = scene.cameras
     if report.viewmats is not None:

@@ -131,7 +131,7 @@ def _photo_notes(scene: Scene) -> list[str]:
     """Describe which photos do not look like their Gaussians, as a run would."""
     with record_part(silent=True) as record:
         if scene.images is not None and len(scene) and len(scene.gaussians):
-            compare_photos(PicturedScene.of(canonicalise(scene)[0], scene.images, scene.masks))
+            compare_photos(PicturedScene.with_pictures(canonicalise(scene)[0], scene.images, scene.masks))
     return record.notes
 
 

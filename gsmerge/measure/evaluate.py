@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.arguments import check_arguments
+from gsmerge.arrays import as_pictures
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import judged_pictures
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
@@ -27,7 +28,7 @@ from gsmerge.report import html_table
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.evaluate import EvaluateOptions
-from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, as_pictures, own_gaussians
+from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, own_gaussians
 
 MENDED = (
     "the photos of the input views differ from their Gaussians or each other in tone, exposure or by what covers them,"

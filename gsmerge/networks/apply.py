@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array, concat_columns, concat_rows, like
 from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
 from gsmerge.networks.corrector import Corrector
@@ -31,7 +32,7 @@ from gsmerge.networks.weights import NetworkWeights
 from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array, concat_columns, concat_rows, like
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 if TYPE_CHECKING:
     from gsmerge.research.training.modules import Networks

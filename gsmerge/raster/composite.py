@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gsmerge.arrays import Array as AnyArray
+from gsmerge.arrays import as_array
 from gsmerge.kernels.raster import blend as kernels
 from gsmerge.kernels.raster import sh
 from gsmerge.raster.tiled_view import Array, Splats, TiledView, make_splats, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
-from gsmerge.types import Array as AnyArray
-from gsmerge.types import Cameras, Gaussians, as_array
+from gsmerge.types import Cameras, Gaussians
 
 TINY = 1e-6  # least opacity that depths are divided by
 SHOWN = 4  # views of a rendering that a notebook shows

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.arguments import check_arguments
+from gsmerge.arrays import Array, like
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import (
     Rendering,
@@ -23,7 +24,7 @@ from gsmerge.raster.composite import (
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.tiled_view import FAR_PLANE, TiledView, make_splats, tile_view
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Array, Cameras, Gaussians, Scene, like
+from gsmerge.types import Cameras, Gaussians, Scene
 
 ONE_AT_A_TIME = 4_000_000  # Gaussians; a tiled view is as large as they are
 BAND_PIXELS = 1 << 22  # of a picture that are in memory as floating-point numbers; larger ones are drawn in bands

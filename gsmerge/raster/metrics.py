@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array
 from gsmerge.kernels.elementary import log10
 from gsmerge.kernels.pictures import blur
-from gsmerge.types import Array, as_array
 
 WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard deviation in pixels
 C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data range of 1

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.pooling import ROWS, Members, Moments, Rule, pool_members
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
+from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene
 
 if TYPE_CHECKING:
     from gsmerge.networks.weights import NetworkWeights

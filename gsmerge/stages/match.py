@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.arrays import as_array
 from gsmerge.geometry import normalize
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
 from gsmerge.runtime.record import stage
 from gsmerge.settings.stages import MatchOptions
-from gsmerge.types import SH_C0, FeatureGaussians, Matches, as_array
+from gsmerge.types import SH_C0, FeatureGaussians, Matches
 
 
 @stage("match")

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_tensor, to_float32
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.pooling import Members
 from gsmerge.runtime.record import stage
-from gsmerge.types import Array, FeatureGaussians, Matches, Segmentation, as_tensor, to_float32
+from gsmerge.types import FeatureGaussians, Matches, Segmentation
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.elementary import power as power_of
 from gsmerge.kernels.gaussians.cross_view import make_tree
@@ -17,7 +18,7 @@ from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments,
 from gsmerge.pooling import MAX_OPACITY, principal_axes
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Gaussians, to_float32
+from gsmerge.types import Gaussians
 
 LEFT = 0.25  # share of the Gaussians that a round leaves, at least
 LEAST_LEFT = 0.2  # the same in each cell: longer chains of merges end in haze

@@ -19,6 +19,7 @@ from functools import partial
 import cv2
 import numpy as np
 
+from gsmerge.arrays import Array, as_array, like
 from gsmerge.budget import MAX_ADAPTED, count_for
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels, refine
@@ -32,7 +33,7 @@ from gsmerge.kernels.superpixels.seeds import (
 from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import SegmentOptions
-from gsmerge.types import Array, Groups, as_array, like
+from gsmerge.types import Groups
 
 RECTANGLES, EARLY_SWEEPS = 2.0, 0  # rectangles per superpixel that rdseg merges, and sweeps before it does
 NUM_SWEEPS = 2

@@ -92,7 +92,7 @@ def with_photos(room: Scene, change: Callable[[Photos], Photos], *, aligned: boo
 
 def odd_photos(room: Scene, change: Callable[[Photos], Photos]) -> list[int]:
     scene, _ = canonicalise(with_photos(room, change, aligned=False))
-    pictured = PicturedScene.of(scene, scene.images, None)
+    pictured = PicturedScene.with_pictures(scene, scene.images, None)
     return sorted(
         {*range(len(scene))} - {*find_matching_views(pictured, range(len(scene)), scene.images, show_views(pictured))}
     )
@@ -110,7 +110,7 @@ def test_odd_photos_are_recognised_in_drawings(room: Scene, change: Callable[[Ph
 @sweep(("change", "odd"), [case for case in SPOILT if len(case[1]) < VIEWS])
 def test_rows_take_the_place_of_other_pictures(room: Scene, change: Callable[[Photos], Photos], odd: list[int]) -> None:
     """Where the photo is that of another view, what both show alike stays."""
-    compared, views = compare_photos(PicturedScene.of(canonicalise(room)[0], change(room.images), None))
+    compared, views = compare_photos(PicturedScene.with_pictures(canonicalise(room)[0], change(room.images), None))
     away = np.abs(compared.images - room.images).mean((1, 2, 3))
     assert away.max() < 0.05
     assert set(range(VIEWS)) - set(views) <= set(odd)
@@ -208,7 +208,7 @@ def test_no_note_on_good_photos(unspoilt: CompactResult) -> None:
 
 
 def test_the_views_of_a_fit(room: Scene) -> None:
-    full, half = fit_photos(PicturedScene.of(room, room.images, None), FitOptions(), (0, 2, 5))
+    full, half = fit_photos(PicturedScene.with_pictures(room, room.images, None), FitOptions(), (0, 2, 5))
     np.testing.assert_array_equal(full.images, room.images[[0, 2, 5]])
     assert len(half) == 3
     np.testing.assert_array_equal(half.viewmats, room.cameras.viewmats[[0, 2, 5]])

@@ -11,7 +11,8 @@ import scenes
 
 import gsmerge
 from gsmerge import Scene
-from gsmerge.types import Views, as_pictures
+from gsmerge.arrays import as_pictures
+from gsmerge.types import Views
 
 QUICK = {"effort": "draft", "fit": "none", "checkpoint": "none"}
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, Pixels, Scene, as_array, as_tensor, like
+from gsmerge.arrays import as_array, as_tensor, like
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, Pixels, Scene
 
 
 def gaussians(n: int, coefficients: int = 0, start: int = 0) -> Gaussians:

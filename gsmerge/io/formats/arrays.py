@@ -8,11 +8,12 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array
 from gsmerge.geometry import apply_turn, harmonics_turn, morton_codes, multiply_quats, rotmat_to_quat, sh0_to_rgb
 from gsmerge.io.bounds import ReadBudget
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
-from gsmerge.types import Array, Gaussians, as_array
+from gsmerge.types import Gaussians
 
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
 LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at

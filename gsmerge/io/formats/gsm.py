@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
+from gsmerge.arrays import as_array
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_pixels, parse_json, read_budget
@@ -25,7 +26,7 @@ from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_count, copied_comments, to_stored
 from gsmerge.io.tensor_file import read_tensors
 from gsmerge.kernels.elementary import log
-from gsmerge.types import Cameras, Gaussians, Scene, StrPath, as_array
+from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 from gsmerge.version import __version__
 
 SCHEMA = 3  # of the whole file; those before were states of 0.3.0 and before

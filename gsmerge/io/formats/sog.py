@@ -23,13 +23,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.errors import SceneError
 from gsmerge.io.archives import new_member, open_archive, read_member
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, read_budget, read_errors, read_text
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.table import META
 from gsmerge.kernels.elementary import expm1, log1p
-from gsmerge.types import Gaussians, to_float32
+from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3
 VERSION = 2

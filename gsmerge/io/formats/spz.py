@@ -24,11 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
-from gsmerge.types import SH_C0, Gaussians, to_float32
+from gsmerge.types import SH_C0, Gaussians
 
 VERSION, MAX_DEGREE = 3, 3  # that are written, and the harmonics of that; Spark 2.2 does not read 4
 MAGIC = 0x5053474E

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats import ply
@@ -18,7 +19,7 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.setting import join_words
-from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath, to_float32
+from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath
 
 INDEX = "lod-meta.json"  # the name by which loaders recognise levels of detail in chunks
 MODEL_NAMES = POINTS, CAMERAS, IMAGES = "points3D.bin", "cameras.bin", "images.bin"

@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from gsmerge.arrays import to_float32
 from gsmerge.compaction.tensors import make_gaussians, make_scene
 from gsmerge.io.cameras.camera_file import select_views
 from gsmerge.measure.sizes import shrink_views
@@ -18,7 +19,7 @@ from gsmerge.research.training.examples import Example, draw_ids, make_example
 from gsmerge.research.training.scenes import make_training_scene, view_subsets
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.scene.content_hash import digest
-from gsmerge.types import Cameras, Gaussians, Scene, Views, to_float32
+from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 Other = TypeVar("Other")
 # Photos [v,h,w,3] sRGB in [0, 1] float32, and their cameras -> v h w Gaussians, view by view, in the cameras' world

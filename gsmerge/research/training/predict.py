@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from gsmerge.arrays import Array, as_array, as_tensor
 from gsmerge.networks.apply import NetworkContext, prepare_children, run_heads
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
 from gsmerge.networks.options import CORRECTED, PART
@@ -34,7 +35,7 @@ from gsmerge.research.training.windows import Crop
 from gsmerge.stages.decode import divide
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
-from gsmerge.types import SH_C0, Array, FeatureGaussians, Gaussians, Matches, as_array, as_tensor
+from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
 
 TINY = 1e-12  # world units
 MIN_GAP = 1e-3  # least difference of two squared scales that turns axes, as a share of the largest

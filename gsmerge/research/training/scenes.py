@@ -13,7 +13,7 @@ from gsmerge.measure.sizes import resize_photo
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.pooling import Members, scene_members
 from gsmerge.raster import composite, make_splats, tile_view
-from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos
+from gsmerge.raster.photos import NEAR_PLANE, Photos, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene, Views
 
@@ -31,9 +31,7 @@ class TrainingScene:
 
     def photos(self, level: float = 1) -> Photos:
         """Return all photos with sides divided by ``level``."""
-        names = tuple(map(str, range(len(self.cameras))))
-        unaligned = Scene(self.scene.gaussians[:0], self.cameras, self.images, None, names)
-        return scene_photos(unaligned, level)
+        return photos_of(self.images, self.cameras, level)
 
 
 def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:

@@ -176,7 +176,7 @@ def test_what_is_fixed_stays(scene: Scene) -> None:
     start = compact(scene, fit="none", **{**SETTINGS, "superpixels": "5%"}).gaussians
     fixed = np.arange(len(start)) % 2 == 0
     settings = FitOptions(fit_steps=20, judged=False, min_contribution=0.0)
-    photos = fit_photos(PicturedScene.of(canonical, scene.images, None), settings)
+    photos = fit_photos(PicturedScene.with_pictures(canonical, scene.images, None), settings)
     frame_start = replace(start, means=start.means.astype(np.float32))
     fitted, report = fit(frame_start, FitJob(photos, settings, len(start), fixed=fixed))
     assert report is not None
@@ -192,7 +192,7 @@ def test_views_of_blocks_are_joined(scene: Scene, monkeypatch: pytest.MonkeyPatc
     masks = np.random.default_rng(0).random((len(scene), 18, 24)) < 0.9
     chosen = [([6, 1], None), ([3], masks)]
     bare = [
-        PicturedScene.of(replace(scene, gaussians=scene.gaussians[:0], pixels=None), scene.images, mask)
+        PicturedScene.with_pictures(replace(scene, gaussians=scene.gaussians[:0], pixels=None), scene.images, mask)
         for _, mask in chosen
     ]
     for size in (1, 1 << 40):

@@ -28,7 +28,7 @@ def room() -> Scene:
 
 
 def pictured(scene: Scene) -> PicturedScene:
-    return PicturedScene.of(scene, scene.images, scene.masks)
+    return PicturedScene.with_pictures(scene, scene.images, scene.masks)
 
 
 def test_gains_are_those_of_the_trial_up_to_what_own_photos_gain_on_confirmed_depth() -> None:

@@ -93,7 +93,7 @@ def test_a_mild_grade_is_followed(room: Scene) -> None:
 def test_the_tone_of_gaussians_does_not_depend_on_what_hides_them(change: Callable | None) -> None:
     """A dark wall in front of every view darkens drawings; the colours of all Gaussians are those of the photos."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(4, 48, 36))
-    pictured = PicturedScene.of(unaligned_scenes.shuffled(scene), scene.images, None)
+    pictured = PicturedScene.with_pictures(unaligned_scenes.shuffled(scene), scene.images, None)
     dark = np.flatnonzero(pictured.gaussians.sh0.mean((1, 2)) < np.quantile(pictured.gaussians.sh0.mean((1, 2)), 0.2))
     means = pictured.gaussians.means.copy()
     means[dark] = scene.cameras.centres.mean(0) + 0.5 * (means[dark] - scene.cameras.centres.mean(0))

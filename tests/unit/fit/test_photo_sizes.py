@@ -39,7 +39,7 @@ def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> Pic
 
     shape = np.array([[width / scene.cameras.width], [height / scene.cameras.height], [1.0]])
     large = LargePhotos(scene.cameras.Ks * shape, width, height, tuple(range(len(scene))), one)
-    return PicturedScene.of(replace(scene, large_photos=large), scene.images, scene.masks)
+    return PicturedScene.with_pictures(replace(scene, large_photos=large), scene.images, scene.masks)
 
 
 # which size

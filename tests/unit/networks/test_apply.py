@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from network_fixtures import SMALL, Made, made, noisy, untrained
 
+from gsmerge.arrays import as_array
 from gsmerge.geometry import covariances
 from gsmerge.networks.apply import NetworkContext, decode_gaussians, encode_features, find_neighbors, run_heads
 from gsmerge.networks.corrector import ANALYTIC
@@ -17,7 +18,7 @@ from gsmerge.settings.stages import DecodeOptions, MatchOptions
 from gsmerge.stages.decode import decode, divide
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
-from gsmerge.types import FeatureGaussians, Gaussians, Matches, as_array
+from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 PAPER = replace(SMALL, outputs="absolute", merger_start="first", geometry="carried", group_numbers=False)
 

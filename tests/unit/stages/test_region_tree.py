@@ -179,7 +179,7 @@ def test_knee_of_a_wall_and_of_a_texture() -> None:
 
 def test_knee_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
     wall, texture = tree_of(grey(), slanted()), tree_of(noise(), slanted())
-    scene = PicturedScene.of(
+    scene = PicturedScene.with_pictures(
         scenes.make_scene(scenes.room(), scenes.arc(1, WIDTH, HEIGHT)), noise(), None
     )  # whose tree is there
 

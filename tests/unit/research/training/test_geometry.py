@@ -12,6 +12,7 @@ from scenes import arc, make_scene, room
 from sweeps import sweep
 from training_runs import PAPER, TINY, noisy_networks, torch
 
+from gsmerge.arrays import as_array
 from gsmerge.networks import apply, tokens
 from gsmerge.networks.apply import NetworkContext, encode_features
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
@@ -31,7 +32,7 @@ from gsmerge.research.training.predict import (
 from gsmerge.research.training.windows import Crop, whole_photo
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, pool_runs
-from gsmerge.types import FeatureGaussians, Matches, as_array
+from gsmerge.types import FeatureGaussians, Matches
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 COLUMNS = {"mean": MEAN, "size": SIZE, "turn": ROTATION, "logit": slice(LOGIT, LOGIT + 1), "color": COLOR}

@@ -1,0 +1,78 @@
+"""NumPy arrays, or torch tensors in their place; torch is imported only if tensors are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmerge.errors import refuse_without_torch
+
+if TYPE_CHECKING:
+    import torch
+
+Array = NDArray[Any]  # or a torch tensor where a docstring allows one, which type checkers do not see
+
+
+def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> None:
+    """Raise ValueError unless an array has a shape; an axis that is named may have any length."""
+    ok = array.ndim == len(shape) and all(
+        isinstance(want, str) or want == have for want, have in zip(shape, array.shape, strict=True)
+    )
+    if not ok:
+        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
+
+
+def as_array(values: Array) -> np.ndarray:
+    """Return an array, or a tensor on any device, as a NumPy array without gradient; copied only if needed."""
+    return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
+
+
+def as_pictures(images: Array) -> np.ndarray:
+    """Return pictures ``[...,3]`` as sRGB in [0, 1], those of uint8 divided by 255.
+
+    Raises ValueError for numbers that are more than one level of 255 beyond.
+    """
+    pictures = as_array(images)
+    if pictures.dtype == np.uint8:
+        return np.multiply(pictures, np.float32(1 / 255), dtype=np.float32)
+    low, high = (float(pictures.min()), float(pictures.max())) if pictures.size else (0.0, 0.0)
+    if not (low >= -1 / 255 and high <= 1 + 1 / 255):
+        remedy = "divide them by 255" if low >= 0 and 1.5 < high <= 255 else "clip them"
+        raise ValueError(f"images: expected sRGB in [0, 1], or uint8, got {low:.4g} to {high:.4g}; {remedy}")
+    return pictures
+
+
+def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor:
+    """Return an array or a tensor as a tensor on a device; on the CPU it shares the array's memory."""
+    with refuse_without_torch():
+        import torch
+
+    return torch.as_tensor(values, device=device)
+
+
+def to_float32(values: np.ndarray) -> np.ndarray:
+    """Round an array to float32; numbers beyond its range become infinite."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
+
+
+def like(values: np.ndarray, template: Array) -> Any:
+    """Convert ``values`` to the type of ``template``: a NumPy array, or a tensor on the same device."""
+    return as_tensor(values, template.device) if hasattr(template, "detach") else values
+
+
+def concat_rows(parts: Sequence[Array], axis: int = 0) -> Any:
+    """Concatenate arrays, or tensors, along ``axis``."""
+    if all(isinstance(part, np.ndarray) for part in parts):
+        return np.concatenate(parts, axis)
+    import torch
+
+    return torch.cat([torch.as_tensor(part) for part in parts], axis)
+
+
+def concat_columns(parts: Sequence[Array]) -> Array:
+    """Put the columns of arrays or of tensors side by side."""
+    return concat_rows(parts, 1)
