@@ -9,9 +9,12 @@ from __future__ import annotations
 import re
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
+from scripts import load_script
 
+import gsmerge
 from gsmerge import plan, types
 from gsmerge.alignment import cameras as cameras_off
 from gsmerge.alignment import layouts, rows_first, score
@@ -31,8 +34,10 @@ from gsmerge.networks.options import RESIDUAL, SLOTS
 from gsmerge.pages import data, splats
 from gsmerge.raster import metrics, photos, tiled_view
 from gsmerge.runtime import estimate, work
+from gsmerge.scene.held_out import read_held_out
+from gsmerge.scene.read import load_scene
 from gsmerge.settings.budget import DEVICES
-from gsmerge.settings.compact import RECIPES
+from gsmerge.settings.compact import RECIPES, method_names
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.fit import FitOptions, Tuning
 from gsmerge.settings.stages import MAX_CHILDREN, SHARE, MatchOptions
@@ -251,3 +256,46 @@ def test_another_number_is_seen(page: str) -> None:
     quotes = tuple(quote for quote in CLAIMS[page] if re.search(r"\d", quote))
     falsified = re.sub(r"\d+", lambda number: str(int(number[0]) + 1), words_of(page))
     assert missing(falsified, quotes) == list(quotes)
+
+
+# Tables of results on the scene of examples/01_make_scene.py: the start of a row, and the settings that make it
+TABLES: dict[str, dict[str, dict[str, Any]]] = {
+    COMPACT: {
+        "defaults": {}, "`--effort draft`": {"effort": "draft"}, "`--effort fast`": {"effort": "fast"},
+        "`--effort best`": {"effort": "best"}, "`--fit none`": {"fit": "none"},
+    },
+    HOW_MANY: {
+        "`--set superpixels=1%`": {"superpixels": "1%"}, "`--budget 2%`": {"budget": "2%"}, "the defaults": {},
+        "`--k 2`": {"k": 2}, "`--budget auto`": {"budget": "auto"}, "`--k 4`": {"k": 4},
+    },
+    "docs/internals/plugins.md": {
+        f"`{name}`": {"method": name} | ({} if name.startswith("unmerged") else {"budget": "4.4%"})
+        for name in sorted({*method_names()} - {"splat-transform"})
+    },
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory: pytest.TempPathFactory) -> tuple[gsmerge.Scene, gsmerge.Views]:
+    """The scene, and photos that no run has seen."""
+    folder = tmp_path_factory.mktemp("example") / "demo"
+    load = load_scene(load_script(ROOT / "examples" / "01_make_scene.py").make_scene(folder))
+    held_out = read_held_out(load, folder / "targets")
+    return load.scene, gsmerge.Views(held_out.cameras, held_out.images, held_out.names)
+
+
+@pytest.mark.slow  # a run for each row, half a minute together
+@pytest.mark.parametrize(("page", "row"), [(page, row) for page, rows in TABLES.items() for row in rows])
+def test_tables_of_the_example_are_those_of_today(
+    page: str, row: str, example: tuple[gsmerge.Scene, gsmerge.Views]
+) -> None:
+    """Counts, and PSNR over the pixels that the input views see, as ``gsmerge evaluate`` prints it."""
+    scene, held_out = example
+    gaussians = gsmerge.compact(scene, **TABLES[page][row]).gaussians
+    measured = gsmerge.evaluate(scene, {"": gaussians}, held_out, gsmerge.EvaluateOptions(lpips=(), fog=False))
+    quality = measured.results[1].mean("target")[1]
+    assert quality is not None
+    (line,) = [line for line in (ROOT / page).read_text("utf-8").splitlines() if line.startswith(f"| {row}")]
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert f"{quality.psnr:.1f} dB" in cells
+    assert page.endswith("plugins.md") or f"{len(gaussians):,}" in cells
