@@ -33,7 +33,7 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
     """Describe a scene in detail; SceneError if ``compact`` refuses it."""
     from gsmerge.compaction.inspect import inspect as inspect_scene
     from gsmerge.compaction.inspect import inspection_lines
-    from gsmerge.file_checks import check_content, damage
+    from gsmerge.file_checks import check_content, list_damage
     from gsmerge.io.formats.table import INDEX
     from gsmerge.report import document_head
     from gsmerge.runtime.record import record_run
@@ -41,7 +41,7 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
     hints = args.hints()
     with stage_progress(quiet=args.silent) as progress, record_run(progress):
         facts = inspect_scene(path, cameras=args.cameras, images=args.images, opacity=args.opacity, **vars(hints))
-        problems = check_content(path).problems if path.name == INDEX else damage(path)
+        problems = check_content(path).problems if path.name == INDEX else list_damage(path)
     document, lines = {**document_head(), **facts, "problems": list(problems)}, inspection_lines(facts)
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
     if facts["compact"] is None:
