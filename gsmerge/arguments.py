@@ -1,4 +1,4 @@
-"""Check the arguments of public functions by their annotations: another type is refused in one clear line."""
+"""Check the arguments of public functions by their annotations; a wrong type raises TypeError with one clear line."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Names in annotations, beside those of classes -> what messages call them, and whether a value is one
+# Name in an annotation -> its words in messages, and the test of a value; CLASSES has the names of classes
 KINDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "None": ("", lambda value: value is None),
     "StrPath": ("a path", lambda value: isinstance(value, str | os.PathLike)),
@@ -24,22 +24,22 @@ CLASSES = {
     "Scene": "a Scene", "Gaussians": "Gaussians", "Cameras": "Cameras", "Views": "Views", "CameraFile": "a CameraFile",
     "CompactOptions": "CompactOptions", "EvaluateOptions": "EvaluateOptions",
 }  # fmt: skip
-OF_SCENE = "write Gaussians to a file and give its path; tensors go to compact_tensors"
+GAUSSIANS_REMEDY = "write Gaussians to a file and give its path; tensors go to compact_tensors"
 
 
 def check_arguments(function: Function) -> Function:
-    """Decorate a public function: arguments of other types than it declares raise TypeError, as one line.
+    """Decorate a public function so that arguments of undeclared types raise TypeError, with one line.
 
-    Only parameters are looked at whose annotation names nothing but :data:`KINDS` and :data:`CLASSES`, one of them or
-    several, and lists or mappings of them.
+    Only parameters are checked whose annotations consist of names from :data:`KINDS` and :data:`CLASSES`, and of lists
+    and mappings of these.
     """
     parameters = inspect.signature(function).parameters
-    known = {name: p for name, p in parameters.items() if isinstance(p.annotation, str) and _is_known(p.annotation)}
+    checked = {name: p for name, p in parameters.items() if isinstance(p.annotation, str) and _is_known(p.annotation)}
     places = {name: place for place, name in enumerate(parameters)}
 
     @wraps(function)
     def call(*args: Any, **named: Any) -> Any:
-        for name, parameter in known.items():
+        for name, parameter in checked.items():
             if parameter.kind is parameter.VAR_POSITIONAL:
                 for value in args[places[name] :]:
                     _check(name, parameter.annotation, value)
@@ -53,7 +53,7 @@ def check_arguments(function: Function) -> Function:
 
 
 def _check(name: str, annotation: str, value: Any) -> None:
-    """Raise TypeError, which says what is expected, for a value of another type than an annotation's."""
+    """Raise TypeError, with the expected types, if a value has none of the types of an annotation."""
     if not _fits(annotation, value):
         remedy = _remedy(annotation, value)
         end = f"; {remedy}" if remedy else ""
@@ -61,28 +61,29 @@ def _check(name: str, annotation: str, value: Any) -> None:
 
 
 def _remedy(annotation: str, value: Any) -> str:
-    """Say what to pass in place of a value that may be meant; "" where that is not clear."""
+    """Return what to pass instead of a wrong value; "" if that is not clear."""
     kinds = {_split(part)[1] for part in _parts(annotation)}
     if "Scene" in kinds:
         is_path = KINDS["StrPath"][1](value)
-        return "gsmerge.read_scene(path) reads it" if is_path else OF_SCENE if "StrPath" in kinds else ""
+        return "gsmerge.read_scene(path) reads it" if is_path else GAUSSIANS_REMEDY if "StrPath" in kinds else ""
     if annotation.startswith("Mapping"):
         return "name each, such as {'small': result}"
     return "pass its .gaussians" if "Gaussians" in annotation and hasattr(value, "gaussians") else ""
 
 
 def _parts(annotation: str) -> list[str]:
-    """Split an annotation at each | outside of brackets."""
+    """Split an annotation at each | outside brackets."""
     return [part.strip() for part in re.split(r"\|(?![^\[]*\])", annotation)]
 
 
 def _split(part: str) -> tuple[str, str]:
-    """Split a part of an annotation into the container, "" without one, and the annotation of what is in it."""
+    """Split a part of an annotation into its container, "" without one, and the annotation of the elements."""
     match = re.fullmatch(r"(Mapping\[str, |Sequence\[)(.*)\]", part)
     return ("", part) if match is None else (match[1], match[2])
 
 
 def _is_known(annotation: str) -> bool:
+    """Return whether an annotation consists of known names only."""
     split = [_split(part) for part in _parts(annotation)]
     return all(_is_known(inner) if container else inner in KINDS or inner in CLASSES for container, inner in split)
 
@@ -103,28 +104,28 @@ def _fits(annotation: str, value: Any) -> bool:
 
 
 def _values(container: str, value: Any) -> Sequence[Any] | None:
-    """Return the values in a container; None for something else."""
+    """Return the values in a container; None if ``value`` is not such a container."""
     if container.startswith("Mapping"):
         return list(value.values()) if isinstance(value, Mapping) else None
     return value if isinstance(value, list | tuple) else None
 
 
 def _describe(annotation: str) -> str:
-    """Say in words what an annotation names, containers last."""
-    words, several = list[str](), list[str]()
+    """Describe the types of an annotation in words, containers last."""
+    words, containers = list[str](), list[str]()
     for container, inner in map(_split, _parts(annotation)):
         if not container:
             words.append(KINDS[inner][0] if inner in KINDS else CLASSES[inner])
         elif container.startswith("Mapping"):
-            several.append(f"{_describe(inner)} by name")
+            containers.append(f"{_describe(inner)} by name")
         else:
-            several.append(f"a list of {_describe(inner)}")
+            containers.append(f"a list of {_describe(inner)}")
     listed = [word for word in words if word]
-    listed += several if not listed else ["several by name"] * bool(several)
+    listed += containers if not listed else ["several by name"] * bool(containers)
     return " or ".join(filter(None, (", ".join(listed[:-1]), listed[-1])))
 
 
 def _describe_value(value: Any) -> str:
-    """Name the type of a value, and of what is in it."""
-    inside = list(value.values()) if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
-    return type(value).__name__ + (f" of {type(inside[0]).__name__}" if inside else "")
+    """Name the type of a value and of its first element."""
+    elements = list(value.values()) if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
+    return type(value).__name__ + (f" of {type(elements[0]).__name__}" if elements else "")

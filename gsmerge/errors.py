@@ -1,7 +1,7 @@
 """Exceptions for problems that a user can fix, each with its exit code.
 
-Arguments of the Python API that make no sense raise ``ValueError``. Everything that has to do with
-files and with what is in them raises one of these; the command line prints the message as one line.
+Invalid arguments of the Python API raise ``ValueError``. Problems with files and their content raise one of these
+exceptions; the command line prints its message as one line.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from os import PathLike
 
 
 class GsmergeError(Exception):
-    """Base of all errors that a user can fix; ``exit_code`` is that of the command line.
+    """Base of all errors that a user can fix; ``exit_code`` is the exit code of the command line.
 
     Example:
         >>> try:
@@ -46,26 +46,26 @@ class SceneError(GsmergeError):
     exit_code = 3
 
     def __init__(self, path: str | PathLike[str], problem: str, remedy: str = "") -> None:
-        problem = " ".join(problem.split())  # libraries' reasons may have several lines
+        problem = " ".join(problem.split())  # messages of libraries may have several lines
         self.path, self.problem, self.remedy = str(path), problem, remedy
         super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))
 
     def __reduce__(self) -> tuple[type[SceneError], tuple[str, str, str]]:
-        """Pickle the arguments, for processes of a cluster."""
+        """Pickle the arguments, since processes of a cluster send this error."""
         return type(self), (self.path, self.problem, self.remedy)
 
 
 class DoubtWarning(UserWarning):
-    """What makes a result doubtful: it is worse than its input, misses its target, or views contradict each other.
+    """Warning of a doubtful result: worse than its input, below its target, or made of views that contradict others.
 
     Example:
         >>> import warnings
-        >>> warnings.simplefilter("error", gsmerge.DoubtWarning)  # a doubt is an error from now on
+        >>> warnings.simplefilter("error", gsmerge.DoubtWarning)  # raise an error for each doubt
     """
 
 
 class TargetError(GsmergeError):
-    """A quality or size target that was asked for could not be met."""
+    """A requested quality or size could not be reached."""
 
     exit_code = 4
 
@@ -77,8 +77,8 @@ class BatchError(GsmergeError):
 
 
 DAMAGED_OPENCV = (
-    "expected a complete OpenCV, found the module cv2 without its parts, as after uninstalling one of several"
-    " opencv packages; run pip install --no-deps --force-reinstall opencv-contrib-python-headless"
+    "expected a complete OpenCV, found the module cv2 without its parts, which happens when one of several opencv"
+    " packages is uninstalled; run pip install --no-deps --force-reinstall opencv-contrib-python-headless"
 )
 
 
@@ -88,7 +88,7 @@ def is_opencv_damaged(error: BaseException) -> bool:
 
 
 TORCH_INSTALL = 'pip install "torch>=2.4,<3" --extra-index-url https://download.pytorch.org/whl/cpu'
-NO_TORCH = f"this needs torch, which is not installed; install gsmerge[torch], or its build for CPUs: {TORCH_INSTALL}"
+NO_TORCH = f"this needs torch, which is not installed; install gsmerge[torch], or torch for CPUs: {TORCH_INSTALL}"
 
 
 def is_torch_missing(error: BaseException) -> bool:
@@ -108,30 +108,34 @@ def refuse_without_torch() -> Iterator[None]:
 
 
 OUT_OF_MEMORY = "out of memory; use fewer --threads or --jobs, or a smaller scene"
-_NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't allocate memory", "can't start new thread",
-              "Insufficient memory")  # the last of OpenCV  # fmt: skip
+_MEMORY_ERRORS = ("failed to map segment", "annot allocate memory", "can't allocate memory", "can't start new thread",
+              "Insufficient memory")  # the last one comes from OpenCV  # fmt: skip
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Return whether an error, or one of its causes, reports a lack of memory."""
     while error is not None:
-        if isinstance(error, MemoryError) or any(text in str(error) for text in _NO_MEMORY):
+        if isinstance(error, MemoryError) or any(text in str(error) for text in _MEMORY_ERRORS):
             return True
         error = error.__cause__ or error.__context__
     return False
 
 
 def file_problem(error: BaseException, unnamed: str = "a file") -> str | None:
-    """Describe an error of the file system in one line; None for another error.
+    """Describe an error of the file system in one line; None for any other error.
 
-    ``unnamed``: what to call the file if the error does not name it.
+    ``unnamed``: words for the file if the error does not name it.
     """
     if not isinstance(error, OSError) or error.strerror is None:
         return None
     if error.filename is not None:
         return f"{error.filename}: cannot be read or written ({error.strerror})"
-    disk = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
-    return f"{unnamed} could not be written ({error.strerror}); free some space, or write elsewhere" if disk else None
+    is_of_disk = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+    return (
+        f"{unnamed} could not be written ({error.strerror}); free some space, or write elsewhere"
+        if is_of_disk
+        else None
+    )
 
 
 def error_line(error: BaseException, unnamed: str = "a file") -> str:

@@ -1,4 +1,4 @@
-"""What all reports share: the head of JSON documents, strict JSON, CSV, tables for people, seconds by stage."""
+"""Helpers of all reports: the head of JSON documents, strict JSON, CSV, tables for people, seconds by stage."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from typing import Any
 from gsmerge.version import __version__
 
 SCHEMA_VERSION = 1
-MAX_WIDTH = 10_000  # columns of a table in a pipe
-UNIT = r"(?<=\d) (?=(?:%|[kMG]?B|dB|px|m?s|min|h)(?:\W|$))"  # the space between a number and its unit
-MIN_NAME = 12  # columns that a table's first keeps in a narrow terminal
+MAX_WIDTH = 10_000  # columns of a table that is not printed on a terminal
+SPACE_BEFORE_UNIT = r"(?<=\d) (?=(?:%|[kMG]?B|dB|px|m?s|min|h)(?:\W|$))"
+MIN_NAME = 12  # least width of a table's first column in a narrow terminal
 
 
 def file_sha256(*paths: Path) -> str:
-    """Return the hexadecimal SHA-256 of a file, or of several, one after the other."""
+    """Return the hexadecimal SHA-256 of a file, or of several files read one after the other."""
     digest = hashlib.sha256()
     for path in paths:
         with open(path, "rb") as file:
@@ -42,7 +42,7 @@ def to_json(document: Mapping[str, Any]) -> str:
 
 
 def finite(value: Any) -> Any:
-    """Return plain JSON types with None in place of infinities and NaN."""
+    """Convert to plain JSON types, with None in place of infinities and NaN."""
     if isinstance(value, Mapping):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -53,14 +53,14 @@ def finite(value: Any) -> Any:
 
 
 def csv_cell(value: Any) -> Any:
-    """Return a value for a CSV table: "" for None; a quote precedes text that a spreadsheet would execute."""
+    """Return a value for a CSV table: "" for None, and a quote before text that a spreadsheet would execute."""
     if value is None:
         return ""
     return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r", "\n") else value
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Write rows as comma-separated values under a line of column names; keys without a column are ignored."""
+    """Format rows as comma-separated values under a line of column names; keys without a column are ignored."""
     out = io.StringIO()
     writer = csv.DictWriter(out, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -71,11 +71,11 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 def text_table(
     rows: Sequence[Sequence[str]], indent: str = "", *, columns: int | None = None, least: Sequence[int] = ()
 ) -> list[str]:
-    """Write rows as lines for a terminal, with the first column left-aligned and others right-aligned.
+    """Format rows as lines for a terminal, with the first column left-aligned and others right-aligned.
 
-    ``columns``: width of the terminal; None: any. What does not fit is left out: the columns ``least``, by number and
-    in this order, then letters from the middle of the first column, then other columns from the last on, but for the
-    first two.
+    ``columns``: width of the terminal; None: unlimited. A table that is too wide is reduced until it fits. First the
+    columns ``least``, by number and in this order, are left out. Then the first column is shortened in its middle, down
+    to ``MIN_NAME``. Then other columns are left out from the last on, except the first two.
     """
     widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (columns or MAX_WIDTH) - len(indent)
     shown = list(range(len(widths)))
@@ -89,28 +89,28 @@ def text_table(
 
 
 def _cut(text: str, width: int) -> str:
-    """Cut letters from the middle of a text that is wider."""
+    """Shorten a text to ``width`` by cutting letters from its middle."""
     half = (width - 3) // 2
     return text if len(text) <= width else f"{text[: width - 3 - half]}...{text[-half:]}"
 
 
 def wrap_line(line: str, columns: int | None, hang: int = 0) -> list[str]:
-    """Break a line between words at ``columns`` (None: never), with further lines indented.
+    """Break a line between words at ``columns`` (None: never), and indent all but its first part.
 
-    They begin at the column ``hang`` or else at the line's first value, or two columns in where these have no room.
+    The indent is ``hang``, or else the column of the line's first value. It is two columns if neither fits.
     """
     if columns is None or len(line) <= columns:
         return [line]
     label = re.match(r" *\S+(?: \S+)?  +|(?:note|warning|error): ", line)
     indents = (hang, len(label[0]) if label else 2)
     indent = " " * next((indent for indent in indents if 0 < indent < columns // 2), 2)
-    whole = re.sub(UNIT, "\N{NO-BREAK SPACE}", line)  # numbers stay with their units
+    whole = re.sub(SPACE_BEFORE_UNIT, "\N{NO-BREAK SPACE}", line)  # numbers stay with their units
     wrapped = textwrap.wrap(whole, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
     return [part.replace("\N{NO-BREAK SPACE}", " ") for part in wrapped]
 
 
 def html_table(rows: Sequence[Sequence[str]]) -> str:
-    """Write rows as an HTML table for notebooks, with the first column left-aligned and others right-aligned."""
+    """Format rows as an HTML table for notebooks, with the first column left-aligned and others right-aligned."""
 
     def cell(text: str, side: str) -> str:
         return f'<td style="text-align:{side}">{html.escape(text)}</td>'
@@ -120,11 +120,11 @@ def html_table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Return the wall time by stage and in total, in the form of all reports."""
+    """Return the wall time by stage and in total, as all reports contain it."""
     total = round(sum(seconds.values()), 4)
     return {"seconds": {name: round(value, 4) for name, value in seconds.items()}, "total_seconds": total}
 
 
 def seconds_line(document: Mapping[str, Any]) -> str:
-    """Return a report's seconds as text; those of each stage are in the document."""
+    """Return a report's total seconds as text; the document has those of each stage."""
     return f"{document['total_seconds']:.1f} s"

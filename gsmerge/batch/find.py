@@ -1,4 +1,4 @@
-"""Find scenes in any layout."""
+"""Find scenes in folders of any layout, by patterns and in lists."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_p
 from gsmerge.scene.no_gaussians import find_remedy
 from gsmerge.settings.extend import SUFFIX
 
-NamedScene = tuple[Path, Path | None]  # a scene, and the folder that was named; None where it was the scene itself
-MAX_FOLDERS = 100_000  # without a scene, after the last one; a link to a system's folders leads to more
-_JOB_BYTES = 700  # of memory for each scene of a list
+NamedScene = tuple[Path, Path | None]  # a scene, and the folder that the user named; None if that was the scene itself
+MAX_FOLDERS = 100_000  # folders without a scene after the last scene; a link into a system's folders leads to more
+_JOB_BYTES = 700  # memory for each scene of a list
 DEPTH_NAMES = {Path(place).parts[0] for place in (*depth_maps.PLACES, depth_maps.FRAMES)}
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)} | DEPTH_NAMES
 SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
 
 
 def scene_plys(scene: Path) -> list[Path]:
-    """List the files of a scene, given one of them or their folder; empty if the folder cannot be read as a scene."""
+    """List the Gaussian files of a scene, given one of them or their folder; empty if the folder cannot be read."""
     with suppress(SceneError, OSError):
         return list_plys(scene) if os.path.isdir(scene) else [scene]
     return []
 
 
 def main_file(scene: Path) -> Path:
-    """Find the file that identifies a scene; the folder itself if several files could, or it cannot be read."""
+    """Find the file that identifies a scene; the folder itself if several files could, or if it cannot be read."""
     if not os.path.isdir(scene):
         return scene
-    with suppress(OSError):  # reading the scene says why
+    with suppress(OSError):  # reading the scene reports the reason
         plys = other_plys(scene)
         return named_ply(scene) or (plys[0] if len(plys) == 1 else scene)
     return scene
@@ -50,17 +50,19 @@ def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
 
 
 def find_named_scenes(arguments: Sequence[str], out: Path) -> Iterator[NamedScene]:
-    """Yield the scenes among the arguments, in order, in natural order within each; a scene may come twice.
+    """Yield the scenes of all arguments, in natural order within each argument; a scene may come twice.
 
-    A folder that cannot be read counts as a scene: reading it says why. SceneError if an argument does not exist, has
-    no scene or too many folders without one, UsageError if it is the output folder.
+    A folder that cannot be read counts as a scene, so that reading it reports the reason. SceneError if an argument
+    does not exist, has no scene, or has too many folders without a scene; UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
     for argument in arguments:
         path, search = Path(argument), _Search(skip)
         if path.is_dir():
             if os.path.realpath(path) == skip:
-                raise UsageError(f"{out}: expected another folder for the results than that of the scenes; name one")
+                raise UsageError(
+                    f"{out}: expected another folder for the results than for the scenes; name another --output"
+                )
             yield from _require_some(search.walk(path), argument, "in the folder")
         elif path.suffix in (*SCENE_SUFFIXES, SUFFIX) and path.is_file():
             yield path, None
@@ -82,39 +84,39 @@ def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> It
 
 
 def _remedy(folder: Path) -> str:
-    """Return what to do about a folder in which no scene was found."""
+    """Return the remedy for a folder in which no scene was found."""
     if not os.path.isdir(folder):
         return ""
     results = list_plys(folder)
-    return f"{results[0]} is a result of gsmerge: name it" if results else find_remedy(folder)
+    return f"{results[0]} is a result of gsmerge; name this file to compact it" if results else find_remedy(folder)
 
 
 @dataclass
 class _Search:
-    """The folders of one argument: each is searched once, whatever links lead to it."""
+    """Search of one argument, which enters each folder once, even if several links lead to it."""
 
-    skip: str  # real path of the folder for the results
-    seen: set[str] = field(default_factory=set)  # real paths
+    skip: str  # real path of the output folder, which is not searched
+    seen: set[str] = field(default_factory=set)  # real paths of the folders entered so far
     num_empty: int = 0  # folders since the last scene
 
     def walk(self, folder: Path) -> Iterator[NamedScene]:
-        """Yield the scenes in a folder, or the folder itself if it has a scene file of a usual name."""
-        for inside, names, folders in self.folders(folder):
+        """Yield the scenes in a folder, or the folder itself if it has a scene file with a usual name."""
+        for current, names, folders in self.folders(folder):
             if names is None:
-                scenes = [inside]
-            elif _is_scene(inside, names):
+                scenes = [current]
+            elif _is_scene(current, names):
                 folders[:] = [name for name in folders if name not in SCENE_PARTS]
-                scenes = [inside]
+                scenes = [current]
             else:
-                scenes = _other_scenes(inside, names)
+                scenes = _other_scenes(current, names)
             self.num_empty = 0 if scenes else self.num_empty
             yield from ((scene, folder) for scene in scenes)
 
     def folders(self, first: Path) -> Iterator[tuple[Path, list[str] | None, list[str]]]:
-        """Yield a folder and those below it, with the names in each, and a list of its folders' names.
+        """Yield a folder and all folders below it, each with the names in it and a list of its folders' names.
 
-        The names are None if the folder cannot be read. The caller may remove names from that list: those folders are
-        not entered.
+        The names are None if the folder cannot be read. A folder is not entered if the caller removes its name from the
+        list.
         """
         stack = [(first, os.path.realpath(first))]
         while stack:
@@ -133,28 +135,28 @@ class _Search:
                 yield folder, None, []
                 continue
             names = natural_order(name for name in entries if not name.startswith("."))
-            inside = [name for name in names if _is_folder(entries[name])]
-            yield folder, list(entries), inside
-            for name in reversed(inside):
+            folders = [name for name in names if _is_folder(entries[name])]
+            yield folder, list(entries), folders
+            for name in reversed(folders):
                 below = os.path.join(real, name)
                 stack.append((folder / name, os.path.realpath(below) if entries[name].is_symlink() else below))
 
 
 def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
-    """List the scenes in a folder that contains these names and is none itself; itself if it has vanished meanwhile."""
+    """List the scenes in a folder with these names that is no scene itself; the folder if it has vanished since."""
     if SCENE_NAMES.isdisjoint(names) and not any(name.endswith(SCENE_SUFFIXES) for name in names):
         return []
     with suppress(OSError):
         scenes = other_plys(folder)
         if scenes or os.path.isdir(folder):
             return scenes
-    return [folder]  # reading it says why
+    return [folder]  # reading it reports the reason
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:
     try:
         return entry.is_dir()
-    except OSError:  # a link to itself, or into a folder that cannot be read
+    except OSError:  # it is a link to itself, or into a folder that cannot be read
         return False
 
 
@@ -166,11 +168,12 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
         if named_ply(folder) is not None:
             return True
         return not other_plys(folder) and bool(depth_maps.find_depth_maps(folder))
-    except (SceneError, OSError):  # a frame is missing, or cannot be read: reading the scene says which
+    except (SceneError, OSError):  # a frame is missing or cannot be read; reading the scene reports which
         return True
 
 
 def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
+    """Yield the scenes that match a pattern, and those in matching folders."""
     for name in dict.fromkeys(natural_order(_expand(pattern, search))):
         path = Path(name)
         if os.path.isdir(path):
@@ -185,26 +188,26 @@ def _expand(pattern: str, search: _Search) -> Iterator[str]:
     if "**" not in parts:
         yield from glob.iglob(pattern)
         return
-    at = parts.index("**")
-    tail = parts[at + 1 :]
+    place = parts.index("**")
+    tail = parts[place + 1 :]
     inner = _Search(search.skip)
-    for base in glob.iglob(os.path.join(*parts[:at])) if at else (os.curdir,):
-        for folder, inside, _ in inner.folders(Path(base)):
-            names = [str(folder)] if inside is None or not tail else []
+    for base in glob.iglob(os.path.join(*parts[:place])) if place else (os.curdir,):
+        for folder, entries, _ in inner.folders(Path(base)):
+            names = [str(folder)] if entries is None or not tail else []
             names += _expand(os.path.join(glob.escape(str(folder)), *(tail or ("*",))), search)
             inner.num_empty = 0 if names else inner.num_empty
             yield from names
 
 
 def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:
-    """Yield the scenes of a list, with paths relative to its folder; a missing scene fails when it is read."""
+    """Yield the scenes of a list, whose paths are relative to its folder; a missing scene fails when it is read."""
     budget, lines = read_budget(file), dict[str, None]()
     for line in read_lines(file):
         if "\0" in line:
             raise SceneError(file, "expected a text file with one path per line, found no text")
         if line.startswith("{"):
             raise SceneError(
-                file, "expected a list of scenes, one path per line, found JSON", "name the scene's folder"
+                file, "expected a list of scenes, one path per line, found JSON", "name the folder of the scene"
             )
         lines[line.strip()] = None
         budget.check_memory(_JOB_BYTES * len(lines), f"{len(lines):,} scenes")

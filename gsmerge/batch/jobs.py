@@ -1,4 +1,4 @@
-"""Make the jobs of a batch: each scene with the call that makes its result."""
+"""Make the jobs of a batch, each a scene with the call that makes its result."""
 
 from __future__ import annotations
 
@@ -30,29 +30,32 @@ from gsmerge.types import StrPath
 from gsmerge.version import __version__
 
 FIELDS = ("stem", "parent", "index", "k")
-PLACES = ("cameras", "images", "masks", "protect")  # of what is beside a scene
+PLACES = ("cameras", "images", "masks", "protect")  # options that name files and folders beside a scene
 
 
 @dataclass(frozen=True)
 class BatchOptions(Settings):
     """Settings of :func:`gsmerge.batch.find_jobs` and :func:`gsmerge.batch.run_batch`."""
 
-    settings: CompactOptions = setting(CompactOptions(), "Of each scene; no threads, which are processors by jobs.")
+    settings: CompactOptions = setting(CompactOptions(), "Settings of each scene.")
     opacity: OpacityChoice = setting("auto", "How all files store opacity.")
-    hints: ReadHints = setting(ReadHints(), "What is known of all files and need not be recognised.")
-    cameras: str | None = setting(None, "Cameras: one path for all scenes, or with {scene}, {parent} and {stem} of "
-        "each in it.",
-        "By default those beside each scene; `none`: without.")  # fmt: skip
-    images: str | None = setting(None, "Folder of the photos, in the same way.")
-    masks: str | None = setting(None, "Folder of their masks, in the same way.")
-    protect: str | None = setting(None, "Folder of pictures of what has to stay sharp, in the same way.")
-    output: str = setting("{stem}.ply", "Name of a result in the output folder: {stem} (the scene's name), {parent} "
-        "(the folder it is in), {index} (its place in the list, from 0) and {k} are filled in; its ending says the "
-        "format.")  # fmt: skip
-    jobs: int | None = setting(None, "Scenes at once.", "By default as many as processors and free memory allow.",
+    hints: ReadHints = setting(ReadHints(), "Hints for reading, the same for all files.")
+    cameras: str | None = setting(None, "Cameras: one path for all scenes, or a pattern in which {scene}, {parent} and "
+        "{stem} are replaced by those of each scene.",
+        "By default the cameras beside each scene; `none`: without.")  # fmt: skip
+    images: str | None = setting(None, "Folder of the photos: a path or such a pattern.")
+    masks: str | None = setting(None, "Folder of their masks: a path or such a pattern.")
+    protect: str | None = setting(
+        None, "Folder of images, white where a text or a face has to stay sharp: a path or such a pattern."
+    )
+    output: str = setting("{stem}.ply", "Name of each result in the output folder, whose ending sets the format. "
+        "{stem} (the scene's name), {parent} (the folder it is in), {index} (its place in the list, from 0) and {k} "
+        "are replaced.")  # fmt: skip
+    jobs: int | None = setting(None, "Number of scenes to run at the same time.",
+        "By default as many as processors and free memory allow.",
         least=1)  # fmt: skip
-    overwrite: bool = setting(False, "Compact scenes again, and replace files that no batch wrote with these "
-        "settings.")  # fmt: skip
+    overwrite: bool = setting(False, "Compact all scenes again, and also replace files that were not written by a "
+        "batch with these settings.")  # fmt: skip
     engine: str = setting("local", "Where scenes are compacted, see `Engine`.")
     address: str | None = setting(None, "Address of the Ray cluster, see `Engine`.")
 
@@ -69,7 +72,7 @@ class BatchOptions(Settings):
         is_outside = example.startswith(("/", "~", ".")) or ".." in example.split("/")
         for is_possible, expected in (
             (all(name in FIELDS for name in names), f"{placeholders} in braces"),
-            (example.lower().endswith(endings), f"a name that ends in {', '.join(endings)}"),
+            (example.lower().endswith(endings), f"a name ending in {', '.join(endings)}"),
             (
                 not is_outside and "\\" not in example and "\0" not in example,
                 "a name inside the output folder, not hidden",
@@ -80,13 +83,13 @@ class BatchOptions(Settings):
 
 
 class SceneCall(Protocol):
-    """Call that makes the result of a scene."""
+    """A call that makes the result of a scene."""
 
     def key(self, files: SceneFiles) -> str:
-        """Return a digest of everything that the result depends on; what follows a dot in it is of settings alone."""
+        """Return a digest of all that the result depends on; the part after a dot depends on the settings only."""
 
     def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
-        """Make the result; return its report and the files written."""
+        """Make the result; return its report and the files that were written."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +101,11 @@ class CompactCall:
     hints: ReadHints
 
     def key(self, files: SceneFiles) -> str:
-        """Return a digest of the input's files and the version and, after a dot, one of all settings."""
+        """Return a digest of the input's files and the version, a dot, and a digest of all settings."""
         settings = self.settings.to_dict()
         del settings["threads"]
         checkpoint = Path(self.settings.checkpoint)
-        if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by its content, wherever it is
+        if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # its content counts, not its path
             settings["checkpoint"] = file_sha256(checkpoint)
         without = [name for name in sorted(files.named) if getattr(files, name) is None]
         reading = {"opacity": self.opacity, **vars(self.hints), "without": without}
@@ -123,16 +126,16 @@ class CompactCall:
 class Job:
     """A scene of a batch, and the call that makes its result."""
 
-    scene: str  # a ``.ply``, or the folder of one
+    scene: str  # a file of Gaussians, or its folder
     outputs: tuple[str, ...]  # names of the result and of its coarser levels in the output folder
     call: SceneCall
-    num_gaussians: int  # about, by the header or the bytes of its files; 0 where they cannot be read
-    num_rest: int = 0  # columns of higher harmonics, likewise
-    cameras: StrPath | None = None  # None: beside the scene
-    images: StrPath | None = None  # likewise
-    masks: StrPath | None = None  # likewise
+    num_gaussians: int  # estimated by the header or the bytes of its files; 0 if they cannot be read
+    num_rest: int = 0  # columns of higher harmonics, estimated in the same way
+    cameras: StrPath | None = None  # None: those beside the scene
+    images: StrPath | None = None  # None: those beside the scene
+    masks: StrPath | None = None  # None: those beside the photos
     protect: StrPath | None = None  # None: nothing has to stay sharper
-    within: Path | None = None  # folder that was named, up to which cameras and photos are searched
+    within: Path | None = None  # folder that the user named; cameras and photos are searched up to it
 
     @property
     def output(self) -> str:
@@ -154,12 +157,12 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
     """Find all scenes, each once, and name their results in the output folder.
 
     ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
-    line. ``results`` has the real paths of former results, which are not scenes. SceneError if something, or what all
-    scenes shall use, does not exist or has no scene, or networks are unusable; UsageError if two scenes would be
-    written to one file, or over another.
+    line. ``results`` has the real paths of former results, which are not scenes. SceneError if an argument does not
+    exist or has no scene, if cameras, photos or masks for all scenes do not exist, or if networks cannot be used.
+    UsageError if a result would have the name of another result or of a scene.
     """
     if options.settings.checkpoint not in CHECKPOINTS:
-        load_checkpoint(options.settings.checkpoint)  # once, and not for each scene
+        load_checkpoint(options.settings.checkpoint)  # fail once, not for each scene
     call = CompactCall(options.settings, options.opacity, options.hints)
     for name in PLACES:
         _check_place(name, getattr(options, name))
@@ -173,38 +176,40 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
         inputs.add(real)
         first = output_name(options, scene, len(jobs))
         outputs = (first, *(level_output(Path(first), i).as_posix() for i in range(1, options.settings.budget.levels)))
-        for name in map(os.path.normcase, outputs):  # on Windows A.ply is a.ply
+        for name in map(os.path.normcase, outputs):  # on Windows A.ply and a.ply are one file
             if name in owners:
                 raise UsageError(
-                    f"{out / name}: expected a file of its own for each scene, would be that of {owners[name]} and of"
-                    f" {scene}; tell them apart with --name, such as '{{parent}}-{{stem}}.ply'"
+                    f"{out / name}: expected a different name for each result, would be that of {owners[name]} and of"
+                    f" {scene}; distinguish them with --name, such as '{{parent}}-{{stem}}.ply'"
                 )
             owners[name] = str(scene)
-        named = {name: getattr(options, name) for name in PLACES}
-        places: dict[str, Any] = {name: path if path == NONE else filled(path, scene) for name, path in named.items()}
+        patterns = {name: getattr(options, name) for name in PLACES}
+        places: dict[str, Any] = {
+            name: path if path == NONE else filled(path, scene) for name, path in patterns.items()
+        }
         jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), **places, within=within))
     for name in owners:
         if os.path.realpath(out / name) in inputs:
-            raise UsageError(f"{out / name}: is one of the scenes, and would be replaced; name another --output")
+            raise UsageError(f"{out / name}: is one of the scenes and would be replaced; name another --output")
     return jobs
 
 
 def _check_place(option: str, place: str | None) -> None:
-    """Raise SceneError if a path for all scenes does not exist: each of them would fail."""
+    """Raise SceneError if a path for all scenes does not exist, since each scene would fail."""
     if place in (None, NONE) or "{" in place or os.path.exists(place):
         return
-    beside = f"for one beside each scene pass --{option} '{{parent}}/{place}'"
-    raise SceneError(place, "no such file or folder", "" if os.path.isabs(place) else beside)
+    remedy = f"for one beside each scene pass --{option} '{{parent}}/{place}'"
+    raise SceneError(place, "no such file or folder", "" if os.path.isabs(place) else remedy)
 
 
 def output_name(options: BatchOptions, scene: Path, index: int) -> str:
     """Return the name of a scene's result in the output folder."""
-    whole = Path(os.path.abspath(scene))
-    stem = stem_of(whole).removesuffix(".compressed")  # which is the scene's format, not its result's
+    path = Path(os.path.abspath(scene))
+    stem = stem_of(path).removesuffix(".compressed")  # belongs to the format of the scene, not of its result
     decode = options.settings.decode
     k = decode.k if decode.k != AUTO else decode.max_k
-    values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": k}
+    values = {"stem": stem, "parent": path.parent.name, "index": index, "k": k}
     try:
         return Path(os.path.normpath(options.output.format(**values))).as_posix()
-    except ValueError as error:  # a format that fits numbers only
+    except ValueError as error:  # a format specification that fits numbers only
         raise UsageError(f"--name: {options.output!r} does not fit {values}: {error}") from error

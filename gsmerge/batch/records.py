@@ -1,4 +1,4 @@
-"""Records of a batch: a line of JSON for each result that was made, or that failed."""
+"""Records of a batch, a line of JSON for each result that was made or failed."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from gsmerge.io.jsonl import each_line
 from gsmerge.report import document_head, file_sha256
 
 RECORDS = "batch.jsonl"
-DONE, FAILED = "done", "failed"  # of records
-SKIPPED = "skipped"  # of what is done already, which is not recorded again
+DONE, FAILED = "done", "failed"  # values of `status` in records
+SKIPPED = "skipped"  # `status` of a result that was done before; it is reported, but not recorded again
 
 
 @dataclass(frozen=True)
 class DoneResult:
-    """A result that a record says is done."""
+    """A result that is done, as its record describes it."""
 
-    key: str  # of the scene's files, the settings and the version; "" where making it again failed
-    files: list[dict[str, Any]]  # ``path`` in the output folder, ``sha256`` and ``bytes`` of each
+    key: str  # digest of the scene's files, the settings and the version; "" if making it again failed
+    files: list[dict[str, Any]]  # ``path`` in the output folder, ``sha256`` and ``bytes`` of each file
     end: int  # byte after its record
-    worse: str | None = None  # that it shows its photos worse than its input
-    left_out: str | None = None  # that cameras or photos beside its scene do not belong to it
+    worse: str | None = None  # warning that it shows its photos worse than the input does
+    left_out: str | None = None  # note that cameras or photos beside its scene do not belong to the scene
 
     def holds(self, folder: Path, key: str) -> bool:
-        """Return whether the key is the same and every file is unchanged."""
+        """Return whether the result has this key and all its files are unchanged."""
         if self.key != key or not self.files:
             return False
         try:
@@ -38,29 +38,29 @@ class DoneResult:
             if not all(path.is_file() for path in paths):  # a pipe would never end
                 return False
             return [file_sha256(path) for path in paths] == [file["sha256"] for file in self.files]
-        except (OSError, ValueError):  # the latter of a name that no file has
+        except (OSError, ValueError):  # ValueError: no file can have this name
             return False
 
 
 @dataclass
 class RecordIndex:
-    """The results that the records of a folder say are done."""
+    """The results that are done according to the records of a folder."""
 
     folder: Path
-    end: int = 0  # byte up to which the records are read
-    results: dict[str, DoneResult] = field(default_factory=dict)  # by name
+    end: int = 0  # byte up to which the records have been read
+    results: dict[str, DoneResult] = field(default_factory=dict)  # by name of the output
 
     def read_on(self) -> RecordIndex:
-        """Read the records that this or another process has added since the last call; pass over damaged lines."""
+        """Read the records that this or another process has added since the last call; skip damaged lines."""
         for end, line in each_line(self.folder / RECORDS, self.end):
             self.end = end
-            with suppress(KeyError, TypeError, AttributeError):  # no record
+            with suppress(KeyError, TypeError, AttributeError):  # the line is not a record
                 if line is None:
                     continue
                 output, status = _text(line["output"]), line["status"]
                 if status == DONE:
                     self.results[output] = _read_result(line, end)
-                elif status == FAILED and line["key"] is None and output in self.results:  # a refusal has its key
+                elif status == FAILED and line["key"] is None and output in self.results:  # a refusal has a key
                     self.results[output] = replace(self.results[output], key="")
         return self
 
@@ -68,24 +68,26 @@ class RecordIndex:
         """Yield the real paths of all files of results."""
         for result in self.results.values():
             for file in result.files:
-                with suppress(ValueError):  # a name that no file has
+                with suppress(ValueError):  # no file can have this name
                     yield os.path.realpath(self.folder / file["path"])
 
 
 def _read_result(line: Mapping[str, Any], end: int) -> DoneResult:
+    """Read a record of a result; KeyError, TypeError or AttributeError if it is damaged."""
     files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
     doubts = line["report"].get("worse"), line["report"].get("input", {}).get("left_out")
     return DoneResult(_text(line["key"]), files, end, *(None if doubt is None else _text(doubt) for doubt in doubts))
 
 
 def _text(value: Any) -> str:
+    """Return a text; TypeError for another value."""
     if not isinstance(value, str):
         raise TypeError
     return value
 
 
 def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
-    """Make a record: the keys of every record, and ``facts``."""
+    """Make a record of ``facts`` with all keys that a record has."""
     blank: dict[str, Any] = {"key": None, "files": [], "error": None, "report": None}
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **facts}
 
@@ -96,10 +98,10 @@ def check_folder(folder: Path) -> int:
         folder.mkdir(parents=True, exist_ok=True)
         records = folder / RECORDS
         if records.is_symlink():
-            problem = "expected a file of records, found a link, whose target would be changed"
+            problem = "expected a file of records, found a link"
             raise SceneError(records, problem, "remove it, or name another folder with --output")
         if records.exists():
-            check_file(records)  # a pipe waits for its reader
+            check_file(records)  # not a pipe, which would wait for its reader
         with records.open("ab") as file:
             return file.tell()
     except OSError as error:

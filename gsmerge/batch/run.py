@@ -1,7 +1,7 @@
-"""Run a batch: make the call of every job, unless its result is done, and record how it ended.
+"""Run a batch: make the result of every job that is not done, and record how each ended.
 
-A kill is safe at any moment. Results are whole or not there, and are recorded right after; what a killed process leaves
-besides is a file that marks its result as begun, which says that a result without a record is of a batch.
+The run may be killed at any moment. A result is written completely or not at all, and is recorded right after. A killed
+process also leaves a file that marks its result as begun. It shows that a result without a record is from a batch.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.threads import available_threads
 from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, Lost, RayPool, WorkerPool
 
-FREE_MEMORY_SHARE = 0.8  # of the free memory that scenes at once may take, where their number is not given
+FREE_MEMORY_SHARE = 0.8  # of the free memory, for all scenes that run at the same time by default
 
 
 @dataclass(frozen=True)
 class Concurrency:
-    """Number of scenes that are compacted at once, and of threads for each."""
+    """Number of scenes that are compacted at the same time, and number of threads for each."""
 
     jobs: int  # 0: as many as the cluster has processors for
     threads: int
@@ -46,16 +46,16 @@ class Concurrency:
 
 @dataclass(frozen=True)
 class Run:
-    """What all jobs of a run share."""
+    """Values that all jobs of a run share."""
 
     folder: Path  # of the results
-    start: int  # size of its records when the run began
-    threads: int  # of a call
+    start: int  # size of its records in bytes when the run began
+    threads: int  # of each call
     overwrite: bool
 
 
 def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrency:
-    """Divide the processors among scenes: a thread for each, as far as there are scenes and free memory."""
+    """Divide the processors among scenes, with as many scenes at once as there are processors and free memory."""
     threads, processors = options.settings.threads, available_threads()
     if options.engine == "ray":
         return Concurrency(options.jobs or 0, threads or 1)
@@ -69,7 +69,7 @@ def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrenc
 
 
 def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> list[tuple[Job, str | None]]:
-    """List the jobs whose result is not done, all where they are to be done again, each with why it is refused."""
+    """List the jobs to do, each with the reason if it will be refused; with ``overwrite`` these are all."""
     if options.overwrite:
         return [(job, None) for job in jobs]
     results, pending = RecordIndex(folder).read_on().results, list[tuple[Job, str | None]]()
@@ -85,12 +85,12 @@ def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> li
 
 
 def refusal(job: Job, folder: Path, known: DoneResult | None, key: str, *, begun: bool = False) -> str | None:
-    """Return why a result is not replaced without being asked; ``begun``: what is there may be of a run that ended."""
+    """Return why a result must not be replaced, or None; ``begun``: the existing file may be from a killed run."""
     names = () if known is None else [file["path"] for file in known.files]
     foreign = [name for name in job.outputs if os.path.lexists(folder / name) and name not in names]
     if foreign and not begun:
-        return f"{folder / foreign[0]}: exists already, and no batch wrote it; pass --overwrite to replace it"
-    former = "" if known is None else known.key.partition(".")[2]  # which stands for the settings
+        return f"{folder / foreign[0]}: exists already and was not written by a batch; pass --overwrite to replace it"
+    former = "" if known is None else known.key.partition(".")[2]  # the digest of the settings
     if former in ("", key.partition(".")[2]) or not any(os.path.lexists(folder / name) for name in names):
         return None
     remedy = "pass --overwrite to make it again, or name another --output"
@@ -98,9 +98,9 @@ def refusal(job: Job, folder: Path, known: DoneResult | None, key: str, *, begun
 
 
 def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Generator[dict[str, Any], None, None]:
-    """Make the results of all jobs in a folder, several at once; yield the record of each as it ends.
+    """Make the results of all jobs in a folder, several at a time; yield the record of each job as it ends.
 
-    Jobs that are done already are yielded as skipped. Several runs may share a folder; jobs that another run works on
+    Jobs that are done already are yielded as skipped. Several runs may share a folder; jobs on which another run works
     come last. Close the generator to end the processes. SceneError if the folder cannot be written; UsageError if Ray
     is not installed.
     """
@@ -120,24 +120,23 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
                 active[job.output] = job
                 yield Call(job, (job, run, wait), job.memory)
 
-        left, wait = jobs, False
-        while left:
+        remaining, wait = jobs, False
+        while remaining:
             busy: list[Job] = []
-            for job, outcome in pool.run(make_result, each_call(left, wait=wait)):
+            for job, outcome in pool.run(make_result, each_call(remaining, wait=wait)):
                 del active[job.output]
                 line = record_loss(job, run, outcome.reason) if isinstance(outcome, Lost) else outcome
                 if line is None:
                     busy.append(job)
                 else:
                     yield line
-            left, wait = busy, True
+            remaining, wait = busy, True
 
 
 def make_result(job: Job, run: Run, wait: bool) -> dict[str, Any] | None:
     """Make a result unless it is done, record the outcome, and return the record.
 
-    ``wait``: wait for another process that works on the result; otherwise return None. SceneError if nothing can be
-    recorded.
+    If another process works on the result, ``wait`` for it or return None. SceneError if the record cannot be written.
     """
     with lock_result(run.folder, job.output, wait=wait) as begun:
         if begun is None:
@@ -154,14 +153,15 @@ def make_result(job: Job, run: Run, wait: bool) -> dict[str, Any] | None:
 
 
 def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
+    """Make a locked result unless it is done or refused; return its record."""
     files = job.find_files()
     key, known = job.call.key(files), read_index(run.folder, run.start).read_on().results.get(job.output)
-    is_new = known is not None and known.end > run.start  # by another run, or process of this one
+    is_new = known is not None and known.end > run.start  # made since this run began, by it or by another run
     if known is not None and (is_new or not run.overwrite) and known.holds(run.folder, key):
         doubts = {"worse": known.worse, "left_out": known.left_out}
         return record(SKIPPED, job.scene, job.output, key=key, files=known.files, **doubts)
     if known is not None and is_new and known.key not in (key, ""):
-        problem = "another run with other settings has made it meanwhile; wait for that run, or name another --output"
+        problem = "another run made it with other settings in the meantime; wait for that run, or name another --output"
         raise UsageError(f"{run.folder / job.output}: {problem}")
     refused = None if run.overwrite else refusal(job, run.folder, known, key, begun=begun.exists())
     if refused:
@@ -173,21 +173,21 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
         warnings.simplefilter("default")
         document, written = job.call.run(files, out, run.threads)
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
-    made = [
+    facts = [
         {"path": name.as_posix(), "sha256": file_sha256(run.folder / name), "bytes": (run.folder / name).stat().st_size}
         for name in (Path(os.path.relpath(path, run.folder)) for path in written)
     ]
-    return record(DONE, job.scene, job.output, key=key, files=made, report=finite(document))
+    return record(DONE, job.scene, job.output, key=key, files=facts, report=finite(document))
 
 
 @lru_cache(maxsize=1)
 def read_index(folder: Path, start: int) -> RecordIndex:
-    """Return the index of a folder's records, which each process keeps between the calls of a run."""
+    """Return the index of a folder's records; each process keeps it between the calls of a run."""
     return RecordIndex(folder)
 
 
 def record_loss(job: Job, run: Run, reason: str) -> dict[str, Any] | None:
-    """Record the failure of a job whose process died; None if another process works on it now."""
+    """Record the failure of a job whose process died; return None if another process works on the job now."""
     with lock_result(run.folder, job.output, wait=False) as begun:
         if begun is None:
             return None
@@ -198,7 +198,7 @@ def record_loss(job: Job, run: Run, reason: str) -> dict[str, Any] | None:
 
 
 def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
-    """Remove the unfinished files of jobs whose processes were ended on purpose."""
+    """Remove the unfinished files of jobs whose processes this run has ended."""
     for job in jobs:
         with suppress(SceneError), lock_result(run.folder, job.output, wait=False) as begun:
             if begun is not None:
@@ -206,7 +206,7 @@ def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
 
 
 def _clean(job: Job, run: Run, begun: Path) -> None:
-    """Remove the files that a killed process left, except the mark of a result that may be without a record."""
+    """Remove the files that a killed process left; keep the mark if the result exists, since it may lack a record."""
     if begun.exists():
         paths = [run.folder / name for name in job.outputs]
         for folder in {path.parent for path in paths}:
@@ -216,19 +216,19 @@ def _clean(job: Job, run: Run, begun: Path) -> None:
 
 
 def mark(begun: Path) -> None:
-    """Say in a file which process works on a result, so that the result is known to be of a batch."""
+    """Write the file that marks a result as begun, with the process number, so that it is known to be from a batch."""
     with begun.open("wb") as file:
         file.write(f"{os.getpid()}\n".encode())
         file.flush()
-        os.fsync(file.fileno())  # on the disk before the result
+        os.fsync(file.fileno())  # it must be on the disk before the result
 
 
 @contextmanager
 def lock_result(folder: Path, output: str, *, wait: bool) -> Iterator[Path | None]:
     """Lock a result against other processes in the block; SceneError if that fails.
 
-    Yields the path of the file that marks the result as begun; None if another process has locked the result, unless
-    it is to ``wait`` for that.
+    Yields the path of the file that marks the result as begun. If another process has locked the result, ``wait`` for
+    it or yield None.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
     with lock_file(folder / f".batch-{name}.lock", wait=wait) as is_ours:

@@ -1,4 +1,4 @@
-"""Read files to their ends, and say of each why ``compact`` would refuse it."""
+"""Read files completely, and list the reasons for which ``compact`` would refuse each one."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ ARCHIVES = (".sog", ".npz", CHUNK)
 
 @dataclass(frozen=True)
 class FileCheck:
-    """Content of a file, and why it is refused."""
+    """Content of a file, and the reasons to refuse it."""
 
     path: str
-    kind: str  # "Gaussians", "cameras", "networks" or "Feature Gaussians"; "" where it cannot be read
-    count: int = 0  # of these: views of cameras, parameters of networks
-    layout: str = ""  # of the columns or of the cameras' file
+    kind: str  # "Gaussians", "cameras", "networks" or "Feature Gaussians"; "" if the file cannot be read
+    count: int = 0  # of Gaussians or Feature Gaussians, views of cameras, or parameters of networks
+    layout: str = ""  # of the columns, or of the camera file
     file_bytes: int = 0
     problems: tuple[str, ...] = ()  # one sentence each, without a full stop
-    notes: tuple[str, ...] = ()  # what is odd, and not wrong, and what was not read
-    num_views: int = 0  # cameras of a scene's folder
-    num_photos: int = 0  # and their photos
+    notes: tuple[str, ...] = ()  # unusual content that is not wrong, and content that was not read
+    num_views: int = 0  # of a scene with cameras
+    num_photos: int = 0  # of a scene with photos
 
     @property
     def line(self) -> str:
-        """The result in one line for people."""
+        """The result as one line for people."""
         if self.problems:
             return f"wrong  {self.path}: {'; '.join(self.problems)}"
         unit = {"networks": "parameters"}.get(self.kind, self.kind)
@@ -57,21 +57,21 @@ class FileCheck:
 
 
 def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> FileCheck:
-    """Read Gaussians with the cameras and photos beside them, cameras, networks or a ``.gsm`` to the end.
+    """Read a file completely: Gaussians with the cameras and photos beside them, cameras, networks or a ``.gsm``.
 
-    The ending tells the kind of file. A scene is read as ``compact`` reads it. UsageError if a package is missing.
+    The ending decides the kind of file. A scene is read as ``compact`` reads it. UsageError if a package is missing.
     """
     try:
         file_check = _read_scene(path, opacity, hints) if holds_scene(path) else _read(path)
     except SceneError as error:
         return FileCheck(str(path), "", problems=(str(error).removeprefix(f"{path}: "),))
-    problems = (*file_check.problems, *damage(path))
+    problems = (*file_check.problems, *list_damage(path))
     size = 0 if path.is_dir() else path.stat().st_size
     return replace(file_check, file_bytes=file_check.file_bytes or size, problems=problems)
 
 
 def holds_scene(path: Path) -> bool:
-    """Return whether a path is read as a scene, and not as cameras, networks, levels or a state alone."""
+    """Return whether a path is read as a scene, and not as cameras, networks, levels or a state."""
     suffix = path.suffix.lower()
     if suffix in SEVERAL_USES:
         return os.path.exists(path) and may_hold_gaussians(path)
@@ -82,17 +82,18 @@ def holds_scene(path: Path) -> bool:
     return suffix in SCENE_SUFFIXES or os.path.isdir(path)
 
 
-def damage(path: Path) -> list[str]:
-    """List what reading a file does not meet: bytes behind its content, and wrong checksums of its parts."""
+def list_damage(path: Path) -> list[str]:
+    """List problems that reading a file does not notice: bytes after its content, and wrong checksums of its parts."""
     suffix = path.suffix.lower()
     if os.path.isdir(path):
-        return [f"{file.name}: {problem}" for file in list_plys(path) for problem in damage(file)]
-    found = damaged_member(path) if suffix in ARCHIVES else spz.problem_at_end(path) if suffix == ".spz" else None
-    left = ply.bytes_after_rows(path) if suffix == ".ply" else 0
-    return [found] if found else [f"{left:,} bytes after the last row, which nothing reads"] if left else []
+        return [f"{file.name}: {problem}" for file in list_plys(path) for problem in list_damage(file)]
+    problem = damaged_member(path) if suffix in ARCHIVES else spz.problem_at_end(path) if suffix == ".spz" else None
+    surplus = ply.bytes_after_rows(path) if suffix == ".ply" else 0
+    return [problem] if problem else [f"{surplus:,} bytes after the last row, which are not read"] if surplus else []
 
 
 def _read(path: Path) -> FileCheck:
+    """Read a file that is not a scene; SceneError if it cannot be read."""
     suffix = path.suffix.lower()
     if suffix == SUFFIX:
         return FileCheck(str(path), "Feature Gaussians", len(load_state(path)))
@@ -121,7 +122,7 @@ def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileChe
 
 
 def _read_cameras(path: Path) -> FileCheck:
-    """Read the cameras of a file, of all scenes if it has several."""
+    """Read the cameras of a file; if it has several scenes, of all."""
     count = 0
     for cameras in read_all_cameras(path):
         count += len(cameras)
@@ -131,9 +132,9 @@ def _read_cameras(path: Path) -> FileCheck:
 
 
 def _read_levels(path: Path) -> FileCheck:
-    """Read all levels of an index, one after the other."""
+    """Read all levels of detail of an index, one after the other."""
     index = streamed.read_index(path)
     infos = [streamed.read_level(path, level, index).info for level in range(len(index.levels))]
-    beside = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
+    total_bytes = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
     notes = dict.fromkeys(note for info in infos for note in file_notes(info))
-    return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, beside, notes=tuple(notes))
+    return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, total_bytes, notes=tuple(notes))

@@ -37,13 +37,13 @@ from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
-LPIPS = "alex"  # the network of LPIPS where its weights are installed: 0.05 s a picture, the other one takes 0.8 s
-MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
+LPIPS = "alex"  # network of LPIPS, if its weights are installed; it takes 0.05 s per picture, "vgg" 0.8 s
+MAX_VIEWS = 32  # of more views, some at equal intervals are shown; each takes up to 300 kB
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
-OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
-OUTLINE_LEVELS = 5  # of each channel in their colours: with the transparent one they fit a byte
+OUTLINE_SIDE = 1280  # largest longer side of a picture of superpixels' outlines, pixels
+OUTLINE_LEVELS = 5  # levels per channel of an outline's colour; with transparency all colours fit into a byte
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
-OUTLINE_SHIFT = 0.35  # by which an outline is lighter than its superpixel, or darker where that is light
+OUTLINE_SHIFT = 0.35  # an outline is lighter than its superpixel by this share, or darker if the superpixel is light
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,17 @@ class Side:
     name: str
     num_gaussians: int
     file_bytes: int
-    mean: Quality  # over the views that count: the held-out ones where there are any
+    mean: Quality  # over the held-out views, or over the input views if no view is held out
     splats: bytes | None  # the Gaussians in the page's frame, see :func:`pack_splats`; None: too many for a page
-    sh_degree: int  # of the harmonics that the page has
-    file_sh_degree: int  # of those in the file
-    covered_share: float | None  # of the pixels of these views, covered by the input
-    covered: Quality  # over those
-    seconds: float  # that drawing a view took here, with all threads
-    dropped: Mapping[str, int]  # Gaussians that ``--drop`` would take, by its words
-    seen: Mapping[str, int]  # Gaussians that "none" of the input views shows, or "one", where any are known
-    support: bytes | None  # how many of them show each packed Gaussian, see :func:`pack_support`; None: not known
-    new_gain: tuple[float, float] | None = None  # bounds of what new views are expected to gain, dB; None: not known
+    sh_degree: int  # of the harmonics in the page
+    file_sh_degree: int  # of the harmonics in the file
+    covered_share: float | None  # share of the pixels of these views that the input covers
+    covered: Quality  # over the covered pixels
+    seconds: float  # time to draw a view on this machine, with all threads
+    dropped: Mapping[str, int]  # number of Gaussians that ``--drop`` would remove, by its words
+    seen: Mapping[str, int]  # number of Gaussians that "none" or "one" of the input views shows; empty if not known
+    support: bytes | None  # number of views that show each packed Gaussian, see :func:`pack_support`; None: not known
+    new_gain: tuple[float, float] | None = None  # bounds of the expected gain of new views, dB; None: not known
 
 
 @dataclass(frozen=True)
@@ -74,16 +74,16 @@ class PageView:
     place: int  # among all views, the input views first
     held_out: bool
     camera: Cameras  # one, in the page's frame
-    distance: float  # of what it looks at, in units of that frame
+    distance: float  # median depth of the scene, in units of that frame
     photo: bytes | None  # WebP
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
-    outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None of held-out views
-    outside: bool = False  # a camera where no photo is; it has no scores
-    drops: tuple[bytes | None, ...] = ()  # PNG, one for each side: what ``--drop`` would take, coloured
-    seen: tuple[bytes | None, ...] = ()  # the same of what none or one of the input views shows
+    outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None for held-out views
+    outside: bool = False  # true: a camera without a photo and without scores
+    drops: tuple[bytes | None, ...] = ()  # PNG, one for each side: Gaussians that ``--drop`` would remove, coloured
+    seen: tuple[bytes | None, ...] = ()  # PNG, one for each side: Gaussians that none or one of the input views shows
     maps: tuple[bytes | None, ...] = ()  # WebP, one for each side: see :mod:`gsmerge.measure.error_maps`
-    faded: tuple[bytes | None, ...] = ()  # stills from outside with that made faint which no view shows
+    faded: tuple[bytes | None, ...] = ()  # stills of the outside view in which Gaussians that no view shows are faint
 
 
 @dataclass(frozen=True)
@@ -92,35 +92,35 @@ class ViewData:
 
     title: str  # name of the scene
     sides: tuple[Side, ...]  # the scene itself, then its results
-    views: tuple[PageView, ...]  # the worst of the first result first, of the scene without one
-    outside: PageView  # the view from outside of the capture
-    num_views: int  # views that were measured, which may be more
+    views: tuple[PageView, ...]  # by the scores of the first result, or else of the scene, the worst view first
+    outside: PageView  # the view from outside the capture
+    num_views: int  # number of measured views, which may be larger than that of `views`
     reference: str  # words for the pictures that scores compare with
     notes: tuple[str, ...]  # warnings and limits, one sentence each
-    num_superpixels: tuple[int, int] | None = None  # least and most of a photo; None without outlines
-    lacks_pixels: bool = False  # whether the scene itself covers less than the input views
-    agreement: Agreement | None = None  # how far the views confirm each other's depth
+    num_superpixels: tuple[int, int] | None = None  # least and largest number in a photo; None without outlines
+    lacks_pixels: bool = False  # true: the scene itself does not cover all pixels of the input views
+    agreement: Agreement | None = None  # share of the depth that other views confirm; None: not known
 
     @property
     def shown(self) -> tuple[PageView, ...]:
-        """The views, followed by the one from outside."""
+        """The views, followed by the outside view."""
         return (*self.views, self.outside)
 
     @property
     def start(self) -> int:
-        """Index of the view on which the page opens: the view of median score, or the first without scores.
+        """Index of the view with which the page opens: the view with the median score, or the first without scores.
 
-        It is a held-out view if there are any, as for the figures at the top, and one with all measures.
+        Held-out views are preferred, as in the figures at the top, and views with LPIPS.
         """
-        every = list(enumerate(self.views))
-        held_out = [(i, view) for i, view in every if view.held_out] or every
+        views = list(enumerate(self.views))
+        held_out = [(i, view) for i, view in views if view.held_out] or views
         measured = [i for i, view in held_out if view.scores[-1].lpips_alex is not None]
-        counted = measured or [i for i, _ in held_out]
-        return counted[(len(counted) - 1) // 2] if self.scored else counted[0]
+        candidates = measured or [i for i, _ in held_out]
+        return candidates[(len(candidates) - 1) // 2] if self.scored else candidates[0]
 
     @property
     def scored(self) -> bool:
-        """Whether views have scores: there are photos, or several scenes to compare."""
+        """Whether views have scores, because there are photos or several scenes to compare."""
         return len(self.sides) > 1 or any(view.photo is not None for view in self.views)
 
     @property
@@ -141,11 +141,11 @@ def collect(
     light: bool = False,
     progress: Progress = lambda *_: None,
 ) -> ViewData:
-    """Draw and score a scene with at least one view, and its results, if any, in all views.
+    """Draw and score a scene with at least one view, and its results, in all views.
 
-    ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the file sizes of the scene and the results.
-    Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`), 3D uses the scene's own. ``new_gains``: dB that
-    new views of results are expected to gain. ``light``: the scene itself as stills alone.
+    ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes``: file sizes of the scene
+    and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's cameras.
+    ``new_gains``: bounds of the expected gain of new views, dB. ``light``: show the scene itself in stills only.
     """
     stills: Stills = {}
     nets = (LPIPS,) if lpips_available(LPIPS) else ()
@@ -162,7 +162,7 @@ def collect(
 
 
 def still_keeper(stills: Stills) -> OnImage:
-    """Make a function for ``on_image`` of :func:`gsmerge.evaluate` that adds what is drawn to ``stills``."""
+    """Make a function for ``on_image`` of :func:`gsmerge.evaluate` that adds the drawings to ``stills``."""
 
     def keep(result: str, split: str, view: int, image: np.ndarray) -> None:
         stills[result, split, view] = encode_still(to_picture(image))
@@ -182,56 +182,56 @@ def page_data(
     cameras: Mapping[str, Cameras] | None = None,
     light: bool = False,
 ) -> ViewData:
-    """Make the content of a page of what was measured: see :func:`collect`."""
+    """Make the content of a page from an evaluation and its stills; see :func:`collect`."""
     pictures = photo_array(evaluation.pictures)
     splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
     splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
-    entered = {name: frame.enter(gaussians) for name, gaussians in named.items()}
-    placed = frame.enter_cameras(scene.cameras.numpy())
-    looked_at = [name for name in named if name != INPUT or not results]
+    canonical = {name: frame.enter(gaussians) for name, gaussians in named.items()}
+    own_cameras = frame.enter_cameras(scene.cameras.numpy())
+    inspected = [name for name in named if name != INPUT or not results]
     photos = pictures if len(pictures) else None
     marks = {name: Marks() for name in named} | {
-        name: find_marks(entered[name], placed, photos, own=name == INPUT and scene.has_own_pixels)
-        for name in looked_at
+        name: find_marks(canonical[name], own_cameras, photos, own=name == INPUT and scene.has_own_pixels)
+        for name in inspected
     }
     split, near = "context" if held_out is None else "target", near_plane(scene) / frame.unit
     sides = [
-        _side(result, size, split, entered[result.name], marks[result.name], scene, placed, light=light)
+        _side(result, size, split, canonical[result.name], marks[result.name], scene, own_cameras, light=light)
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
-    means = entered[evaluation.results[:2][-1].name].means
+    means = canonical[evaluation.results[:2][-1].name].means
     views = _page_views(splits, evaluation, stills, frame, means)
     shown, num_superpixels = with_outlines(_shown(views), pictures)
     moved = {name: frame.enter_cameras(own.numpy()) for name, own in (cameras or {}).items()}
     witnesses = {
-        name: call_witnesses(entered[name], Views(moved.get(name, placed), pictures, scene.names), scene.masks)
-        for name in (looked_at if len(pictures) > 1 else ())
+        name: call_witnesses(canonical[name], Views(moved.get(name, own_cameras), pictures, scene.names), scene.masks)
+        for name in (inspected if len(pictures) > 1 else ())
     }
-    splats = {name: make_splats(entered[name]) for name in looked_at}
+    splats = {name: make_splats(canonical[name]) for name in inspected}
     shown = tuple(replace(view, maps=tuple(_map(witnesses.get(name), view) for name in named)) for view in shown)
     *drawn, outside = (
         _with_marks(view, splats, marks, near) for view in (*shown, _outside_view(scene, named, frame, len(views)))
     )
-    faint = (marks[name].fade(gaussians) for name, gaussians in entered.items())
+    faint = (marks[name].fade(gaussians) for name, gaussians in canonical.items())
     faded = (None if g is None else render(g, outside.camera, near=near).images[0] for g in faint)
     outside = replace(outside, faded=tuple(None if one is None else encode_still(to_picture(one)) for one in faded))
-    measured = evaluation.notes if results else ()  # which are about what was fitted
+    measured = evaluation.notes if results else ()  # they concern results
     notes = (*measured, *_limits(sides, len(shown), len(views)))
     share, _ = evaluation.results[0].mean_covered("context")
     lacks_pixels = share is not None and share < WHOLE
     return ViewData(
         title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
-        lacks_pixels, confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=placed)),
+        lacks_pixels, confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=own_cameras)),
     )  # fmt: skip
 
 
 def _with_marks(view: PageView, splats: Mapping[str, Splats], marks: Mapping[str, Marks], near: float) -> PageView:
-    """Add to a view what is marked of each side."""
+    """Add to a view the pictures of the marked Gaussians of each side."""
     drawn = [
-        draw_marks(splats[name], of, view.camera, near) if name in splats else (None, None)
-        for name, of in marks.items()
+        draw_marks(splats[name], marked, view.camera, near) if name in splats else (None, None)
+        for name, marked in marks.items()
     ]
     drops, seen = zip(*drawn, strict=True)
     return replace(view, drops=drops, seen=seen)
@@ -267,7 +267,7 @@ def _page_views(
 
 
 def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
-    """Draw Gaussians of a scene's world from outside of its capture."""
+    """Draw Gaussians in a scene's world from outside its capture."""
     camera, distance = outside_camera(scene.cameras.numpy(), scene.file_gaussians.means)
     renders = (render(gaussians, camera, near=near_plane(scene)) for gaussians in named.values())
     return PageView(
@@ -290,14 +290,14 @@ def with_outlines(views: Sequence[PageView], photos: np.ndarray) -> tuple[tuple[
         return tuple(views), None
     pictures = photos[[views[i].place for i in places]]
     groups = segment(pictures, SegmentOptions())
-    made = list(views)
+    outlined = list(views)
     for i, picture, labels in zip(places, pictures, groups.labels, strict=True):
-        made[i] = replace(views[i], outlines=encode_outlines(picture, labels))
-    return tuple(made), (min(groups.counts), max(groups.counts))
+        outlined[i] = replace(views[i], outlines=encode_outlines(picture, labels))
+    return tuple(outlined), (min(groups.counts), max(groups.counts))
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Shorten photo names by folders and endings, where the short names still differ."""
+    """Remove folders and endings from photo names, if all short names differ."""
     stems = [PurePosixPath(name.replace("\\", "/")).stem or name for name in names]
     return stems if len(set(stems)) == len(stems) else list(names)
 
@@ -323,7 +323,7 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
 
 
 def _map(witnesses: Witnesses | None, view: PageView) -> bytes | None:
-    """Draw by other photos how far off one side is likely to be in a view; None without other photos."""
+    """Draw the likely error of one side in a view, estimated by other photos; None without other photos."""
     if witnesses is None:
         return None
     own = None if view.held_out else view.place
@@ -334,9 +334,9 @@ def _map(witnesses: Witnesses | None, view: PageView) -> bytes | None:
 def _pack(
     gaussians: Gaussians, name: str, scene: Scene, cameras: Cameras, light: bool
 ) -> tuple[bytes | None, int, int]:
-    """Pack one side's Gaussians (canonical, as ``cameras``) for the page; also return its SH degree and the file's.
+    """Pack one side's Gaussians for the page; also return the SH degrees of the page and of the file.
 
-    Those of the scene itself are left out if the page is to be ``light``.
+    Gaussians and ``cameras`` are canonical. In a ``light`` page the Gaussians of the scene itself are left out.
     """
     highest = highest_degree(gaussians.shN)
     if name != INPUT:
@@ -361,7 +361,7 @@ def _side(
     *,
     light: bool,
 ) -> Side:
-    """Collect what the page says of one side: of canonical ``gaussians`` what is marked, packed for its 3D."""
+    """Collect the data of one side of a page: scores, counts of marked Gaussians, and packed canonical Gaussians."""
     packed = _pack(gaussians, result.name, scene, cameras, light)
     support = None if marks.support is None or packed[0] is None else pack_support(marks.support[drawn_rows(gaussians)])
     dropped, seen = ({word: int(mask.sum()) for word, mask in masks.items()} for masks in (marks.drops, marks.seen))
@@ -373,7 +373,7 @@ def _side(
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
-    """Choose at most ``MAX_VIEWS`` views and the worst one, sorted by the scores of the first result, worst first."""
+    """Choose at most ``MAX_VIEWS`` views and the worst view, sorted by the scores of the first result, worst first."""
 
     def quality(view: PageView) -> float:
         score = view.scores[:2][-1].psnr
@@ -385,7 +385,7 @@ def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
 
 
 def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
-    """List what the page leaves out: Gaussians, harmonics and views."""
+    """List the Gaussians, harmonics and views that the page leaves out."""
     notes = []
     for side in sides:
         if side.num_gaussians > MAX_GAUSSIANS and side.splats is None:

@@ -1,4 +1,4 @@
-"""Find what ``--drop floaters,sky`` would take of a scene, and what few views show, and draw it for a page."""
+"""Find the Gaussians that ``--drop floaters,sky`` would remove or that few views show, and draw them for a page."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from gsmerge.types import Cameras, Gaussians
 
 Color = tuple[int, int, int]  # sRGB
 DROPS: Mapping[str, Color] = {"floaters": (255, 45, 150), "sky": (20, 170, 255)}
-SEEN: Mapping[str, Color] = {"none": TINTS[0], "one": TINTS[1]}  # views that show it
-MORE = 2  # views from which on it is no matter how many
-FAINT = 0.1  # of its opacity is left of what no view shows where that fades
-MOST = 300_000  # Gaussians: finding the floaters among more takes seconds
-VISIBLE = 0.15  # share of a pixel's light
-STEPS, MOST_ALPHA = 8, 190  # of such shares, each of which has an opacity; that of the whole light
+SEEN: Mapping[str, Color] = {"none": TINTS[0], "one": TINTS[1]}  # by the number of views that show a Gaussian
+MAX_SUPPORT = 2  # numbers of views from here on are not distinguished
+FAINT = 0.1  # factor on the opacity of Gaussians that no view shows, where these fade
+MAX_MARKED = 300_000  # Gaussians; finding the floaters among more takes seconds
+VISIBLE = 0.15  # least share of a pixel's light that is drawn
+STEPS, MAX_ALPHA = 8, 190  # number of shares that have different opacities, and the opacity of the whole light
 
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """What is marked of the n Gaussians of one side of a page."""
+    """Marks of the n Gaussians of one side of a page."""
 
-    drops: Mapping[str, np.ndarray] = field(default_factory=dict)  # [n] bool, what ``--drop`` takes, by its words
-    support: np.ndarray | None = None  # [n] uint8, views that show each, 2 for more; None: not known
+    drops: Mapping[str, np.ndarray] = field(default_factory=dict)  # [n] bool, removed by ``--drop``, by its words
+    support: np.ndarray | None = None  # [n] uint8, number of views that show each, at most 2; None: not known
 
     @property
     def seen(self) -> dict[str, np.ndarray]:
-        """Masks ``[n]`` of what no view and what one view shows, where any is."""
+        """Masks ``[n]`` of the Gaussians that no view and that one view shows, without empty masks."""
         if self.support is None:
             return {}
         masks = {word: self.support == number for number, word in enumerate(SEEN)}
         return {word: mask for word, mask in masks.items() if mask.any()}
 
     def fade(self, gaussians: Gaussians) -> Gaussians | None:
-        """Make faint what no view shows; None where nothing is such."""
+        """Make the Gaussians that no view shows faint; None if there are none."""
         if "none" not in self.seen:
             return None
         factors = np.where(self.seen["none"], np.float32(FAINT), np.float32(1))
@@ -48,22 +48,22 @@ class Marks:
 
 
 def find_marks(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None, *, own: bool) -> Marks:
-    """Find what is marked of canonical ``gaussians``; nothing where there are more than ``MOST``.
+    """Find the marks of canonical ``gaussians``; if there are more than ``MAX_MARKED``, mark none.
 
-    ``photos [v,h,w,3]`` of the ``cameras`` say where the sky is; None: no sky is found. Where views have
-    Gaussians of their ``own``, each is shown by one, which is not worth a mark.
+    The sky is found in the ``photos [v,h,w,3]`` of the ``cameras``; None: no sky is found. With ``own``, each view has
+    Gaussians of its own, which that view shows, so their support is not marked.
     """
-    if len(gaussians) > MOST:
+    if len(gaussians) > MAX_MARKED:
         return Marks()
-    above = np.zeros(len(gaussians), bool) if photos is None else sky(gaussians, cameras, photos)
+    in_sky = np.zeros(len(gaussians), bool) if photos is None else sky(gaussians, cameras, photos)
     isolated = np.zeros(len(gaussians), bool)
-    isolated[~above] = floaters(gaussians[~above])
-    drops = {word: mask for word, mask in (("floaters", isolated), ("sky", above)) if mask.any()}
-    return Marks(drops, None if own else np.minimum(count_views(gaussians, cameras), MORE).astype(np.uint8))
+    isolated[~in_sky] = floaters(gaussians[~in_sky])
+    drops = {word: mask for word, mask in (("floaters", isolated), ("sky", in_sky)) if mask.any()}
+    return Marks(drops, None if own else np.minimum(count_views(gaussians, cameras), MAX_SUPPORT).astype(np.uint8))
 
 
 def draw_marks(splats: Splats, marks: Marks, camera: Cameras, near: float) -> tuple[bytes | None, bytes | None]:
-    """Draw what is marked of canonical ``splats``, in one view: ``drops``, and what is ``seen`` by none or one."""
+    """Draw the marked ones of canonical ``splats`` in one view: those of ``drops``, and those of ``seen``."""
     if not (marks.drops or marks.seen):
         return None, None
     viewmat, K = camera.viewmats[0], camera.Ks[0]
@@ -72,9 +72,9 @@ def draw_marks(splats: Splats, marks: Marks, camera: Cameras, near: float) -> tu
 
 
 def draw_masks(tiled: TiledView, masks: Mapping[str, np.ndarray], colors: Mapping[str, Color]) -> bytes | None:
-    """Draw ``masks [n]`` in the ``colors`` of their words, two, each as opaque as its share of a pixel.
+    """Draw two ``masks [n]`` in the ``colors`` of their words, each as opaque as its share of a pixel's light.
 
-    Returns a PNG; None if nothing is seen.
+    Returns a PNG; None if no marked Gaussian is visible.
     """
     flags = np.zeros((len(tiled.splats), 3), np.float32)
     for channel, word in enumerate(colors):
@@ -84,5 +84,5 @@ def draw_masks(tiled: TiledView, masks: Mapping[str, np.ndarray], colors: Mappin
     first, second, _ = np.moveaxis(composite(tiled, flags)[0], 2, 0)
     most = np.maximum(first, second)
     ids = np.where(most >= VISIBLE, STEPS * (second > first) + np.ceil(STEPS * most.clip(0, 1)), 0).astype(np.uint8)
-    tints = [(*color, MOST_ALPHA * step // STEPS) for color in colors.values() for step in range(1, STEPS + 1)]
+    tints = [(*color, MAX_ALPHA * step // STEPS) for color in colors.values() for step in range(1, STEPS + 1)]
     return encode_indexed(ids, np.array([(0, 0, 0, 0), *tints], np.uint8)) if ids.any() else None

@@ -1,4 +1,4 @@
-"""Fill the templates of pages; everything that a page shows is in its one file."""
+"""Fill the templates of pages; the one file of a page has everything that it shows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,14 +24,14 @@ from gsmerge.version import __version__
 if TYPE_CHECKING:
     import jinja2
 
-# What a page may load and run: its own scripts and styles, which the policy names by their hashes
+# Content security policy: a page may run only its own scripts and styles, which the policy names by their hashes
 PICTURES = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
-# Spark decodes in WebAssembly, sorts in a worker, and has both as data: addresses in its own text
+# Spark decodes in WebAssembly and sorts in a worker; its text has both as data: addresses
 SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
-POLICY = "{policy}"  # stands for it in the templates until the hashes are known
+POLICY = "{policy}"  # placeholder in the templates until the hashes are known
 VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
-NONE = "-"  # in place of a figure
-FASTER = 1.2  # times, from which on the headline says it
+NONE = "-"  # in place of a missing figure
+FASTER = 1.2  # least ratio of drawing times that the headline mentions
 
 
 def view_page(data: ViewData) -> str:
@@ -45,12 +45,12 @@ def view_page(data: ViewData) -> str:
         for view in data.shown
     ]
     opened = stills[data.start]
-    first = {side: opened[side] for side in (left, right)}  # in the page itself, to be seen at once
+    first = {side: opened[side] for side in (left, right)}  # in the HTML itself, so that they appear at once
     opened[left] = opened[right] = None
 
     def pictures(of_sides: Sequence[bytes | None], kind: str = "image/webp") -> list[str | None]:
-        some = [None] * (len(sources) - len(of_sides)) + list(of_sides)
-        return [None if one is None else data_uri(one, kind) for one in some]
+        of_sources = [None] * (len(sources) - len(of_sides)) + list(of_sides)
+        return [None if picture is None else data_uri(picture, kind) for picture in of_sources]
 
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     engine = VIEWER.read_bytes() if splats else None
@@ -97,7 +97,7 @@ def view_page(data: ViewData) -> str:
 
 
 def _sources(data: ViewData, photos: bool) -> list[dict[str, Any]]:
-    """List what the sides of a page may show: the photos if there are some, and each scene."""
+    """List the choices for the two sides of a page: the photos if there are any, and each scene."""
     picture = "own colours" if data.reference == ROW_COLORS else "photo"
     sources: list[dict[str, Any]] = (
         [{"name": picture, "splats": None, "count": 0, "dropped": {}, "seen": {}, "support": None}] if photos else []
@@ -112,7 +112,7 @@ def _sources(data: ViewData, photos: bool) -> list[dict[str, Any]]:
 
 
 def _result(data: ViewData, place: int) -> dict[str, Any]:
-    """Describe a result in the words and figures of a page."""
+    """Return the headline, words and figures of a result."""
     return {
         "headline": _unbroken(headline(data, place)), "speed": speed(data, place), "words": size_words(data, place),
         "figures": figures(data, place),
@@ -120,7 +120,7 @@ def _result(data: ViewData, place: int) -> dict[str, Any]:
 
 
 def headline(data: ViewData, place: int = 1) -> str:
-    """Write the headline of a result: share of Gaussians and change of quality; for one scene alone its size."""
+    """Return the headline of a result, its share of Gaussians and change of quality; for a single scene its size."""
     before = data.sides[0]
     if len(data.sides) == 1:
         quality = before.mean.psnr
@@ -129,15 +129,15 @@ def headline(data: ViewData, place: int = 1) -> str:
     after, reference = data.sides[place], PHOTOS if data.held_out else data.reference
     old, new = before.mean.psnr, after.mean.psnr
     share = after.num_gaussians / max(before.num_gaussians, 1)
-    said = f"{human_share(share, 1 if share >= 0.01 else 2)} of the Gaussians"
+    share_text = f"{human_share(share, 1 if share >= 0.01 else 2)} of the Gaussians"
     if after.new_gain is not None and not data.held_out:
-        return f"{said}, new views expected {describe_gain(*after.new_gain)}"
+        return f"{share_text}, new views expected {describe_gain(*after.new_gain)}"
     if new is None or old is None or not np.isfinite(new):
-        return said
+        return share_text
     if not np.isfinite(old):  # the input itself is the reference
-        return f"{said}, {new:.1f} dB from the input's own renders"
+        return f"{share_text}, {new:.1f} dB from the input's own renders"
     words = "photos that were not used" if data.held_out else "its own photos" if reference == PHOTOS else reference
-    return f"{said}, {_nearer(new - old)} {'to' if new >= old else 'from'} {words}"
+    return f"{share_text}, {_nearer(new - old)} {'to' if new >= old else 'from'} {words}"
 
 
 def describe_gain(low: float, high: float) -> str:
@@ -149,29 +149,30 @@ def describe_gain(low: float, high: float) -> str:
 
 
 def _nearer(gain: float) -> str:
+    """Return a gain (dB) as "closer" or "farther"."""
     return f"{abs(gain):.1f} dB {'closer' if gain >= 0 else 'farther'}"
 
 
 def agreement_words(data: ViewData) -> str:
-    """Describe how far the views confirm each other's depth, and what would help where that is little."""
+    """Describe the share of depth that other views confirm, or what would help if it is small."""
     if data.agreement is None:
         return ""
     return data.agreement.doubt or f"{100 * data.agreement.confirmed:.0f} % of the depth is confirmed by other views"
 
 
 def speed(data: ViewData, place: int = 1) -> float | None:
-    """Return how many times as fast as the scene itself this processor drew a result; None for one scene alone."""
+    """Return the ratio of the drawing times of the scene and a result on this processor; None for a single scene."""
     if len(data.sides) == 1 or not data.sides[place].seconds:
         return None
     return round(data.sides[0].seconds / data.sides[place].seconds, 2)
 
 
 def speed_words(ratio: float | None) -> str:
-    """Write the end of the headline, to one digit from 3 times on; empty where a result is not clearly faster."""
+    """Return the end of the headline, with one digit from a ratio of 3 on; "" if a result is not clearly faster."""
     if ratio is None or ratio < FASTER:
         return ""
-    said = f"about {float(f'{ratio:.1g}'):.0f}" if ratio >= 3 else f"{ratio:.1f}"
-    return f", {said}\u00a0\u00d7\u00a0faster to draw"
+    times = f"about {float(f'{ratio:.1g}'):.0f}" if ratio >= 3 else f"{ratio:.1f}"
+    return f", {times}\u00a0\u00d7\u00a0faster to draw"
 
 
 def size_words(data: ViewData, place: int) -> str:
@@ -185,16 +186,16 @@ def size_words(data: ViewData, place: int) -> str:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure at the top of the page, of the scene itself and of a result."""
+    """A figure at the top of the page, for the scene itself and for a result."""
 
     label: str
     old: str
     new: str
-    mark: str  # its class in the style: "up" for better than the scene's own, "own" for what fits have seen; ""
+    mark: str  # CSS class: "up" if better than the scene's, "own" if fits have seen the photos, otherwise ""
 
 
 def figures(data: ViewData, place: int) -> list[Figure]:
-    """Collect the figures at the top for one side: size and mean quality."""
+    """Collect the figures at the top for one side: its size and mean quality."""
     before, after = data.sides[0], data.sides[place]
     sizes = [
         Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", ""),
@@ -202,35 +203,35 @@ def figures(data: ViewData, place: int) -> list[Figure]:
     ]
     views, own = reference_words(data)
     is_expected = not data.held_out and any(side.new_gain for side in data.sides)
-    names = ("psnr",) if is_expected else ("psnr", "ssim")  # the headline needs its place
+    names = ("psnr",) if is_expected else ("psnr", "ssim")  # to leave room for the expected gain
     qualities = [(f"{name.upper()}, {views}", name, before.mean, after.mean) for name in names]
     if data.lacks_pixels:
         label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that the input covers"
         qualities.append((label, "psnr", before.covered, after.covered))
-    made = []
+    scores = []
     for label, name, *pair in qualities:
         digits, unit = (2, " dB") if name == "psnr" else (3, "")
         old, new = (getattr(quality, name) for quality in pair)
         if any(getattr(side.mean, name) is not None for side in data.sides[1:] or data.sides):
             better = place > 0 and old is not None and new is not None and old < new
             mark = "own" if own else "up" if better else ""
-            made.append(Figure(label, _number(old, digits), _number(new, digits) + unit, mark))
+            scores.append(Figure(label, _number(old, digits), _number(new, digits) + unit, mark))
     if is_expected:
         gain = after.new_gain
         words = NONE if gain is None else "{:+.1f} to {:+.1f} dB".format(*gain)
         sizes.append(Figure("New views, expected", "", words, "up" if gain is not None and gain[0] > 0 else ""))
-    return sizes + (made if data.scored else [])
+    return sizes + (scores if data.scored else [])
 
 
 def reference_words(data: ViewData) -> tuple[str, bool]:
-    """Describe what a page's scores are compared with, and say whether fits have seen it: own photos."""
+    """Describe the pictures that scores compare with; also return whether they are own photos, which fits have seen."""
     if data.held_out:
         return "held-out photos", False
     return ("its own photos", True) if data.reference == PHOTOS else (data.reference, False)
 
 
 def results_table(data: ViewData) -> tuple[list[str], list[list[str]]]:
-    """Make the table over all results: head and rows, without columns that have no figure."""
+    """Make the table of all results, head and rows, without columns that have no figure."""
     first = data.sides[0]
     columns: dict[str, list[str]] = {
         "": [side.name for side in data.sides],
@@ -252,12 +253,12 @@ def _unbroken(text: str) -> str:
 
 
 def _number(value: float | None, digits: int) -> str:
-    """Format a number; a missing one and the infinite PSNR of equal pictures are written as none."""
+    """Format a number; a missing number and the infinite PSNR of equal pictures become ``NONE``."""
     return NONE if value is None or value == float("inf") else f"{value:.{digits}f}"
 
 
 def _view(view: PageView) -> dict[str, Any]:
-    """Convert a view for the page's script."""
+    """Convert a view to JSON types for the page's script."""
     return {
         "name": view.name,
         "held_out": view.held_out,
@@ -268,7 +269,7 @@ def _view(view: PageView) -> dict[str, Any]:
 
 
 def camera_numbers(camera: Cameras, distance: float) -> dict[str, Any]:
-    """Describe a camera for a page's script: row-major world to camera, intrinsics in pixels, distance of the scene."""
+    """Convert a camera for a page's script: row-major world to camera, intrinsics in pixels, distance of the scene."""
     return {
         "viewmat": camera.viewmats[0].reshape(-1).tolist(),
         "K": [float(camera.Ks[0, row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))],
@@ -279,7 +280,7 @@ def camera_numbers(camera: Cameras, distance: float) -> dict[str, Any]:
 
 
 def _finite(value: float | None) -> float | None:
-    """Round a number for JSON, where the infinite PSNR of equal pictures has no value."""
+    """Round a number for JSON; the infinite PSNR of equal pictures becomes None."""
     return None if value is None or value == float("inf") else round(value, 4)
 
 
@@ -294,20 +295,20 @@ def base64_text(content: bytes) -> str:
 
 
 def render_template(name: str, policy: str, **values: Any) -> str:
-    """Fill a template with values, escaped except where the template says otherwise.
+    """Fill a template with values, which are escaped unless the template says otherwise.
 
-    ``policy`` is what the page may load; hashes of its elements take the places of ``{script}`` and
-    ``{style}``.
+    ``policy`` is the page's content security policy, in which ``{script}`` and ``{style}`` are replaced by the hashes
+    of the page's elements.
     """
     text = _environment().get_template(name).render(version=__version__, **values)
-    text = text.encode("utf-8", "replace").decode("utf-8")  # names of files may hold halves of characters
+    text = text.encode("utf-8", "replace").decode("utf-8")  # names of files may have lone surrogates
     hashes = {kind: " ".join(_hashes(text, kind)) for kind in ("script", "style")}
     return text.replace(POLICY, html.escape(policy.format(**hashes)), 1)
 
 
 def _hashes(page: str, kind: str) -> list[str]:
     """Return the hashes of a page's own scripts or styles, as a content security policy names them."""
-    # Elements of another type are data, which a browser does not run
+    # Elements with a type attribute hold data, which a browser does not run
     contents = re.findall(f"<{kind}>(.*?)</{kind}>", page, re.DOTALL)
     digests = [hashlib.sha256(content.encode()).digest() for content in contents]
     return [f"'sha256-{base64_text(digest)}'" for digest in dict.fromkeys(digests)]
@@ -315,12 +316,14 @@ def _hashes(page: str, kind: str) -> list[str]:
 
 @cache
 def _environment() -> jinja2.Environment:
+    """Make the environment of all templates."""
     import jinja2
 
     loader = jinja2.PackageLoader("gsmerge.pages")
-    made = jinja2.Environment(
+    environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    made.filters |= {"bytes": human_bytes, "number": _number}
-    made.policies["json.dumps_function"] = lambda value, **_: json.dumps(value, separators=(",", ":"), allow_nan=False)
-    return made
+    environment.filters |= {"bytes": human_bytes, "number": _number}
+    dumps = partial(json.dumps, separators=(",", ":"), allow_nan=False)
+    environment.policies["json.dumps_function"] = lambda value, **_: dumps(value)
+    return environment

@@ -1,4 +1,4 @@
-"""Write a page with a viewer, whose camera stays where photos stood, and the ``.sog`` in it, or beside it."""
+"""Write a page with a viewer and a ``.sog`` in it or beside it; the camera stays near the viewpoints of photos."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from gsmerge.io.formats.table import Contents
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
-from gsmerge.pages.marks import MORE
+from gsmerge.pages.marks import MAX_SUPPORT
 from gsmerge.pages.page import VIEWER, base64_text, camera_numbers, data_uri, describe_gain, render_template
 from gsmerge.pages.splats import pack_support
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 
-# Its own files and scripts alone; Spark has data: addresses and a worker in its text
+# Only its own files and scripts; Spark has data: addresses and a worker in its text
 POLICY = (
     "default-src 'none'; img-src 'self' data:; style-src {style}; script-src {script} blob: 'wasm-unsafe-eval';"
     " worker-src data: blob:; connect-src 'self' data: blob:"
 )
 NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "poster": "poster.webp", "licences": "LICENSES.txt"}
-MAX_VIEWS = 64  # of which the page knows where they stood
-REST = 43_000  # bytes of a page besides: its scripts, licences, and the picture and textures of one Gaussian
-LONGEST_TITLE = 255  # bytes of a title, which is a file's name, at most
+MAX_VIEWS = 64  # largest number of viewpoints that the page knows
+REST = 43_000  # bytes of a page without the viewer: scripts, licences, and picture and textures of one Gaussian
+LONGEST_TITLE = 255  # largest number of bytes of a title, which is the name of a file
 LICENSED = ("spark", "three", "fflate")
 
 
 def files_beside(page: Path, apart: bool) -> tuple[Path, ...]:
-    """Return the paths of the files beside a page: none unless it is ``apart`` from what it shows."""
+    """Return the paths of the files beside a page; none if the page holds all, that is, if it is not ``apart``."""
     return tuple(page.with_name(name) for name in NAMES.values() if apart)
 
 
 def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write a page, and the files beside it if it is to have some, as :data:`gsmerge.io.formats.table.WriteOutput`."""
+    """Write a page and the files beside it, if any, as a :data:`gsmerge.io.formats.table.WriteOutput`."""
     text, beside = site_contents(
         contents.levels[0], contents.cameras, contents.title, contents.comments, apart=contents.apart
     )
@@ -54,29 +54,29 @@ def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> 
 
 
 def least_bytes() -> int:
-    """Count the bytes of a page besides those of its Gaussians, at least: the viewer as text, and the rest."""
+    """Return the least number of bytes of a page without its Gaussians: the viewer as text, and the rest."""
     return int(4 / 3 * VIEWER.stat().st_size) + REST
 
 
 def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
-    """Count the bytes that a page takes at most, whatever its title."""
+    """Return the largest number of bytes that a page takes with any title."""
     return len(site_contents(gaussians, cameras, "x" * LONGEST_TITLE, comments, apart=False)[0].encode())
 
 
 def site_contents(
     gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str], *, apart: bool
 ) -> tuple[str, dict[str, bytes]]:
-    """Make a page, and by name the files beside it: none unless it is ``apart`` from what it shows.
+    """Make a page, and the files beside it by name; there are none unless the page is ``apart`` from its scene.
 
-    Without cameras some are placed, and one may look from any side.
+    Without cameras viewpoints are placed, and the user may look from any side.
     """
     scene, expected = sog_bytes(gaussians, comments), read_new_views(comments)
     is_free = len(cameras) == 0
     shown = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
-    middle = 0 if is_free else median_camera(shown)  # of placed ones the first stands outside
+    middle = 0 if is_free else median_camera(shown)  # the first placed viewpoint is outside
     poster = encode_still(to_picture(render(gaussians.numpy(), shown[[middle]]).images[0]))
     views = sorted({*even_views(len(shown), min(len(shown), MAX_VIEWS)), middle})
-    support = np.minimum(count_views_in_world(gaussians.numpy(), shown[views]), MORE).astype(np.uint8)
+    support = np.minimum(count_views_in_world(gaussians.numpy(), shown[views]), MAX_SUPPORT).astype(np.uint8)
     vendor = files("gsmerge.pages").joinpath("vendor")
     licences = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]
     notice, engine = "\n\n".join(licences).encode(), VIEWER.read_bytes()

@@ -1,4 +1,4 @@
-"""Pack Gaussians for a page: the numbers of a ``.spz``, coarser where there are many, as differences between rows."""
+"""Pack Gaussians for a page: the numbers of a ``.spz`` as differences of rows, coarser if there are many Gaussians."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from gsmerge.kernels.page_rows import LOOKS, pack_looks, pack_pixels
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.types import SH_C0, Cameras, Gaussians
 
-MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
-MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
-FINE = 11  # bits of a position within the scene: the browser keeps 10 and the sign
-MANY = 300_000  # Gaussians that are as small as pixels, each of which may be less exact
-# Steps of the numbers of a .spz: opacity, colour, logarithm of the scale; and levels of half a turn's rotation. With
-# the coarse ones pictures are 50 dB from those of the exact scene
+MAX_GAUSSIANS = 2_000_000  # larger scenes have only stills, since a page gets too large and loads too slowly
+MAX_SPZ_BYTES = 40_000_000  # before compression; enough for 2 million Gaussians without harmonics
+FINE = 11  # bits of a position within the scene; browsers keep 10 bits and the sign
+MANY = 300_000  # beyond this number Gaussians are as small as pixels and may be less exact
+# Step sizes of the numbers of a .spz (opacity, colour, logarithm of the scale), and levels of half a turn's rotation.
+# With COARSE, pictures are 50 dB from those of the exact scene
 EXACT, COARSE = ((1, 1, 1), 255), ((16, 2, 2), 31)
-PIXEL_PARTS, DEPTH_PARTS = 8, 1024  # of a pixel, and of a depth: steps of what belongs to pixels
+PIXEL_PARTS, DEPTH_PARTS = 8, 1024  # steps of a shift per pixel, and of a log depth per unit, for rows of pixels
 
 
 def pack_splats(
@@ -30,11 +30,12 @@ def pack_splats(
 ) -> tuple[bytes | None, int]:
     """Pack the visible Gaussians with as many harmonics as fit; return bytes (None if too many) and SH degree.
 
-    A gzip stream of a line of JSON and columns: numbers of a ``.spz`` in steps, each less that of the row before, the
-    sign as lowest bit, first the low bytes of a column and then the higher ones. Neighbouring rows are similar, so this
-    takes 40 to 70 % of the ``.spz``, which the page's script restores. Rows with ``homes [n]`` among all pixels of
-    ``cameras`` have depths and shifts within their pixel for positions. ``gaussians`` and ``cameras`` are in the page's
-    frame, where the scene is about 1 large: browsers keep means in 16 bits.
+    The bytes are a gzip stream of a line of JSON and of columns. A column has the numbers of a ``.spz`` in steps, each
+    as the difference from the row before, with the sign as the lowest bit. Its low bytes come first, then the higher
+    bytes. Neighbouring rows are similar, so this takes 40 to 70 % of the ``.spz``, which the page's script restores.
+    Rows with ``homes [n]`` among all pixels of ``cameras`` store a depth and a shift within their pixel in place of a
+    position. ``gaussians`` and ``cameras`` are in the page's frame, in which the scene has a size of about 1, since
+    browsers keep means in 16 bits.
     """
     rows, means = drawn_rows(gaussians), np.ascontiguousarray(gaussians.means, np.float32)
     count = len(rows)
@@ -68,11 +69,11 @@ def pack_splats(
         planes.append(column.astype("<u4").view(np.uint8).reshape(-1, 4)[:, :size].T.tobytes())
         head["sizes"].append(size)
     line = json.dumps(head).encode() + b"\n"
-    return spz.gzip_bytes(line + b"".join(planes), 1, zlib.Z_RLE), degree  # differences seldom repeat longer runs
+    return spz.gzip_bytes(line + b"".join(planes), 1, zlib.Z_RLE), degree  # longer matches are rare in differences
 
 
 def drawn_rows(gaussians: Gaussians) -> np.ndarray:
-    """Return the ids of the rows that :func:`pack_splats` packs: finite and visible."""
+    """Return the ids of the rows that :func:`pack_splats` packs, which are finite and visible."""
     drawn = gaussians.opacities >= LEAST_OPACITY
     for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
         finite = np.isfinite(values).reshape(len(values), prod(values.shape[1:])).T
@@ -81,12 +82,12 @@ def drawn_rows(gaussians: Gaussians) -> np.ndarray:
 
 
 def pack_support(support: np.ndarray) -> bytes:
-    """Pack how many views show each Gaussian, ``[n]`` uint8, as a gzip stream of a byte for each."""
+    """Pack the number of views that show each Gaussian, ``[n]`` uint8, as a gzip stream of one byte per Gaussian."""
     return spz.gzip_bytes(support.tobytes(), 9, zlib.Z_DEFAULT_STRATEGY)
 
 
 def _pixel_places(rows: np.ndarray, means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:
-    """Return pixels, shifts in them, log depths ``[4,m]`` of ``rows [m]`` with ``ids [n]``; None if one is behind."""
+    """Return pixels, shifts and log depths ``[4,m]`` of ``rows [m]`` with pixel ``ids [n]``; None if one is behind."""
     places = np.empty((4, len(rows)), np.uint32)
     viewmats, Ks = (np.ascontiguousarray(part, np.float64) for part in (cameras.viewmats, cameras.Ks))
     sizes = (cameras.width, cameras.height, PIXEL_PARTS, DEPTH_PARTS)

@@ -1,4 +1,4 @@
-"""Show scenes and results in notebooks and browsers: the page of ``gsmerge view`` for what is in memory."""
+"""Show scenes and results in notebooks and browsers: the page of ``gsmerge view`` for data in memory."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from gsmerge.scene.files import find_scene_files, scene_title
 from gsmerge.scene.read import as_scene
 from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
 
-MOST_SOLID = 600_000  # Gaussians of a scene of which a page has the stills alone: 8 MB of a notebook
-HEIGHT = 820  # pixels of a page in a notebook
+MAX_SOLID = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
+HEIGHT = 820  # of a page in a notebook, pixels
 
 
 @dataclass(frozen=True, repr=False)
 class Page:
-    """A page in one file, which notebooks show."""
+    """A page in one file, which notebooks can show."""
 
     text: str  # HTML
     headline: str
@@ -66,15 +66,14 @@ def view(
     """Show a scene, alone or beside results: photos, a swipe, 3D and scores, as ``gsmerge view`` does.
 
     Args:
-        scene: What :func:`gsmerge.read_scene` returns, or the path that it reads.
-        results: Results of it by name, or one: what :func:`gsmerge.compact` returns, Gaussians, or paths of files.
-        held_out: Views with photos that were no input, to score them on.
-        light: Leave out the scene's own Gaussians, whose stills remain; None: where there are more than 600,000.
-        progress: Called with (what is done, done, of how many).
+        scene: A scene from :func:`gsmerge.read_scene`, or the path that it reads. results: Results of the scene by
+        name, or one result: from :func:`gsmerge.compact`, Gaussians, or paths of files. held_out: Views with photos
+        that were not part of the input, for scores. light: Show the scene itself in stills only; None: if it has more
+        than 600,000 Gaussians. progress: Called with (name of the step, number done, total).
 
     Returns:
-        A page that a notebook shows as the last value of a cell; ``save(path)`` writes it as one ``.html`` file,
-        ``open()`` opens it in the browser.
+        A page, which a notebook shows if it is the last value of a cell. ``save(path)`` writes it as one ``.html``
+        file, ``open()`` opens it in the browser.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget=300)
@@ -99,7 +98,7 @@ def view(
         for name, value in given.items()
         if (moved := getattr(value, "cameras", None)) is not None and len(moved) == len(shown) == len(read)
     }
-    is_light = len(read.gaussians) > MOST_SOLID if light is None else light
+    is_light = len(read.gaussians) > MAX_SOLID if light is None else light
     data = collect(
         scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
         [_num_bytes(scene), *(_num_bytes(files.get(name, value)) for name, value in given.items())], held_out,
@@ -109,13 +108,13 @@ def view(
 
 
 def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, float]]:
-    """Return the bounds of what new views are expected to gain, dB, by the names of results whose files say it."""
+    """Return the bounds of the expected gain of new views, dB, by name of each result whose file has them."""
     known = {name: read_new_views(file.info.comments) for name, file in files.items()}
     return {name: scores.bounds for name, scores in known.items() if scores}
 
 
 def _num_bytes(value: Any) -> int:
-    """Return the size of a scene's files, or of a file that was read; of other Gaussians that of a ``.ply``."""
+    """Return the bytes of a scene's files or of a file that was read; for other Gaussians those of a ``.ply``."""
     if isinstance(value, GaussianFile):
         return value.info.file_bytes
     if isinstance(value, str | PathLike):

@@ -1,4 +1,4 @@
-"""Estimates of a run's seconds and bytes, within a factor of about two."""
+"""Estimate the seconds and bytes of a run, within a factor of about two."""
 
 from __future__ import annotations
 
@@ -8,34 +8,34 @@ from typing import Any
 from gsmerge.runtime.memory import machine_memory
 
 # Processor seconds, measured on 7 views of 480 x 352 and 12 of 480 x 256 pixels
-IMPORT_SECONDS = 1.0  # and of what every run does
-# Per million pixels of all views together, or per million Gaussians, which is the same number:
+IMPORT_SECONDS = 1.0  # imports, and the constant part of every run
+# Per million pixels of all views together, or per million Gaussians if there are more of these:
 COST_MERGE = 1.0  # reading, superpixels and merging
 COST_SCORE = 0.3  # of input and result against the photos
 COST_NETWORKS = 1.4
-COST_PAPER = 4.5  # those of the paper, which see more and refine
-COST_FIT = 0.5  # besides the steps
+COST_PAPER = 4.5  # the paper's networks, which have more inputs and refine
+COST_FIT = 0.5  # of a fit, without its steps
 COST_COUNT = 0.4  # of each further count that a search builds
-COST_SLOW = {"bass-adaptive": 6.0, "slic": 4.5, "greedy": 25.0, "splat-transform": 60.0}  # more than usual
-# Of a step of the fit:
+COST_SLOW = {"bass-adaptive": 6.0, "slic": 4.5, "greedy": 25.0, "splat-transform": 60.0}  # in addition
+# For each step of the fit:
 COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.25  # per million Gaussians that it draws
-MORE = 0.35  # of a processor that each thread but the first is worth
+THREAD_GAIN = 0.35  # speed of each thread after the first, relative to the first
 
-# Where views are placed, per million Gaussians of the input:
-COST_READ = 3.0  # of reading and judging
+# With placed views, per million Gaussians of the input:
+COST_READ = 3.0  # of reading and scoring
 COST_PLACED = 0.15  # of drawing a view
 COST_PAIRS = 3.0  # of merging pairs, for each count that is tried
-PLACED_PIXELS = 512 * 512  # of a view, at most
-FITS = 2  # to placed views, for each count
-TRIED = 5  # counts, where the input's quality decides
-TRIED_BY_PHOTOS = 3  # counts, where views are given and a quality decides
+PLACED_PIXELS = 512 * 512  # largest number of pixels of a view
+FITS = 2  # number of fits to placed views, for each count
+TRIED = 5  # number of counts that are tried to keep the quality of the input
+TRIED_BY_PHOTOS = 3  # number of counts that are tried if a quality decides on given views
 
 # Memory, in bytes
 BYTES_FIXED = 250_000_000  # interpreter and libraries
 BYTES_PER_GAUSSIAN = 150
-BYTES_PER_VALUE = 4.5  # of higher harmonics, per Gaussian: those of the scene, and of some of its groups
-BYTES_PER_PIXEL = 90  # the photo as floats and what segmentation and rendering hold of it
+BYTES_PER_VALUE = 4.5  # for each value of higher harmonics: of the scene, and of some of its groups
+BYTES_PER_PIXEL = 90  # the photo as floats, and arrays of segmentation and rendering
 BYTES_ELSEWHERE = 40  # per Gaussian of the whole scene while a block of it is in memory
 
 
@@ -45,10 +45,10 @@ def work_seconds(
 ) -> float:  # fmt: skip
     """Estimate the processor seconds of compacting a scene, without imports.
 
-    ``pixels``: pixels of all views together, or the number of Gaussians if that is larger; ``view_pixels``: pixels of
-    one view; ``options``: all settings by flat name, with the checkpoint in use; ``num_drawn``: average number of
-    Gaussians in a view of the fit; ``tries``: counts that are fitted; ``short_drawn``: the same average for each
-    count that a search fits to photos of half the size, in ``short_steps``.
+    ``pixels``: pixels of all views together, or the number of Gaussians if that is larger. ``view_pixels``: pixels of
+    one view. ``options``: all settings by flat name, with the checkpoint in use. ``num_drawn``: average number of
+    Gaussians in a view of the fit. ``tries``: number of counts that are fitted. ``short_drawn``: average number of
+    Gaussians in a view, for each count that a search fits to photos of half the size in ``short_steps``.
     """
     method, fits = options["method"], fit_of(options) == "full"
     work = COST_MERGE + COST_SCORE + COST_FIT * fits
@@ -62,20 +62,21 @@ def work_seconds(
 
 
 def wall_seconds(pixels: int, num_views: int, options: Mapping[str, Any], *, threads: int, **facts: Any) -> float:
-    """Estimate the wall time of a run on ``threads`` threads with imports; other arguments: :func:`work_seconds`."""
+    """Estimate the wall time of a run on ``threads`` threads with imports; further arguments: :func:`work_seconds`."""
     work = work_seconds(pixels, pixels / max(num_views, 1), options, **facts)
-    return IMPORT_SECONDS + work / (1 + MORE * max(0, min(threads, num_views) - 1))
+    return IMPORT_SECONDS + work / (1 + THREAD_GAIN * max(0, min(threads, num_views) - 1))
 
 
 def placed_seconds(num_input: int, num_drawn: float, *, threads: int, fit_steps: int, views: int, tries: int) -> float:
-    """Estimate the wall time of merging pairs without views, with imports.
+    """Estimate the wall time, with imports, of merging pairs in a scene without views.
 
-    ``num_drawn``: Gaussians of the result; ``fit_steps``: 0 without a fit, which sees ``views``; ``tries``: counts.
+    ``num_drawn``: number of Gaussians in the result. ``fit_steps``: 0 without a fit. ``views``: number of placed views
+    of the fit. ``tries``: number of counts that are tried.
     """
     step = COST_STEP * min(num_input, PLACED_PIXELS) + COST_DRAWN * num_drawn
     whole = num_input * (COST_READ + COST_PLACED * views * (fit_steps > 0))
     work = 1.0 + (whole + tries * (COST_PAIRS * num_input + FITS * fit_steps * step)) / 1e6
-    return IMPORT_SECONDS + work / (1.0 if threads == 1 else 1.3)  # little of it runs on several
+    return IMPORT_SECONDS + work / (1.0 if threads == 1 else 1.3)  # only a small part runs on several threads
 
 
 def fit_of(options: Mapping[str, Any]) -> str:
@@ -86,19 +87,19 @@ def fit_of(options: Mapping[str, Any]) -> str:
 def memory_bytes(pixels: int, *, num_rest: int = 0, num_elsewhere: int = 0) -> int:
     """Estimate the memory of a run in bytes, imports included.
 
-    ``num_rest``: columns of higher harmonics; ``num_elsewhere``: Gaussians of a scene outside the block of ``pixels``
-    in work.
+    ``pixels``: number of pixels or Gaussians of the scene, or of the block in memory. ``num_rest``: columns of higher
+    harmonics. ``num_elsewhere``: number of Gaussians outside the block.
     """
     each = BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL
     return BYTES_FIXED + round(each * pixels + BYTES_ELSEWHERE * num_elsewhere)
 
 
 def memory_problem(needed: int) -> str | None:
-    """Return why a run of ``needed`` bytes may not fit into this machine; None if it should."""
+    """Return why a run that needs ``needed`` bytes may not fit into this machine; None if it should fit."""
     available = machine_memory()
     if available is None or needed <= available:
         return None
     return (
-        f"about {needed / 1e9:.1f} GB of memory are needed and this machine has {available / 1e9:.1f} GB: use fewer"
+        f"about {needed / 1e9:.1f} GB of memory are needed, and this machine has {available / 1e9:.1f} GB; use fewer"
         " views (gsmerge extend adds more later), export without higher harmonics, or try --effort draft"
     )

@@ -1,4 +1,4 @@
-"""Memory of the machine and of the process, and release of what is no longer used."""
+"""Memory of the machine and of the process, arrays in files, and release of unused memory."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from weakref import WeakSet
 
 import numpy as np
 
-LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")  # of versions 2 and 1
-# Of glibc, see mallopt(3): bytes from which an array has pages of its own, which are given back when it goes, and bytes
-# that a process keeps for the next ones. Clearing new pages for each array was a tenth of a page's time.
+LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")  # of control groups 2 and 1
+# Parameters of glibc and our values, see mallopt(3). An array of 32 MiB or more gets pages of its own, which are
+# returned when it is deleted. Of other freed memory a process keeps up to 256 MiB for further arrays. With the
+# defaults, clearing new pages for each array took a tenth of the time to make a page of `gsmerge view`.
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
-MAPPED_BYTES = 1 << 28  # from which on an array is in a file
-_own_pages: WeakSet[mmap.mmap] = WeakSet()  # pages of others may be private, and would lose their values
+MAPPED_BYTES = 1 << 28  # arrays of this size or more are mapped from files
+_own_pages: WeakSet[mmap.mmap] = WeakSet()  # only these may be freed; private pages of others would lose their values
 
 
 def peak_memory() -> int:
     """Return the peak resident memory of this process in bytes."""
     if sys.platform == "win32":
-        counters = (ctypes.c_uint64 * 9)(72)  # PROCESS_MEMORY_COUNTERS, which begins with its size
+        counters = (ctypes.c_uint64 * 9)(72)  # PROCESS_MEMORY_COUNTERS begins with its size
         ctypes.windll.kernel32.K32GetProcessMemoryInfo(ctypes.c_void_p(-1), counters, 72)
         return counters[1]
     import resource
@@ -42,7 +43,7 @@ def machine_memory() -> int | None:
     with suppress(OSError, ValueError):
         limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     for path in LIMITS:
-        with suppress(OSError, ValueError):  # "max": there is none
+        with suppress(OSError, ValueError):  # the text "max" means no limit
             limits.append(int(Path(path).read_text(encoding="ascii")))
     return min((limit for limit in limits if limit > 0), default=None)
 
@@ -58,16 +59,16 @@ def free_memory() -> int | None:
 
 
 def _memory_status() -> list[int]:
-    """Return the numbers of Windows' MEMORYSTATUSEX: the second is its memory, the third what is free of it."""
-    status = (ctypes.c_uint64 * 8)(64)  # it begins with its size
+    """Return the numbers of Windows' MEMORYSTATUSEX: the second is the total memory, the third the free memory."""
+    status = (ctypes.c_uint64 * 8)(64)  # the structure begins with its size
     if sys.platform == "win32":
         ctypes.windll.kernel32.GlobalMemoryStatusEx(status)
     return list(status)
 
 
 def keep_memory() -> None:
-    """Let arrays take the places of those that went before, where the C library can: for processes that do one job."""
-    with suppress(AttributeError, OSError, TypeError):  # another C library
+    """Let new arrays reuse the memory of deleted ones, if the C library can; for processes that do a single job."""
+    with suppress(AttributeError, OSError, TypeError):  # not glibc
         mallopt = ctypes.CDLL(None).mallopt
         for parameter in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
             mallopt(*parameter)
@@ -76,8 +77,8 @@ def keep_memory() -> None:
 def release_memory() -> None:
     """Return freed memory to the operating system.
 
-    glibc keeps the memory that a thread has freed for that thread. Over stages that use different threads this adds up
-    to a tenth of the peak. Does nothing on other systems.
+    glibc keeps the memory that a thread has freed for the same thread. Over stages that use different threads this adds
+    up to a tenth of the peak. Does nothing on systems other than Linux.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
@@ -85,17 +86,17 @@ def release_memory() -> None:
 
 
 def make_array(shape: tuple[int, ...], dtype: type[np.generic], mapped_bytes: int | None = None) -> np.ndarray:
-    """Make an uninitialised array; a large one is mapped from an unnamed temporary file, if there is room.
+    """Make an uninitialised array; map a large one from an unnamed temporary file, if the disk has room.
 
-    ``mapped_bytes``: size in bytes from which an array is large, at most ``MAPPED_BYTES``, which is also the default.
+    ``mapped_bytes``: size in bytes from which an array is large; at most ``MAPPED_BYTES``, which is also the default.
 
-    A mapped array takes memory only while it is in use, and none after :func:`free_pages`. The file is in the system's
-    temporary folder (``TMPDIR``), and is removed with the array.
+    A mapped array takes memory only for pages in use, and none after :func:`free_pages`. Its file is in the system's
+    temporary folder (``TMPDIR``) and is removed with the array.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if size >= min(MAPPED_BYTES, mapped_bytes or MAPPED_BYTES) and hasattr(os, "posix_fallocate"):
         with suppress(OSError), tempfile.TemporaryFile() as file:
-            os.posix_fallocate(file.fileno(), 0, size)  # a page without room on the disk would end the process
+            os.posix_fallocate(file.fileno(), 0, size)  # on a full disk, writing to a page would kill the process
             pages = mmap.mmap(file.fileno(), size)
             _own_pages.add(pages)
             return np.frombuffer(pages, dtype).reshape(shape)
@@ -103,7 +104,7 @@ def make_array(shape: tuple[int, ...], dtype: type[np.generic], mapped_bytes: in
 
 
 def free_pages(arrays: Iterable[np.ndarray]) -> None:
-    """Release the memory of arrays that :func:`make_array` mapped from files; their values stay."""
+    """Release the memory of arrays that :func:`make_array` mapped from files; the files keep their values."""
     for array in arrays:
         base = array
         while isinstance(base, np.ndarray) and base.base is not None:
@@ -114,7 +115,7 @@ def free_pages(arrays: Iterable[np.ndarray]) -> None:
 
 
 def gather(array: np.ndarray, *ids: np.ndarray) -> np.ndarray:
-    """Copy ``array[ids]``; for a mapped array only a part at a time is in memory, the least if ids are sorted."""
+    """Copy ``array[ids]``, with only a part of a mapped array in memory at a time; sorted ids need the least memory."""
     parts = -(-array.nbytes // MAPPED_BYTES)
     if parts <= 1:
         return array[ids]
@@ -126,7 +127,10 @@ def gather(array: np.ndarray, *ids: np.ndarray) -> np.ndarray:
 
 
 def human_share(share: float, digits: int = 2) -> str:
-    """Format a share in [0, 1] in percent with so many digits, or with its first one: ``0.044`` -> ``4.40 %``."""
+    """Format a share in [0, 1] as a percentage: ``0.044`` -> ``4.40 %``.
+
+    It has ``digits`` decimals, or more if these would all be zeros.
+    """
     percent = 100 * share
     digits = digits if percent <= 0 else max(digits, -math.floor(math.log10(percent)))
     return f"{percent:.{digits}f} %"

@@ -1,4 +1,4 @@
-"""What is imported at its first use: functions of optional parts, and what installed packages add as entry points."""
+"""Import at first use: functions of optional parts, and entry points of installed packages."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ COMMANDS, METHODS = "gsmerge.commands", "gsmerge.methods"  # groups of entry poi
 
 @dataclass(frozen=True)
 class LazyFunction:
-    """A function by its module and name, which imports the module when it is called: for tables of formats."""
+    """A function, given by module and name, whose module is imported at the first call; for tables of formats."""
 
     module: str
     name: str
 
     def __call__(self, *arguments: Any, **settings: Any) -> Any:
-        """Import the module, and call the function."""
+        """Import the module and call the function."""
         return self.load()(*arguments, **settings)
 
     def load(self) -> Any:
-        """Import the function."""
+        """Import and return the function."""
         return getattr(import_module(self.module), self.name)
 
 
 def lazy_functions(package: str) -> Callable[[str], LazyFunction]:
-    """Return what names functions of a package by "module.name", to be imported when they are called."""
+    """Return a function that makes a :class:`LazyFunction` of "module.name" in a package."""
     return lambda place: LazyFunction(f"{package}.{place.split('.')[0]}", place.split(".")[1])
 
 
 @cache
 def find_plugins(group: str) -> dict[str, EntryPoint]:
-    """Find the entry points of a group by name without importing any; sorted, the first wins among equal names."""
-    from importlib.metadata import entry_points  # 8 ms that most commands do without
+    """Find the entry points of a group without importing any, sorted by name; of equal names the first counts."""
+    from importlib.metadata import entry_points  # takes 8 ms, and most commands do not need it
 
     plugins: dict[str, EntryPoint] = {}
     for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
@@ -49,7 +49,7 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
 
 
 def load_plugin(group: str, name: str) -> Any:
-    """Import the object of an entry point; UsageError with the package's name if that fails."""
+    """Import the object of an entry point; UsageError with the name of its package if that fails."""
     entry = find_plugins(group)[name]
     try:
         return entry.load()

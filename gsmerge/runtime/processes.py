@@ -15,7 +15,7 @@ from typing import Any
 from gsmerge.runtime.work import CALLS_PER_PROCESS, Call, Lost, WorkerPool
 
 LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-END_SECONDS = 10.0  # that a process has to end by itself
+END_SECONDS = 10.0  # time that a process gets to end by itself
 
 
 class Worker:
@@ -23,16 +23,16 @@ class Worker:
 
     def __init__(self, threads: int) -> None:
         spawn = multiprocessing.get_context("spawn")
-        self.pipe, theirs = spawn.Pipe()
-        self.process: BaseProcess = spawn.Process(target=run_worker, args=(theirs,), daemon=True)
+        self.pipe, worker_end = spawn.Pipe()
+        self.process: BaseProcess = spawn.Process(target=run_worker, args=(worker_end,), daemon=True)
         with _library_threads(threads):
             self.process.start()
-        theirs.close()
+        worker_end.close()
         self.key: Any = None
         self.count = 0
 
     def read_result(self) -> Any:
-        """Return the result of the current call, or Lost if the process has ended; raise an exception of the call."""
+        """Return the result of the current call, or Lost if the process has ended; raise the exception of the call."""
         try:
             is_result, value = self.pipe.recv()
         except (EOFError, OSError):
@@ -43,7 +43,7 @@ class Worker:
         return value
 
     def stop(self, *, now: bool) -> None:
-        """End the process: ``now``, or when it finds the pipe closed."""
+        """End the process, either ``now`` or when it notices that the pipe is closed."""
         self.pipe.close()
         if now:
             self.process.kill()
@@ -67,7 +67,7 @@ class ProcessPool(WorkerPool):
             self.workers.append(worker)
         worker.key = call.key
         worker.count += 1
-        with suppress(OSError):  # a process that has ended already is noticed by wait
+        with suppress(OSError):  # if the process has ended already, wait notices it
             worker.pipe.send((function, call.arguments))
 
     def wait(self) -> list[tuple[Any, Any]]:
@@ -99,13 +99,13 @@ def _describe_exit(process: BaseProcess) -> str:
         name = signal.Signals(-code).name
     except ValueError:
         name = str(-code)
-    hint = "; perhaps out of memory, fewer --jobs help" if name == "SIGKILL" else ""
+    hint = "; perhaps out of memory, try fewer --jobs" if name == "SIGKILL" else ""
     return f"its process was killed ({name}{hint})"
 
 
 @contextmanager
 def _library_threads(count: int) -> Iterator[None]:
-    """Let numpy's libraries use ``count`` threads in processes that are started in the block."""
+    """Let NumPy's libraries use ``count`` threads in processes that are started within the block."""
     before = {name: os.environ[name] for name in LIBRARIES if name in os.environ}
     os.environ.update(dict.fromkeys(LIBRARIES, str(count)))
     try:
@@ -117,18 +117,18 @@ def _library_threads(count: int) -> Iterator[None]:
 
 
 def run_worker(pipe: Connection) -> None:
-    """Execute calls that come through the pipe until it closes; main function of a worker process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run handles it, and ends its processes
-    os.dup2(2, 1)  # only the run itself prints to stdout
+    """Run calls from the pipe until it closes; this is the main function of a worker process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and ends this process
+    os.dup2(2, 1)  # only the parent prints to stdout
     parent = multiprocessing.parent_process()
 
     def end_with_parent() -> None:
         if parent is not None:
             wait([parent.sentinel])
-            os._exit(1)  # whatever this process is doing
+            os._exit(1)  # at once, even within a call
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-    with suppress(EOFError, OSError):  # raised when the run has ended
+    with suppress(EOFError, OSError):  # raised when the parent has closed the pipe
         while True:
             function, arguments = pipe.recv()
             try:

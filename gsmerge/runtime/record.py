@@ -1,7 +1,7 @@
 """The record of a run: seconds of each stage, choices, notes for the user, and progress.
 
-It is ambient. A run begins one with :func:`record_run`; whatever works within the run writes to it by
-:func:`stage`, :func:`note` and :func:`choose`, on the thread that began it. Outside of any run these do nothing.
+A run begins a record with :func:`record_run`. Code within the run, on the same thread, writes to this record with
+:func:`stage`, :func:`note` and :func:`choose`, without passing it around. Outside a run these write to no record.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.time_left import STAGES, Forecast, Part
 
-Progress = Callable[[str, int, int], None]
-NAMED = 4  # items that a note lists
-# stages that leave much behind that was freed in other threads
+Progress = Callable[[str, int, int], None]  # stage, done, total
+MAX_NAMED = 4  # largest number of items that a note lists
+# Stages after which memory is released, since other threads have freed much of it
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
 
@@ -29,10 +29,10 @@ class Record:
 
     progress: Progress | None = None  # Called with (stage, done, total)
     seconds: dict[str, float] = field(default_factory=dict)  # Wall time of each stage
-    choices: dict[str, Any] = field(default_factory=dict)  # What the stages decided
+    choices: dict[str, Any] = field(default_factory=dict)  # Decisions of the stages
     notes: list[str] = field(default_factory=list)  # Warnings and adaptations, one sentence each
     running: str | None = None  # The stage that is being timed
-    forecast: Forecast = field(default_factory=Forecast)  # Of the whole run, which its parts share
+    forecast: Forecast = field(default_factory=Forecast)  # Of the whole run; parts of the run share it
 
 
 _current: ContextVar[Record | None] = ContextVar("record", default=None)
@@ -40,19 +40,19 @@ _current: ContextVar[Record | None] = ContextVar("record", default=None)
 
 @contextmanager
 def record_run(progress: Progress | None = None) -> Iterator[Record]:
-    """Start a record for everything that the block reports; ``progress`` is called with "done" at its end."""
+    """Start a record for all reports of the block; at its end, ``progress`` is called with "done"."""
     with _write_to(Record(progress)) as record:
         yield record
         report_progress("done", len(STAGES), len(STAGES))
 
 
 def current_record() -> Record:
-    """Return the record of the current run; outside of any run, an empty one."""
+    """Return the record of the current run; outside a run, return an empty one."""
     return _current.get() or Record()
 
 
 def current_forecast() -> Forecast | None:
-    """Return the forecast of the current run; None outside of any run."""
+    """Return the forecast of the current run; None outside a run."""
     record = _current.get()
     return None if record is None else record.forecast
 
@@ -61,7 +61,7 @@ def current_forecast() -> Forecast | None:
 def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[Record]:
     """Start a separate record for a part of the current run; ``silent``: do not report its progress.
 
-    With a ``title``, all its stages are reported as steps of one stage of that name.
+    With a ``title``, progress reports all stages of the part as steps of one stage with this name.
     """
     progress = None if silent else current_record().progress
     if progress is not None and title is not None:
@@ -71,11 +71,13 @@ def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[R
 
 
 def _titled(progress: Progress, title: str) -> Progress:
+    """Return a progress function that puts a title before each text."""
     return lambda text, done, total: progress(f"{title}: {text}", done, total)
 
 
 @contextmanager
 def _write_to(record: Record) -> Iterator[Record]:
+    """Make a record the current one within the block."""
     token = _current.set(record)
     try:
         yield record
@@ -85,12 +87,12 @@ def _write_to(record: Record) -> Iterator[Record]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Time a block or function as one of ``STAGES``; inside another stage its time counts for the outer stage."""
+    """Time a block or function as one of ``STAGES``; within another stage, its time counts for the outer stage."""
     record = _current.get()
     if record is None or record.running is not None:
         yield
         return
-    if name not in record.seconds:  # a stage in two parts is one step
+    if name not in record.seconds:  # the second part of a stage is not a new step
         report_progress(name, STAGES.index(name), len(STAGES))
     record.running, start = name, time.perf_counter()
     try:
@@ -103,13 +105,13 @@ def stage(name: str) -> Iterator[None]:
 
 
 def list_some(items: Sequence[str], separator: str = ", ") -> str:
-    """List the first of some items for a note, and how many more there are."""
-    more = f" and {len(items) - NAMED} more" if len(items) > NAMED else ""
-    return separator.join(items[:NAMED]) + more
+    """List the first items for a note, and the number of further ones."""
+    more = f" and {len(items) - MAX_NAMED} more" if len(items) > MAX_NAMED else ""
+    return separator.join(items[:MAX_NAMED]) + more
 
 
 def note(text: str) -> None:
-    """Add a sentence for the user to the current record, once, and to the log of the package."""
+    """Add a sentence for the user to the current record, unless it has it already, and to the package's log."""
     notes = current_record().notes
     if text not in notes:
         notes.append(text)
@@ -136,17 +138,17 @@ def adopt(part: Record) -> None:
 
 
 def expect_parts(parts: Iterable[Part]) -> None:
-    """Expect parts of the current run after the one of now, in place of those that were expected before."""
+    """Set the parts that the current run expects after its present part, replacing earlier expectations."""
     current_record().forecast.expect(parts)
 
 
 def begin_part() -> None:
-    """Begin the next of the parts that the current run expects."""
+    """Begin the next part that the current run expects."""
     current_record().forecast.begin()
 
 
 def report_progress(text: str, done: int, total: int) -> None:
-    """Report progress of a stage, or of a step as ``"stage: detail"``, to the caller of the current run."""
+    """Report the progress of a stage, or of a step as ``"stage: detail"``, to the caller of the current run."""
     record = current_record()
     record.forecast.move(text, done, total)
     if record.progress is not None:

@@ -1,10 +1,10 @@
 """One thread pool for the whole package.
 
-Kernels run on one thread and release the GIL; parallelism is over views (or bands of an image)
-and lives here. So there is one barrier per pass over the views instead of one per loop, nothing spins, and a
-result cannot depend on the number of threads: every item is computed alone, and results come back in order.
-OpenCV and torch are held to one thread each while a pool is in use, so that the three do not fight for the cores;
-torch only where somebody else imports it.
+A kernel runs on one thread and releases the GIL. This module runs kernels in parallel over views or bands of an image.
+So there is one barrier per pass over the views instead of one per loop, and no thread spins. A result cannot depend on
+the number of threads, since every item is computed on its own and results are returned in order. While a pool is in
+use, OpenCV and torch are limited to one thread each, so that the three do not compete for cores; torch is limited only
+if other code has imported it.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ import cv2
 from gsmerge.errors import UsageError
 from gsmerge.runtime import MOST_THREADS
 
-THREADS = "GSMERGE_THREADS"  # of the environment: how many where nobody says so
+THREADS = "GSMERGE_THREADS"  # environment variable: the default number of threads
 T = TypeVar("T")
 R = TypeVar("R")
-AT_ONCE = 12  # results of in_turn that are in memory together
+AT_ONCE = 12  # results of in_turn that are in memory at the same time
 
 
 class _Pool:
-    """Threads that wait for work; handing it over costs a tenth of what an executor with futures takes."""
+    """Threads that wait for work; handing it over takes a tenth of the time that an executor with futures needs."""
 
     def __init__(self, count: int) -> None:
         self.work = SimpleQueue[Callable[[], None] | None]()
@@ -42,10 +42,10 @@ class _Pool:
         work_alone()
         while (work := self.work.get()) is not None:
             work()
-            del work  # it would keep what it worked on until the next one comes
+            del work  # otherwise its arrays would stay in memory until the next work comes
 
     def shutdown(self) -> None:
-        """End the threads, once all submitted work is done."""
+        """End the threads after all submitted work is done."""
         for _ in self.threads:
             self.work.put(None)
         for thread in self.threads:
@@ -53,33 +53,33 @@ class _Pool:
 
 
 class _Local(threading.local):
-    """Pool of each calling thread, so that two calls at once do not stop each other's."""
+    """Pool of each calling thread, so that two simultaneous calls do not shut down each other's pool."""
 
     pool: _Pool | None = None
     count = 1
-    inside = False  # True on the pool's own threads: they must not wait for a pool
-    holds_torch = False  # whether torch was held to one thread for this thread's pool
+    inside = False  # True on the pool's own threads, which must not wait for a pool
+    holds_torch = False  # True if torch was limited to one thread for this thread's pool
 
 
 class _Libraries:
-    """Threads of torch and OpenCV; these settings are the process's, so all callers share them."""
+    """Threads of torch and OpenCV. These are settings of the process, so all callers share them."""
 
     lock = threading.Lock()
-    pools = 0
-    opencv = 1  # its threads before the first pool
-    torch: int | None = None  # the same; None where torch is not held
+    pools = 0  # number of pools in use
+    opencv = 1  # OpenCV's threads before the first pool
+    torch: int | None = None  # torch's threads before the first pool; None if torch is not limited
 
 
 _local, _libraries = _Local(), _Libraries()
 
 
 def available_threads() -> int:
-    """Return the number in the environment's ``GSMERGE_THREADS``, else of the processors that this process may use.
+    """Return the number in the variable ``GSMERGE_THREADS``, or of the processors that this process may use.
 
-    UsageError if the variable holds no such number.
+    UsageError if the variable is not a number from 1 to ``MOST_THREADS``.
     """
     text = os.environ.get(THREADS)
-    if text:  # an empty variable is one that is not set
+    if text:  # an empty variable counts as not set
         if not (text.isascii() and text.isdecimal() and len(text) < 10 and 1 <= int(text) <= MOST_THREADS):
             raise UsageError(f"{THREADS}: expected a number from 1 to {MOST_THREADS}, got {text!r:.40}")
         return int(text)
@@ -87,7 +87,7 @@ def available_threads() -> int:
 
 
 def work_alone() -> None:
-    """Let :func:`parallel_map` on the calling thread compute items one by one, as on the pool's own threads."""
+    """Make :func:`parallel_map` on the calling thread compute items one by one, as on the pool's own threads."""
     _local.inside = True
 
 
@@ -117,6 +117,7 @@ def use_threads(count: int | None = None) -> Iterator[int]:
 
 
 def _hold_opencv() -> None:
+    """Limit OpenCV to one thread, and count one more pool in use."""
     with _libraries.lock:
         if _libraries.pools == 0:
             _libraries.opencv = cv2.getNumThreads()
@@ -141,7 +142,7 @@ def hold_torch() -> None:
 
 
 def _release_libraries() -> None:
-    """Give torch its threads back on this thread, and OpenCV when no caller is left."""
+    """Restore the threads of torch for this thread's pool, and those of OpenCV when no pool is in use."""
     with _libraries.lock:
         _libraries.pools -= 1
         if _local.holds_torch:
@@ -155,9 +156,9 @@ def _release_libraries() -> None:
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """Return ``[function(item) for item in items]``, computed on the pool, in the order of the items.
 
-    Outside :func:`use_threads` a pool of all processors is made for the call; inside another call the items are
-    computed one by one. The calling thread computes items as well, so that a short call costs one hand-over, not one
-    for each item.
+    Outside :func:`use_threads` a pool with all processors is made for the call. Within another call the items are
+    computed one by one. The calling thread computes items as well, so that a short call costs one hand-over instead of
+    one for each item.
     """
     items = list(items)
     with use_threads() as count:
@@ -167,10 +168,9 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
 
 def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Yield the results of :func:`parallel_map` in order, with only a few in memory at a time.
+    """Yield the results of :func:`parallel_map` in order, with at most ``AT_ONCE`` in memory at a time.
 
-    Use it for results as large as all Gaussians, one per view, that are only added up: memory then does not grow with
-    the number of views.
+    Use it for large results, one per view, that are only summed up. Memory then does not grow with the number of views.
     """
     items = list(items)
     for first in range(0, len(items), AT_ONCE):
@@ -178,19 +178,19 @@ def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 
 
 def _share(pool: _Pool, function: Callable[[T], R], items: list[T], helpers: int) -> list[R]:
-    """Compute the items on this thread and some of the pool's; a free thread takes the next item.
+    """Compute the items on this thread and on ``helpers`` threads of the pool; a free thread takes the next item.
 
-    A thread that comes too late for any item is not waited for. After an error no further item is begun. If several
-    items fail, the error of the first item is raised, whichever thread is quicker.
+    A thread that comes too late to take an item is not waited for. After an error, the thread takes all remaining items
+    without computing them. If several items fail, the error of the first item is raised, whichever thread is quicker.
     """
     results: list[R] = [None] * len(items)  # type: ignore[list-item]
-    following = itertools.count()  # its next() is atomic
-    errors: dict[int, BaseException] = {}  # by item; those before a failed one have all been begun
-    ends: SimpleQueue[int] = SimpleQueue()  # how many items each thread took
+    indices = itertools.count()  # its next() is atomic
+    errors: dict[int, BaseException] = {}  # by index; all items before a failed one have been started
+    ends: SimpleQueue[int] = SimpleQueue()  # number of items that each thread took
 
     def work() -> None:
         taken, failed = 0, False
-        for index in following:
+        for index in indices:
             if index >= len(items):
                 break
             taken += 1
@@ -209,9 +209,9 @@ def _share(pool: _Pool, function: Callable[[T], R], items: list[T], helpers: int
         work()
     finally:
         _local.inside = False
-    left = len(items)
-    while left:
-        left -= ends.get()
+    remaining = len(items)
+    while remaining:
+        remaining -= ends.get()
     if errors:
         raise errors.pop(min(errors))
     return results

@@ -1,4 +1,4 @@
-"""Seconds that a run still takes, by the parts that it expects and the progress that it reports."""
+"""Forecast the seconds until a run ends, from the parts that it expects and the progress that it reports."""
 
 from __future__ import annotations
 
@@ -15,38 +15,39 @@ FIT = "fit"
 
 @dataclass(frozen=True)
 class Part:
-    """Cost of a part of a run: of what comes before its fits, of the fits, and of what comes after them.
+    """Cost of a part of a run: before its fits, of all its fits, and after them.
 
-    Costs are in any unit, since only their ratios matter: the run itself says how long they take.
+    Costs may have any unit, since only their ratios matter; the time that a cost takes is measured during the run.
     """
 
     before: float = 0.0
-    fit: float = 0.0  # all its fits
+    fit: float = 0.0  # of all its fits together
     after: float = 0.0
     num_fits: int = 1
 
 
 @dataclass
 class Forecast:
-    """Seconds left of a run, whose parts are expected with their costs; how long costs take is measured.
+    """Forecast of the seconds left in a run. The costs of its parts are given, and the time per cost is measured.
 
-    Fits and all other stages are measured apart, as their costs have little to do with each other. Nothing is known
-    before the first steps of a fit. What has no parts, such as drawing pictures, is forecast by the steps it counts.
+    Fits and all other stages are measured separately, since their costs are unrelated. There is no forecast before the
+    first steps of a fit. Work without parts, such as drawing pictures, is forecast by the steps that it counts.
     """
 
     clock: Callable[[], float] = time.monotonic
     start: float = field(init=False)
-    _parts: list[Part] = field(init=False, default_factory=list)  # still to come
-    _part: Part | None = field(init=False, default=None)  # of now
-    _begun: float = field(init=False, default=0.0)  # when the part, or what follows its fits, began
-    _share: float = field(init=False, default=0.0)  # of the part's fits that is done
-    _step: int | None = field(init=False, default=None)  # of the fit that runs now, the last one
-    _fit: int = field(init=False, default=-1)  # of the part, counted from 0
-    _last: float = field(init=False)  # when something was reported last
-    _seconds: dict[bool, float] = field(init=False)  # of fits (True), and of all other stages, as measured
-    _costs: dict[bool, float] = field(init=False)  # done in these seconds
-    _counted: tuple[str, float, int] | None = field(init=False, default=None)  # a stage, time and number of a step
-    _end: float | None = field(init=False, default=None)  # expected, of what has no parts
+    _parts: list[Part] = field(init=False, default_factory=list)  # the parts after the present one
+    _part: Part | None = field(init=False, default=None)  # the present part
+    _begun: float = field(init=False, default=0.0)  # time when the part, or its stages after the fits, began
+    _share: float = field(init=False, default=0.0)  # share of the part's fits that is done
+    _step: int | None = field(init=False, default=None)  # last step of the fit that runs now; None: no fit runs
+    _fit: int = field(init=False, default=-1)  # number of the fit within the part, from 0
+    _last: float = field(init=False)  # time of the last report
+    _seconds: dict[bool, float] = field(init=False)  # measured for fits (True) and for all other stages (False)
+    _costs: dict[bool, float] = field(init=False)  # costs that these seconds paid for
+    # Stage without parts whose steps are counted, with time and number of its first step
+    _counted: tuple[str, float, int] | None = field(init=False, default=None)
+    _end: float | None = field(init=False, default=None)  # expected end of work without parts
 
     def __post_init__(self) -> None:
         self.start = self._last = self.clock()
@@ -58,12 +59,12 @@ class Forecast:
         return self.clock() - self.start
 
     def expect(self, parts: Iterable[Part]) -> None:
-        """Expect parts after the one of now, in place of those that were expected before."""
+        """Set the parts that follow the present one, replacing earlier expectations."""
         self._parts = list(parts)
 
     def begin(self) -> None:
-        """Begin the next of the expected parts."""
-        if self._part is None:  # what came before has no cost
+        """Begin the next expected part."""
+        if self._part is None:  # the work so far has no cost
             self._last = self.clock()
         else:
             self._spend(is_fit=False)
@@ -73,7 +74,7 @@ class Forecast:
         self._begun = self.clock()
 
     def move(self, text: str, done: int, total: int) -> None:
-        """Take what a run reports: a stage, or a step as ``"stage: detail"``."""
+        """Take a report of the run: a stage, or a step as ``"stage: detail"``."""
         stage, _, detail = text.partition(": ")
         if stage == "done":
             self._parts, self._part, self._end = [], Part(), self.clock()
@@ -86,6 +87,7 @@ class Forecast:
             self._count(stage, done, total, is_step=bool(detail) or (stage not in STAGES and total > 0))
 
     def _take_step(self, part: Part, done: int, total: int) -> None:
+        """Take a step of a fit; a lower number than the last one means that the next fit has begun."""
         is_next = self._step is not None and done >= self._step
         if self._fit < 0:
             self._costs[False] += part.before
@@ -97,12 +99,13 @@ class Forecast:
         self._share, self._step = max(share, self._share), done
 
     def _spend(self, *, is_fit: bool) -> None:
+        """Add the time since the last report to the seconds of fits or of other stages."""
         now = self.clock()
         self._seconds[is_fit] += now - self._last
         self._last = now
 
     def _count(self, stage: str, done: int, total: int, *, is_step: bool) -> None:
-        """Expect the end of what has no parts by the time that each step took since the stage's first one."""
+        """Forecast the end of work without parts by the mean time per step since the first step of its stage."""
         now = self.clock()
         if self._counted is None or self._counted[0] != stage:
             self._end, self._counted = None, (stage, now, done) if is_step else None
@@ -112,16 +115,16 @@ class Forecast:
 
     @property
     def seconds_left(self) -> float | None:
-        """Seconds until the run ends; None where they are not known yet."""
+        """Seconds until the run ends; None if they are not known yet."""
         if self._part is None:
             return None if self._end is None else max(0.0, self._end - self.clock())
         part, later = self._part, self._parts
         fits = part.fit * (1 - self._share) + sum(each.fit for each in later)
         rates = {kind: self._seconds[kind] / cost if cost else 0.0 for kind, cost in self._costs.items()}
         fit_rate, rate = rates[True], rates[False] or rates[True]
-        now = part.after if self._share else part.before + part.after
-        others = sum(each.before + each.after for each in later)
-        if (fits and not fit_rate) or (now + others > 0 and not rate):
+        own_cost = part.after if self._share else part.before + part.after
+        later_cost = sum(each.before + each.after for each in later)
+        if (fits and not fit_rate) or (own_cost + later_cost > 0 and not rate):
             return None  # not measured yet
         spent = self.clock() - self._begun if self._step is None else 0.0
-        return fit_rate * fits + max(0.0, rate * now - spent) + rate * others
+        return fit_rate * fits + max(0.0, rate * own_cost - spent) + rate * later_cost

@@ -1,7 +1,8 @@
-"""Engines that make calls: in this process, in others of this machine, or in those of a Ray cluster.
+"""Engines that make calls: in this process, in other processes of this machine, or on a Ray cluster.
 
-Ray is an extra, which schedules by threads and memory. A process that dies takes one call with it; on a cluster such a
-call is made again, elsewhere, and gives the same. Processes of this machine: :mod:`gsmerge.runtime.processes`.
+Ray is an optional dependency; it schedules calls by threads and memory. If a process dies, its call is lost. On a
+cluster the call is repeated on another process, with the same result. :mod:`gsmerge.runtime.processes` has the
+processes of this machine.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from gsmerge.runtime.threads import use_threads
 
 T = TypeVar("T")
 CONNECT_TIMEOUT = 10.0  # seconds to reach a cluster
-RETRIES = 5  # of a call whose process or node was lost
-SMALL_STORE = 100 << 20  # bytes of objects that the calls on a cluster of this machine may share
-CALLS_PER_PROCESS = 200  # then it is replaced by a new one, so that what libraries leave in memory cannot add up
+RETRIES = 5  # repetitions of a call whose process or node was lost
+SMALL_STORE = 100 << 20  # bytes of shared objects on a cluster of this machine
+CALLS_PER_PROCESS = 200  # then a new process replaces it, so that memory leaks of libraries cannot add up
 
 
 class Call(NamedTuple):
     """A call to make in another process."""
 
-    key: Any  # by which the caller knows its result
+    key: Any  # identifies the result for the caller
     arguments: tuple[Any, ...]
-    memory: int = 0  # bytes that it may take
+    memory: int = 0  # bytes that the call may need
 
 
 class Lost(NamedTuple):
@@ -47,9 +48,10 @@ class WorkerPool(ABC):
     capacity: int
 
     def run(self, function: Callable[..., Any], calls: Iterable[Call]) -> Iterator[tuple[Any, Any]]:
-        """Make calls of a picklable function, each taken when there is room for it.
+        """Make calls of a picklable function; take the next call when a process is free.
 
-        Yields the key and the result of each call, or :class:`Lost`, as it ends; raises exceptions of a call.
+        Yields key and result of each call as it ends; the result is :class:`Lost` if the process died. Raises the
+        exception of a failed call.
         """
         waiting, active = iter(calls), 0
         while True:
@@ -77,9 +79,10 @@ class WorkerPool(ABC):
 
 @contextmanager
 def start_work(engine: str, address: str | None = None, *, threads: int | None, memory: int) -> Iterator[Work]:
-    """Open an engine for calls that each need ``threads`` (None: chosen) and ``memory`` bytes.
+    """Open an engine for calls that each need ``memory`` bytes and ``threads`` (None: the engine chooses).
 
-    ``engine``: ``"local"``: in this process, one call after the other; ``"ray"``: on the Ray cluster at ``address``.
+    With the ``engine`` ``"local"``, calls run in this process, one after the other. With ``"ray"`` they run on the Ray
+    cluster at ``address``.
     """
     with ExitStack() as stack:
         cluster = None if engine == "local" else stack.enter_context(closing(Cluster(address)))
@@ -95,13 +98,13 @@ class Cluster:
 
     @property
     def processors(self) -> int:
-        """Processors of all nodes."""
+        """Number of processors of all nodes."""
         return int(self.ray.cluster_resources().get("CPU", 1.0))
 
     def needs(self, threads: int, memory: int) -> dict[str, float]:
-        """Return the resources that a task requests, at most those of the largest node.
+        """Return the resources that a task requests, limited to those of the largest node.
 
-        Ray would let a task that requests more wait forever. UsageError without processors.
+        In Ray a task that requests more would wait forever. UsageError if no node has processors.
         """
         nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
         if not nodes:
@@ -110,7 +113,7 @@ class Cluster:
         return {"num_cpus": min(threads, largest["CPU"]), "memory": min(memory, int(largest.get("memory", 0.0)))}
 
     def close(self) -> None:
-        """Disconnect."""
+        """Disconnect from the cluster."""
         self.ray.shutdown()
 
 
@@ -129,26 +132,26 @@ class Work:
     def run(
         self, title: str, function: Callable[..., T], count: int, calls: Iterable[tuple[Any, ...]]
     ) -> Iterator[tuple[T, Record]]:
-        """Make ``count`` calls of a picklable function; yield (result, record) of each, in order.
+        """Make ``count`` calls of a picklable function; yield result and record of each call, in order.
 
-        A cluster makes as many calls at once as it has processors; this process makes one after the other.
+        A cluster makes as many calls at once as it has processors for; this process makes one after the other.
         """
         if self.cluster is not None:
-            yield from self._run_there(self.cluster, title, function, count, calls)
+            yield from self._run_on_cluster(self.cluster, title, function, count, calls)
             return
         place = 0
-        for arguments in calls:  # not by enumerate, which would keep them until the next ones are made
+        for arguments in calls:  # enumerate would keep the arguments in memory until the next ones are made
             place += 1  # noqa: SIM113
             with record_part(title=f"block {place} of {count}: {title}") as record:
                 value = function(*arguments)
             del arguments
             yield value, record
 
-    def _run_there(
+    def _run_on_cluster(
         self, cluster: Cluster, title: str, function: Callable[..., T], count: int, calls: Iterable[tuple[Any, ...]]
     ) -> Iterator[tuple[T, Record]]:
-        needs = cluster.needs(self.threads or max(1, cluster.processors // count), self.memory)
-        pool, results = RayPool(cluster, max(1, int(needs["num_cpus"]))), dict[int, Any]()
+        resources = cluster.needs(self.threads or max(1, cluster.processors // count), self.memory)
+        pool, results = RayPool(cluster, max(1, int(resources["num_cpus"]))), dict[int, Any]()
 
         def each_call() -> Iterator[Call]:
             for place, arguments in enumerate(calls):
@@ -156,7 +159,7 @@ class Work:
 
         for place, value in pool.run(_call_in_part, each_call()):
             if isinstance(value, Lost):
-                raise UsageError(f"engine ray: {title}: {value.reason}; perhaps out of memory, more blocks help")
+                raise UsageError(f"engine ray: {title}: {value.reason}; perhaps out of memory, try more blocks")
             results[place] = value
             report_progress(f"{title}: {len(results)} of {count} blocks", len(results), count)
         for place in range(len(results)):
@@ -164,7 +167,7 @@ class Work:
 
 
 def _call_in_part(threads: int, function: Callable[..., T], *arguments: Any) -> tuple[T, Record]:
-    """Make a call with a record of its own."""
+    """Make a call with its own record, and return both."""
     with use_threads(threads), record_part() as record:
         value = function(*arguments)
     return value, replace(record, progress=None)
@@ -177,11 +180,11 @@ class RayPool(WorkerPool):
         self.cluster, self.ray = cluster, cluster.ray
         self.threads, self.jobs = threads, jobs
         self.function = self.ray.remote(max_retries=RETRIES, max_calls=CALLS_PER_PROCESS)(_call_in_folder)
-        self.keys: dict[Any, Any] = {}  # by reference to the result
+        self.keys: dict[Any, Any] = {}  # key of each running call, by the reference to its result
 
     @property
     def capacity(self) -> int:  # type: ignore[override]
-        """Number of simultaneous calls, which may change as a cluster grows."""
+        """Number of simultaneous calls, which changes with the size of the cluster."""
         return self.jobs or max(1, self.cluster.processors // self.threads)
 
     def submit(self, function: Callable[..., Any], call: Call) -> None:
@@ -197,6 +200,7 @@ class RayPool(WorkerPool):
         return [(self.keys.pop(ref), self._result(ref)) for ref in ready]
 
     def _result(self, ref: Any) -> Any:
+        """Return the result of a call, or Lost; raise the exception of a failed call."""
         try:
             return self.ray.get(ref)
         except self.ray.exceptions.RayTaskError as error:
@@ -213,7 +217,7 @@ class RayPool(WorkerPool):
 
 
 def _call_in_folder(folder: str, function: Callable[..., T], *arguments: Any) -> T:
-    """Make a call in the folder that relative paths of the caller refer to."""
+    """Make a call in the caller's working directory, to which relative paths refer."""
     with suppress(OSError):
         os.chdir(folder)
     return function(*arguments)
@@ -233,17 +237,17 @@ def require_ray() -> ModuleType:
 def _join(ray: ModuleType, address: str | None, store_bytes: int | None) -> None:
     """Connect to the cluster, or start one on this machine."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # of processes that Ray itself ends
+    os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # after Ray itself has ended a process
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
     if ray.is_initialized():
-        raise UsageError("engine ray: expected a process without a connection to Ray; call ray.shutdown() before")
+        raise UsageError("engine ray: expected a process without a connection to Ray; call ray.shutdown() first")
     if address is None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         ray.init(address="local", include_dashboard=False, object_store_memory=store_bytes, **quiet)
         return
     try:
         host, _, port = address.removeprefix("ray://").rpartition(":")
-        if host and port.isdecimal():  # where nothing listens, Ray itself would wait for minutes
+        if host and port.isdecimal():  # if nothing listens there, Ray itself would wait for minutes
             with closing(socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT)):
                 pass
         ray.init(address=address, **quiet)

@@ -1,1 +1,1 @@
-"""States: views that arrive batch by batch, and compact scenes of all of them at any time."""
+"""States: collect views that arrive in batches, and make compact scenes of all views at any time."""

@@ -1,4 +1,4 @@
-"""A state and its settings in one object: views in batches, compact scenes at any time."""
+"""A state and its settings in one object: add views in batches, and make compact scenes at any time."""
 
 from __future__ import annotations
 
@@ -29,36 +29,38 @@ if TYPE_CHECKING:
 def extend_state(
     state: State | None, scene: Scene, settings: Mapping[str, Any], *, progress: Progress | None = None
 ) -> tuple[State, BatchReport]:
-    """Add a batch of views to a state, which is not changed; None: begin one.
+    """Add a batch of views to a copy of a state; None: begin a state.
 
-    ``settings``: those of a draft by default, without a fit where each Gaussian has a pixel; with
-    ``recipe="paper"`` the first batch begins Feature Gaussians, and later ones go on with its networks. Raises
-    ValueError if a setting is unknown, out of range, or impossible for the state or the scene; SceneError for a scene
-    that seems to be of another world.
+    ``settings``: by default those of a draft, without a fit if each Gaussian has a pixel. With ``recipe="paper"`` the
+    first batch begins a state of Feature Gaussians, and later batches use its networks. Raises ValueError if a setting
+    is unknown, out of range, or impossible for the state or the scene; SceneError if the scene seems to have another
+    frame of coordinates than the state.
     """
     about = {} if state is None else dict(state.about)
     scene_before, features = (None, None) if state is None else (state.scene, state.features)
-    of_paper = settings.get("recipe") == "paper"
-    if of_paper and scene_before is not None:
+    is_paper = settings.get("recipe") == "paper"
+    if is_paper and scene_before is not None:
         raise UsageError("recipe paper: expected a state that began with it, found results; begin another state")
-    made: dict[str, Any] = {}
-    if of_paper or features is not None:
+    content: dict[str, Any] = {}
+    if is_paper or features is not None:
         options = batch_settings({"recipe": "paper", "effort": "default"} | dict(settings))
-        made["features"], report = extend_features(features, scene, *options, progress=progress)
+        content["features"], report = extend_features(features, scene, *options, progress=progress)
     else:
-        usual = {"fit": "none"} if scene.has_own_pixels else {}  # the photos are fitted to in the end
-        made["scene"], report = extend(scene_before, scene, *batch_settings(usual | dict(settings)), progress=progress)
+        usual = {"fit": "none"} if scene.has_own_pixels else {}  # the fit follows when the state is compacted
+        options = batch_settings(usual | dict(settings))
+        content["scene"], report = extend(scene_before, scene, *options, progress=progress)
     about |= {"batches": [*about.get("batches", []), report.numbers]}
     about |= {"pictures": sorted({*about.get("pictures", []), report.pictures})}
-    return State(about, **made), report
+    return State(about, **content), report
 
 
 class Compactor:
     """Compact views that arrive in batches.
 
-    Each batch is compacted when it comes. Its Gaussians, cameras and at most ``max_views`` pictures are kept: a scene
-    of which ``compact`` makes results. With ``recipe="paper"`` Feature Gaussians are kept instead, matched and merged
-    across batches (paper section 4.5, "Online reconstruction"), and ``decode`` makes results of any K.
+    Each batch is compacted when it is added. The state keeps its Gaussians and cameras, and the pictures of at most
+    ``max_views`` views in all. They form a scene from which ``compact`` makes results. With ``recipe="paper"`` the
+    state keeps Feature Gaussians instead, which are matched and merged across batches (paper section 4.5, "Online
+    reconstruction"), and ``decode`` makes results with any K.
 
     Args:
         **settings: Settings of the batches by name, those of :class:`gsmerge.CompactOptions` and of
@@ -82,7 +84,7 @@ class Compactor:
     @classmethod
     @check_arguments
     def load(cls, path: StrPath, **settings: Unpack[StateKeywords]) -> Compactor:
-        """Load a saved state; ``settings`` are for the batches to come.
+        """Load a saved state; ``settings`` apply to further batches.
 
         Raises:
             SceneError: If the file cannot be read or is damaged.
@@ -96,24 +98,24 @@ class Compactor:
         return f"Compactor({len(self):,} Gaussians of {len(self.batches)} batch(es))"
 
     def __len__(self) -> int:
-        """Return the number of Gaussians, or Feature Gaussians, so far."""
+        """Return the number of Gaussians or Feature Gaussians so far."""
         return 0 if self._state is None else len(self._state)
 
     @property
     def state(self) -> State:
-        """Results and views so far as a scene, or Feature Gaussians; ValueError before the first batch."""
+        """The state so far: results and views as a scene, or Feature Gaussians. ValueError before the first batch."""
         if self._state is None:
             raise ValueError("expected at least one batch of views, got none")
         return self._state
 
     @property
     def batches(self) -> Sequence[Mapping[str, Any]]:
-        """Numbers of every batch so far; see :class:`gsmerge.states.extend.BatchReport`."""
+        """Figures of every batch so far; see :class:`gsmerge.states.extend.BatchReport`."""
         return () if self._state is None else tuple(self._state.about["batches"])
 
     @check_arguments
     def extend(self, scene: Scene | StrPath, *, progress: Progress | None = None) -> BatchReport:
-        """Add a batch of views in the world of the earlier ones; see :func:`gsmerge.states.extend.extend`.
+        """Add a batch of views in the same frame of coordinates; see :func:`gsmerge.states.extend.extend`.
 
         Raises:
             SceneError: If the pictures of the batch do not show the earlier Gaussians, without ``other_world=True``.
@@ -123,40 +125,40 @@ class Compactor:
 
     @check_arguments
     def remove(self, number: int) -> None:
-        """Take a batch out again; see :func:`gsmerge.states.remove.remove`.
+        """Remove a batch; see :func:`gsmerge.states.remove.remove`.
 
         Args:
-            number: The batch, from 1; later ones move up.
+            number: Number of the batch, from 1; the numbers of later batches decrease by one.
 
         Raises:
-            ValueError: If there is no such batch, it is the only one, or the state is of Feature Gaussians, in which
-                batches are merged.
+            ValueError: If there is no such batch, if it is the only one, or if the state has Feature Gaussians, since
+                these are merged across batches.
         """
         self._state = remove(self.state, number)
 
     @check_arguments
     def compact(self, *, progress: Progress | None = None, **settings: Unpack[CompactKeywords]) -> CompactResult:
-        """Compact the scene of all batches so far, see :func:`gsmerge.compact`.
+        """Compact the scene of all batches so far; see :func:`gsmerge.compact`.
 
         Raises:
-            ValueError: If there was no batch yet, a setting is wrong, or the state is of Feature Gaussians.
+            ValueError: If there was no batch yet, a setting is wrong, or the state has Feature Gaussians.
         """
         if self.state.scene is None:
-            raise ValueError("expected a state of results, found Feature Gaussians; decode makes Gaussians of them")
+            raise ValueError("expected a state of results, found Feature Gaussians; use decode for these")
         return compact(self.state.scene, progress=progress, **settings)
 
     def decode(self, **settings: Unpack[DecodeKeywords]) -> Gaussians:
         """Decode Feature Gaussians in the world frame.
 
         Args:
-            **settings: ``k``: Gaussians of each group, 1 to 4, or ``"mixed"``; others of
+            **settings: ``k``: Gaussians per group, 1 to 4, or ``"mixed"``; further settings of
                 :class:`gsmerge.settings.stages.DecodeOptions`.
 
         Raises:
-            ValueError: If there was no batch yet, a setting is wrong, or the state is one of results.
+            ValueError: If there was no batch yet, a setting is wrong, or the state has results.
         """
         if self.state.features is None:
-            raise ValueError('expected a state begun with recipe="paper", found results; compact makes others of them')
+            raise ValueError('expected a state that began with recipe="paper", found results; use compact for these')
         return decode_features(self.state.features, DecodeOptions(**settings))
 
     @check_arguments
@@ -168,5 +170,5 @@ class Compactor:
             SceneError: If the file exists or cannot be written.
         """
         if Path(path).suffix.lower() != SUFFIX:
-            raise ValueError(f"{path}: expected a name that ends in {SUFFIX}")
+            raise ValueError(f"{path}: expected a name ending in {SUFFIX}")
         save_state(path, self.state, overwrite=overwrite)

@@ -1,4 +1,4 @@
-"""State and new views -> state: a batch is compacted, and its Gaussians, cameras and pictures are added."""
+"""State and new views -> state: compact a batch, and add its Gaussians, cameras and pictures."""
 
 from __future__ import annotations
 
@@ -26,14 +26,17 @@ from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.setting import piece_settings
 from gsmerge.types import Cameras, Gaussians, Scene
 
-# Earlier Gaussians that are looked up in new views
+# Earlier Gaussians that are compared with new views
 SAMPLE_GAUSSIANS = 10_000
-# How far colours of the foremost lie from the pictures, over how far from random pixels: of batches of 15 captures at
-# most .87 in one world, and .92 to 1.08 in others, where 1 is chance. That is to be certain.
-UNLIKE = 0.9
+# A "world" is a frame of coordinates. It is another one above this ratio: the difference between the colours of the
+# foremost Gaussians and the pictures, divided by their difference from random pixels; 1 is chance. Over batches of 15
+# captures the ratio is at most .87 in the same world and .92 to 1.08 in another one. The side has to be certain.
+WORLD_RATIO = 0.9
 SAME, ANOTHER, NOT_KNOWN = "the same", "another", "not known"  # worlds
-BATCH = "batch"  # in messages, until the file is known
-NOT_COMPARED = "the pictures of this batch show too little of the earlier Gaussians to say whether its world is theirs"
+BATCH = "batch"  # place in messages until the file is known
+NOT_COMPARED = (
+    "the pictures of this batch show too little of the earlier Gaussians to say whether both are in the same world"
+)
 
 
 @dataclass(frozen=True)
@@ -42,22 +45,22 @@ class BatchReport:
 
     num_views: int
     num_input: int  # Gaussians of the batch
-    num_new: int  # Gaussians that it became; of a state of Feature Gaussians, superpixels
-    num_gaussians: int  # of the state afterwards; or Feature Gaussians
-    num_kept: int  # views of the state afterwards whose pictures it keeps
-    pictures: str  # what the batch is fitted to: "photos", or what stands in for them
-    views: Mapping[str, str]  # of which the state keeps pictures: their names in the state -> in the batch
+    num_new: int  # Gaussians that the batch became; superpixels in a state of Feature Gaussians
+    num_gaussians: int  # Gaussians, or Feature Gaussians, of the state afterwards
+    num_kept: int  # views whose pictures the state keeps afterwards
+    pictures: str  # pictures that the batch is fitted to: "photos", or what stands in for them
+    views: Mapping[str, str]  # views whose pictures the state keeps: name in the state -> name in the batch
     sh_degree: int  # of the batch's Gaussians
     seconds: Mapping[str, float]  # wall time of each stage
-    choices: Mapping[str, Any]  # what the stages decided; `world`: whether it seems to be that of the earlier batches
+    choices: Mapping[str, Any]  # decisions of the stages; `world`: that of the batch compared with earlier batches
     notes: tuple[str, ...]  # warnings, one sentence each
     options: Mapping[str, Any]  # all settings, by their names in reports
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What a state keeps of the report."""
-        left = ("seconds", "choices", "notes", "options")
-        return {name: value for name, value in asdict(self).items() if name not in left}
+        """The part of the report that a state keeps."""
+        omitted = ("seconds", "choices", "notes", "options")
+        return {name: value for name, value in asdict(self).items() if name not in omitted}
 
 
 def extend(
@@ -70,9 +73,9 @@ def extend(
 ) -> tuple[Scene, BatchReport]:
     """Add a batch of views, in the same world, to the results of earlier batches; None before the first.
 
-    Poses and exposures of the batch stay as they are. Returns an unaligned scene of all results, with the kept views at
-    the size of the first batch's: each has its photo, mended, or what stands in for it. And the report. ValueError if a
-    setting is impossible for the scene, SceneError for a scene that seems to be of another world.
+    Poses and exposures of the batch are not changed. Returns an unaligned scene of all results, and the report. The
+    scene has the kept views at the size of the first batch's views; each has its mended photo, or what stands in for
+    it. ValueError if a setting is impossible for the scene; SceneError if the scene seems to be in another world.
     """
     options = options.with_settings(piece_settings(CompactOptions))
     with use_threads(options.threads), record_run(progress):
@@ -84,7 +87,7 @@ def extend(
             refuse_other_world(world, extend_options)
             parts = [before.gaussians]
         result = compact_prepared(prepared, method, options)
-    notes = [text for text in result.report.notes if text != result.report.worse]  # that is for results
+    notes = [text for text in result.report.notes if text != result.report.worse]  # that note is for final results
     notes += [NOT_COMPARED] if before is not None and world == NOT_KNOWN else []
     parts.append(result.gaussians.numpy())
     num_higher = max(part.shN.shape[1] for part in parts)
@@ -111,9 +114,10 @@ def extend(
 
 
 def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
-    """Return whether pictures of new views show earlier Gaussians that the batch's own, at ``means``, do not hide.
+    """Compare the world of new views with that of earlier Gaussians: ``SAME``, ``ANOTHER`` or ``NOT_KNOWN``.
 
-    In another world their colours are as those of random pixels.
+    In the same world the pictures show those earlier Gaussians that the batch's Gaussians, at ``means``, do not hide.
+    In another world the colours differ from the pictures as much as from random pixels.
     """
     if not len(views):
         return NOT_KNOWN
@@ -121,22 +125,22 @@ def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
     pictures = photo_array(views.images)
     check = check_cameras(before, rows, views.cameras, pictures, SAMPLE_GAUSSIANS, foremost=True, hiding=hiding)
     reach = CERTAIN * check.ratio_error
-    if check.num_compared < ENOUGH or not abs(check.color_ratio - UNLIKE) > reach:
+    if check.num_compared < ENOUGH or not abs(check.color_ratio - WORLD_RATIO) > reach:
         return NOT_KNOWN
-    return SAME if check.color_ratio < UNLIKE else ANOTHER
+    return SAME if check.color_ratio < WORLD_RATIO else ANOTHER
 
 
 def refuse_other_world(world: str, options: ExtendOptions) -> None:
-    """Raise SceneError for a batch that seems to be of another world, unless options ask for it."""
+    """Raise SceneError for a batch that seems to be in another world, unless the options allow it."""
     if world == ANOTHER and not options.other_world:
-        problem = "expected views in the world of the earlier batches, found pictures that do not show their Gaussians"
-        raise SceneError(BATCH, problem, "begin another .gsm with it, or add it with --set other_world=true")
+        problem = "expected views in the same world as earlier batches, found pictures that do not show their Gaussians"
+        raise SceneError(BATCH, problem, "begin another .gsm with this batch, or add it with --set other_world=true")
 
 
 def _keep_pictures(prepared: Prepared) -> Scene:
-    """Return the given views, each once, with their pictures; no Gaussians."""
+    """Return the given views, each once, with their pictures and without Gaussians."""
     given, none = prepared.input_scene, prepared.input_scene.gaussians[:0]
-    if prepared.reference.placed:  # views that the scene lacks
+    if prepared.reference.placed:  # these views do not belong to the scene
         return Scene(none, given.cameras, None, None, given.names)
     once = np.unique(camera_kinds(given.cameras), return_index=True)[1]
     views, places = sorted(once.tolist()), prepared.repeated
@@ -146,7 +150,7 @@ def _keep_pictures(prepared: Prepared) -> Scene:
 
 
 def _join_views(first: Scene, second: Scene) -> Scene:
-    """Concatenate views, at the size of the first; a name that is taken gets a number in front."""
+    """Concatenate views at the size of the first ones; a name that is already in use gets a number in front."""
     if len(second) == 0 or len(first) == 0:
         return first if len(second) == 0 else second
     size = first.cameras.width, first.cameras.height
@@ -165,18 +169,18 @@ def _join_views(first: Scene, second: Scene) -> Scene:
 
 
 def number_names(before: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, ...]:
-    """Append names of views to those before; one that is taken gets a number in front."""
+    """Append names of views to those ``before``; a name that is already in use gets a number in front."""
     all_names = list(before)
     for name in names:
         numbered = (f"{number}-{name}" for number in range(2, len(all_names) + 3))
-        all_names.append(name if name not in all_names else next(other for other in numbered if other not in all_names))
+        all_names.append(name if name not in all_names else next(new for new in numbered if new not in all_names))
     return tuple(all_names)
 
 
 def choose_far(cameras: Cameras, count: int) -> list[int]:
-    """Choose at most ``count`` views, rising: the first, then each that is farthest from those chosen already.
+    """Choose at most ``count`` views, in rising order: the first, then always the one farthest from those chosen.
 
-    Distances are between centres, as shares of their widest extent, plus between directions.
+    A distance is that of the centres, as a share of their widest extent, plus that of the directions.
     """
     if len(cameras) <= count:
         return list(range(len(cameras)))

@@ -1,7 +1,7 @@
-"""Feature Gaussians across batches (paper section 4.5, "Online reconstruction"), which ``recipe=paper`` extends by.
+"""Feature Gaussians across batches with ``recipe=paper`` (paper section 4.5, "Online reconstruction").
 
-New views are encoded, matched with the Feature Gaussians so far, merged into them and refined; decoder heads make any K
-of them, of one batch the same bytes as ``compact`` does.
+New views are encoded, matched with the earlier Feature Gaussians, merged into them and refined. Decoder heads then make
+any K of Gaussians per group. For a single batch the result has the same bytes as that of ``compact``.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ from gsmerge.states.extend import NOT_COMPARED, NOT_KNOWN, BatchReport, compare_
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
 from gsmerge.version import __version__
 
-SAMPLE_STEP = 8  # pixels between the samples of a view along each axis
+SAMPLE_STEP = 8  # pixels between samples of a view along each axis
 
 
 @dataclass(frozen=True, eq=False)
 class ViewSamples:
-    """Gaussians of every view on a coarse grid of pixels, with which groups of other views are compared."""
+    """Gaussians of every view at a coarse grid of pixels, for comparison with groups of other views."""
 
     means: np.ndarray  # [v,h,w,3] float32, canonical
-    opacities: np.ndarray  # [v,h,w] float32, 0 where the pixel has no Gaussian
+    opacities: np.ndarray  # [v,h,w] float32, 0 if the pixel has no Gaussian
     sh0: np.ndarray  # [v,h,w,3] float32
 
     @staticmethod
@@ -63,18 +63,18 @@ class ViewSamples:
 class FeatureState:
     """Feature Gaussians of all views so far; the frame is that of the first batch."""
 
-    merged: FeatureGaussians  # g, canonical, as the merger left them, which later batches are matched with
-    refined: FeatureGaussians  # the same after the refiner, which heads read
+    merged: FeatureGaussians  # g, canonical, after merging; later batches are matched with these
+    refined: FeatureGaussians  # g, canonical, after the refiner; the heads decode these
     views: np.ndarray  # [g] int64, the view that each group's frame belongs to
     num_members: np.ndarray  # [g] int64, Gaussians that became the group
-    saliency: np.ndarray  # [g] float64, mean corner response of its pixels, by which K is mixed
+    saliency: np.ndarray  # [g] float64, mean corner response of the group's pixels, which chooses a mixed K
     group: np.ndarray  # [g,n] float32, the numbers that describe each group
     samples: ViewSamples  # of all views
-    cameras: Cameras  # the views, canonical, at the size of the first batch's
-    unseen: Gaussians  # canonical, that no view sees
+    cameras: Cameras  # of all views, canonical, at the size of the first batch's views
+    unseen: Gaussians  # canonical Gaussians that no view sees
     frame: Frame  # from canonical to world
     networks: NetworkWeights
-    checkpoint: str = ""  # the name by which they were given
+    checkpoint: str = ""  # name of the networks, as the user gave it
     names: tuple[str, ...] = ()  # of the views
 
     def __len__(self) -> int:
@@ -86,22 +86,22 @@ class FeatureState:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _JoinContext(NetworkContext):
-    """The networks' inputs for groups of a batch and of a state; ``cameras`` are those of all views.
+    """The networks' inputs for groups of a batch and a state together; ``cameras`` are those of all views.
 
-    Each Feature Gaussian lists, in place of its members, the rows of the parts it was pooled from: Gaussians of the
-    batch, or groups. Members of earlier batches are not stored.
+    Members of earlier batches are not stored. In place of its members, each Feature Gaussian lists the rows of the
+    parts from which it was pooled; a part is a group of the state or of the batch.
     """
 
     samples: ViewSamples  # of all views
     part_views: np.ndarray  # [p] int64, the view of each part
-    part_members: np.ndarray  # [p] int64, Gaussians that became the part
-    part_weights: np.ndarray  # [p] sum of their opacities
+    part_members: np.ndarray  # [p] int64, number of Gaussians that became the part
+    part_weights: np.ndarray  # [p] sum of the opacities of these Gaussians
 
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
         """Compute the networks' inputs for Feature Gaussians, from the samples of all views."""
         views, num_members = self.trace(features)
         height, width = self.samples.opacities.shape[1:]
-        nothing = np.zeros((0, 0), np.float32)  # which statistics do not read
+        nothing = np.zeros((0, 0), np.float32)  # the statistics do not read these columns
         shown = Members(
             means=self.samples.means.reshape(-1, 3), quats=nothing, scales=nothing,
             opacities=self.samples.opacities.reshape(-1), sh0=self.samples.sh0.reshape(-1, 1, 3), shN=nothing,
@@ -112,7 +112,7 @@ class _JoinContext(NetworkContext):
         return describe_features(features, views, num_members, stats, self.cameras)
 
     def trace(self, features: FeatureGaussians) -> tuple[np.ndarray, np.ndarray]:
-        """Find each Feature Gaussian's view ``[g]``, the one with most of its weight, and its number of members."""
+        """Find the view ``[g]`` with most of the weight of each Feature Gaussian, and its number of members ``[g]``."""
         starts, rows = features.starts, features.members
         owners = np.repeat(np.arange(len(features)), np.diff(starts))
         keys, places = np.unique(owners * len(self.cameras) + self.part_views[rows], return_inverse=True)
@@ -127,16 +127,17 @@ def extend_features(
     state: FeatureState | None, scene: Scene, options: CompactOptions, extend_options: ExtendOptions,
     *, progress: Progress | None = None,
 ) -> tuple[FeatureState, BatchReport]:  # fmt: skip
-    """Add a batch of views to a state, or begin one; see :func:`gsmerge.states.extend.extend`.
+    """Add a batch of views to a state, or begin a state; see :func:`gsmerge.states.extend.extend`.
 
-    Raises UsageError if the settings ask for other networks than the state's, a budget, or a fit; ValueError if the
-    harmonics are of another degree.
+    Raises UsageError if the settings ask for a budget, a fit or networks other than those of the state, or if the
+    harmonics have another degree.
     """
     for name in options.compact_only:
-        raise UsageError(f"{name}: goes with a whole scene, not with Feature Gaussians of several batches")
+        raise UsageError(f"{name}: not possible for Feature Gaussians in batches; use compact on the whole scene")
     if options.budget.budget is not None:
         raise UsageError(
-            f"budget {options.budget.budget}: recipe paper takes superpixels=NUMBER; compact --k decides the rest"
+            f"budget {options.budget.budget}: not possible with recipe paper; set superpixels=NUMBER here, and --k when"
+            " decoding"
         )
     if options.fit.fit != "none":
         raise UsageError(f"fit {options.fit.fit}: expected none with recipe paper")
@@ -147,7 +148,9 @@ def extend_features(
         plan = make_plan(prepared, options, None if state is None else _own_checkpoint(state, options))
         weights = plan.networks
         if weights is None or not weights.options.encoder or not weights.options.makes_children:
-            raise UsageError(f"recipe paper: expected an encoder and absolute outputs, {options.checkpoint} lacks them")
+            raise UsageError(
+                f"recipe paper: expected networks with an encoder and absolute outputs, {options.checkpoint} lacks them"
+            )
         cameras = in_float64(pictured.cameras)
         segmentation = segment_scene(pictured, plan.superpixels, None)
         members = assign(pictured, segmentation.groups, by_contribution=plan.by_contribution)
@@ -159,29 +162,29 @@ def extend_features(
         if state is None:
             merged = merge(features, match(features, plan.match), context)
             saliency = group_saliency(merged, members, corners)
-            made = _refine(merged, context, saliency, samples, prepared.frame, plan.unseen)
+            extended = _refine(merged, context, saliency, samples, prepared.frame, plan.unseen)
         else:
-            degree, own = scene.gaussians.sh_degree, state.unseen.sh_degree
-            if degree != own:
-                raise UsageError(f"expected Gaussians with harmonics of degree {own} as the state's, got {degree}")
+            degree, expected = scene.gaussians.sh_degree, state.unseen.sh_degree
+            if degree != expected:
+                raise UsageError(f"expected harmonics of degree {expected}, as in the state, got {degree}")
             saliency = group_saliency(features, members, corners)
-            made = _join(state, features, saliency, context, samples, plan.match)
-            made = replace(made, unseen=Gaussians.concat([state.unseen, plan.unseen]))
+            extended = _join(state, features, saliency, context, samples, plan.match)
+            extended = replace(extended, unseen=Gaussians.concat([state.unseen, plan.unseen]))
     numbers = {"num_views": len(pictured), "num_input": scene.num_gaussians, "num_new": len(features)}
     notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == NOT_KNOWN else [])]
     report = BatchReport(
-        **numbers, num_gaussians=len(made), num_kept=0, pictures=prepared.reference.name, views={},
+        **numbers, num_gaussians=len(extended), num_kept=0, pictures=prepared.reference.name, views={},
         sh_degree=scene.gaussians.sh_degree, seconds=record.seconds,
         choices=record.choices | plan.network_facts | {"world": world}, notes=tuple(notes), options=options.to_dict(),
     )  # fmt: skip
     names = prepared.input_scene.names
     views = tuple(names[prepared.repeated.index(view)] for view in range(len(pictured)))
     names = views if state is None else number_names(state.names, views)
-    return replace(made, checkpoint=options.checkpoint, names=names), report
+    return replace(extended, checkpoint=options.checkpoint, names=names), report
 
 
 def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
-    """Return whether a canonical scene seems to be of a state's world; SceneError for another one, unless asked for."""
+    """Compare the world of a canonical scene with that of a state; SceneError for another one, unless allowed."""
     if state is None:
         return NOT_KNOWN
     world = compare_worlds(feature_to_gaussians(state.refined), scene, scene.gaussians.means)
@@ -190,18 +193,18 @@ def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOption
 
 
 def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
-    """Return the networks of a state as a checkpoint; UsageError if the options name others."""
+    """Return the networks of a state as a checkpoint; UsageError if the options name other networks."""
     stored = state.checkpoint
     if options.checkpoint != stored:
         raise UsageError(
-            f"checkpoint {options.checkpoint}: expected the networks that made the state ({stored}), whose latents it"
-            " holds; leave the checkpoint out, or begin a new state"
+            f"checkpoint {options.checkpoint}: expected the networks that made the state ({stored}); omit the"
+            " checkpoint, or begin a new state"
         )
     return Checkpoint(state.networks, Path(stored), __version__, {})
 
 
 def sample_views(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
-    """Sample the Gaussians shown at the centres of the cells of a grid, that of a state if there is one."""
+    """Sample the foremost Gaussian at the centre of each cell of a grid; with a state, use its grid."""
     shape = -(-cameras.height // SAMPLE_STEP), -(-cameras.width // SAMPLE_STEP)
     height, width = shape if state is None else state.samples.opacities.shape[1:]
     rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
@@ -223,7 +226,7 @@ def _refine(
     merged: FeatureGaussians, context: NetworkContext, saliency: np.ndarray, samples: ViewSamples, frame: Frame,
     unseen: Gaussians,
 ) -> FeatureState:  # fmt: skip
-    """Refine merged Feature Gaussians, and describe them for the heads."""
+    """Refine merged Feature Gaussians, and describe the groups for the heads."""
     refined = context.refine(merged)
     with stage("decode"):
         described = context.describe(refined)
@@ -247,7 +250,7 @@ def _join(
     state: FeatureState, features: FeatureGaussians, saliency: np.ndarray, context: NetworkContext,
     samples: ViewSamples, options: MatchOptions,
 ) -> FeatureState:  # fmt: skip
-    """Match a batch's Feature Gaussians with a state's, which come first in clusters, and merge and refine them."""
+    """Match, merge and refine the Feature Gaussians of a state and a batch; those of the state come first."""
     size, members = (state.cameras.width, state.cameras.height), context.members
     cameras = concat_cameras(state.cameras, resize_cameras(context.cameras, *size))
     views = features.views + len(state.cameras)
@@ -271,8 +274,8 @@ def _join(
 def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -> Matches:
     """Match the Feature Gaussians of a batch with each other, as in a scene, and with those of the state.
 
-    Clusters are the union of both matchings. For the second the state counts as one view and the batch as another, so
-    that each is compared with its nearest there.
+    A cluster joins the clusters of both matchings that share a part. For the second matching the state counts as one
+    view and the batch as another, so that each part is compared with its nearest neighbours on the other side.
     """
     rows = np.arange(len(parts))
     across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options).clusters
@@ -286,17 +289,18 @@ def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -
 
 
 def _without_members(features: FeatureGaussians) -> FeatureGaussians:
+    """Return the Feature Gaussians with empty lists of members."""
     return replace(features, starts=np.zeros(len(features) + 1, np.int64), members=np.zeros(0, np.int32))
 
 
 def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
-    """Decode a state into ``k`` Gaussians of each group in the world frame, or a number mixed by their saliency.
+    """Decode a state into ``k`` Gaussians per group, or a number mixed by saliency, in the world frame.
 
-    Raises UsageError if the networks' heads do not make so many, or for a rule that needs the groups' members.
+    Raises UsageError if the networks' heads make fewer Gaussians, or for a rule that needs the members of the groups.
     """
     most = state.networks.options.max_children
     if options.k == MIXED and options.k_rule == "distortion":
-        raise UsageError("k_rule distortion: expected saliency for Feature Gaussians, whose members are not kept")
+        raise UsageError("k_rule distortion: expected saliency, since Feature Gaussians do not keep their members")
     if options.max_k > most:
         raise UsageError(f"k: expected mixed or 1 to {most}, got {options.k}")
     counts = np.full(len(state), options.max_k)
@@ -312,9 +316,9 @@ def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
 
 
 def feature_arrays(state: FeatureState) -> dict[str, np.ndarray]:
-    """Return the g Feature Gaussians and v views of a state by name, in the world's frame and unit.
+    """Return the arrays of a state's g Feature Gaussians and v views by name, in the world's frame and unit.
 
-    docs/reference/formats.md says what each array is, with its shape and unit.
+    docs/reference/formats.md describes each array with its shape and unit.
     """
     features, unit = state.refined, state.frame.unit
     ones, cameras = state.frame.leave(feature_to_gaussians(features)), state.frame.leave_cameras(state.cameras)

@@ -1,4 +1,4 @@
-"""States in files: extended by scenes; of Feature Gaussians, decoded into files and written as arrays."""
+"""States in files: extend them by scenes, decode their Feature Gaussians, and write these as arrays."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from gsmerge.states.features import decode_features, feature_arrays
 from gsmerge.states.remove import remove
 from gsmerge.states.state_file import State, load_state, save_state
 
-ARRAYS = ".npz"  # ending of a file of Feature Gaussians as arrays
+ARRAYS = ".npz"  # ending of a file with the arrays of Feature Gaussians
 
 
 def extend_file(
@@ -54,14 +54,15 @@ def extend_file(
     dry_run: bool = False,
     tried: State | None = None,
 ) -> tuple[dict[str, Any], State]:
-    """Add a batch of views to the state in a file, or to a new file; return the report as plain JSON types, and it.
+    """Add a batch of views to the state in a file, or to a new file; return report (plain JSON types) and new state.
 
-    The file is replaced at the end, and not if anything fails or another process has changed it. If two processes end
-    together, the second waits for the first and then sees its change. A batch that the state has already is left out,
-    with a note. ``settings``: see :class:`gsmerge.Compactor`. ``seconds_before``: wall time by name of the caller's
-    earlier steps. ``dry_run``: write nothing; ``tried``: the state that an earlier one made, in place of the file's.
-    Raises SceneError if a file cannot be read or written or was changed meanwhile, or the batch seems to be of another
-    world; UsageError if a setting is unknown, out of range, or requires what the state or the scene does not have.
+    The file is replaced at the end, but not if anything fails or another process has changed the file. If two processes
+    end together, the second waits for the first and then notices its change. A batch that the state already has is left
+    out, with a note. ``settings``: see :class:`gsmerge.Compactor`. ``seconds_before``: wall time by name of the
+    caller's earlier steps. ``dry_run``: write nothing. ``tried``: the state of an earlier dry run, used in place of the
+    file's. Raises SceneError if a file cannot be read or written, if it was changed in the meantime, or if the batch
+    seems to be in another world; UsageError if a setting is unknown, out of range, or impossible for the state or the
+    scene.
     """
     start, identity = perf_counter(), _file_identity(path)
     try:
@@ -73,7 +74,7 @@ def extend_file(
     known = [] if state is None else [batch.get("sha256") for batch in state.about["batches"]]
     document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}, "dry_run": dry_run}
     if state is not None and sha256 in known:
-        note = f"{files.ply}: left out, as all its files are batch {known.index(sha256) + 1} of {path.name} already"
+        note = f"{files.ply}: left out, since the same files are batch {known.index(sha256) + 1} of {path.name} already"
         return document | {"left_out": True, "state": _describe_file(path, state), "notes": [note]}, state
     with _replaced(path, identity, dry_run=dry_run) as temporary:
         loaded = perf_counter()
@@ -104,10 +105,10 @@ def extend_file(
 
 
 def remove_batch(path: Path, number: int, *, dry_run: bool = False) -> dict[str, Any]:
-    """Take a batch, counted from 1, out of the state in a file; return what is left as plain JSON types.
+    """Remove a batch, counted from 1, from the state in a file; return the report as plain JSON types.
 
     The file is replaced as by :func:`extend_file`. ``dry_run``: write nothing. SceneError if the file cannot be read or
-    written or was changed meanwhile; UsageError if the batch cannot be taken out.
+    written or was changed in the meantime; UsageError if the batch cannot be removed.
     """
     identity, before = _file_identity(path), load_state(path)
     state = remove(before, number)
@@ -125,18 +126,18 @@ def remove_batch(path: Path, number: int, *, dry_run: bool = False) -> dict[str,
 
 
 def _note_source(state: State, sha256: str, comments: Sequence[str]) -> State:
-    """Return a state whose last batch notes its files, and the comments that results copy."""
+    """Return a state whose last batch records the hash of its files and the comments that results copy."""
     *earlier, last = state.about["batches"]
     last = last | {"sha256": sha256} | ({"comments": list(comments)} if comments else {})
-    every = list(dict.fromkeys([*state.about.get("comments", []), *comments]))
-    return replace(state, about={**state.about, "batches": [*earlier, last], "comments": every})
+    all_comments = list(dict.fromkeys([*state.about.get("comments", []), *comments]))
+    return replace(state, about={**state.about, "batches": [*earlier, last], "comments": all_comments})
 
 
 @contextmanager
 def _replaced(path: Path, identity: tuple[int, int, int] | None, *, dry_run: bool) -> Iterator[Path | None]:
-    """Yield a file that takes the place of ``path`` after the block; None in a dry run.
+    """Yield a temporary file that replaces ``path`` after the block; None in a dry run.
 
-    SceneError if ``path`` is then another file than that of the ``identity``.
+    SceneError if ``path`` then no longer has this ``identity``.
     """
     if dry_run:
         yield None
@@ -145,20 +146,20 @@ def _replaced(path: Path, identity: tuple[int, int, int] | None, *, dry_run: boo
         yield temporary
         until_renamed.enter_context(lock_folder(path.resolve().parent))
         if _file_identity(path) != identity:
-            raise SceneError(path, "was changed by another process meanwhile", "run again; it is as that left it")
+            raise SceneError(path, "was changed by another process in the meantime, and is not replaced", "run again")
 
 
 def _describe_file(path: Path, state: State) -> dict[str, Any]:
-    """Describe the file of a state, which a dry run may not have written."""
+    """Describe the file of a state; after a dry run it may not exist."""
     num_bytes = path.stat().st_size if path.exists() else 0
     return {"path": str(path), "bytes": num_bytes, "num_batches": len(state.about["batches"])}
 
 
 def _file_identity(path: Path) -> tuple[int, int, int] | None:
-    """Return numbers that change when a file of this name is replaced; None without a file."""
+    """Return numbers that change when a file of this name is replaced; None if there is no file."""
     try:
         status = os.stat(path)
-    except OSError:  # other problems show when it is written
+    except OSError:  # problems other than a missing file are reported when it is written
         return None
     return status.st_ino, status.st_mtime_ns, status.st_size
 
@@ -179,17 +180,18 @@ def batch_line(document: Mapping[str, Any]) -> str:
 
 def removal_line(document: Mapping[str, Any]) -> str:
     """Describe the report of :func:`remove_batch` in one line."""
-    state, gone = document["state"], document["removed"]
+    state, removed = document["state"], document["removed"]
     would = "would be " * document["dry_run"]
     left = f"{_count_batches(state)}, {document['num_gaussians']:,} Gaussians left"
     size = "" if would else f", {human_bytes(state['bytes'])}"
     return (
-        f"{state['path']}: {would}without batch {gone['number']} of {gone['num_views']} views and"
-        f" {gone['num_new']:,} Gaussians; {left}{size}"
+        f"{state['path']}: {would}without batch {removed['number']} of {removed['num_views']} views and"
+        f" {removed['num_new']:,} Gaussians; {left}{size}"
     )
 
 
 def _count_batches(state: Mapping[str, Any]) -> str:
+    """Return the number of batches with its unit."""
     return f"{state['num_batches']} batch{'' if state['num_batches'] == 1 else 'es'}"
 
 
@@ -205,18 +207,18 @@ def decode_file(
     dry_run: bool = False,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Decode the Feature Gaussians in a ``.gsm`` into an output, with the cameras in or beside it; return the report.
+    """Decode the Feature Gaussians in a ``.gsm`` into an output, with cameras in or beside it; return the report.
 
-    ``site``: a page has its parts beside it. ``dry_run``: write nothing. Raises SceneError if a file cannot be read or
-    written, UsageError for a K that the networks do not make.
+    ``site``: write the parts of a page beside it. ``dry_run``: write nothing. Raises SceneError if a file cannot be
+    read or written, UsageError for a K that the networks do not make.
     """
     start, state = perf_counter(), load_state(path)
     features, batches = state.features, state.about["batches"]
     if features is None:
         raise SceneError(path, "expected Feature Gaussians, found results", "compact it as a scene")
     num_input = sum(int(batch.get("num_input", 0)) for batch in batches)
-    given = {"path": str(path), "bytes": path.stat().st_size, "num_groups": len(features), "num_gaussians": num_input}
-    document: dict[str, Any] = {**document_head(), "input": given | {"batches": batches}, "k": options.k}
+    facts = {"path": str(path), "bytes": path.stat().st_size, "num_groups": len(features), "num_gaussians": num_input}
+    document: dict[str, Any] = {**document_head(), "input": facts | {"batches": batches}, "k": options.k}
     if dry_run:
         most = options.max_k * len(features)
         return document | {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}, "notes": []}
@@ -227,7 +229,7 @@ def decode_file(
         first = add(out)
         gaussians, done = decode_features(features, options), perf_counter()
         if len(gaussians) == 0:
-            raise SceneError(path, "expected visible Gaussians, found none", "extend a new state by the scene")
+            raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
         cameras, photos = features.frame.leave_cameras(features.cameras), name_photos(None, names)
         notes = [*output_notes(out, gaussians.sh_degree, photos), *rounding_notes(out, gaussians)]
         contents = Contents(
@@ -262,11 +264,11 @@ def decoding_line(document: Mapping[str, Any]) -> str:
 def convert_features(path: Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
     """Write the Feature Gaussians in a ``.gsm`` as an ``.npz``; return the report as plain JSON types.
 
-    Raises SceneError if a file cannot be read or written, or holds results.
+    Raises SceneError if a file cannot be read or written, or if it holds results.
     """
     features = load_state(path).features
     if features is None:
-        raise SceneError(path, "expected Feature Gaussians, found results", "name a .ply, or another format of scenes")
+        raise SceneError(path, "expected Feature Gaussians, found results", "name a .ply as the output")
     arrays = feature_arrays(features)
     with atomic_output(out, overwrite=overwrite) as temporary, ZipFile(temporary, "w") as archive:
         for name, array in arrays.items():

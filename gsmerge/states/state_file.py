@@ -1,4 +1,4 @@
-"""The file of a state: results with views, or Feature Gaussians of ``recipe=paper``, written and read."""
+"""Write and read the file of a state: results with views, or Feature Gaussians of ``recipe=paper``."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from gsmerge.states.features import FeatureState, ViewSamples
 from gsmerge.types import FeatureGaussians, Gaussians, Scene, StrPath
 
 COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
-MOST = 1e37  # of any number: float32 ends at 3e38
+LARGEST = 1e37  # absolute value of any number; float32 ends at 3e38
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What batches of views became: results in a scene, or Feature Gaussians."""
+    """Views of several batches, compacted: results in a scene, or Feature Gaussians."""
 
-    about: Mapping[str, Any]  # plain JSON types: `batches`, a report of each
-    scene: Scene | None = None
-    features: FeatureState | None = None  # where there is no scene
+    about: Mapping[str, Any]  # plain JSON types; `batches` has the report of each batch
+    scene: Scene | None = None  # None in a state of Feature Gaussians
+    features: FeatureState | None = None  # None in a state of results
 
     def __repr__(self) -> str:
         return f"State({len(self):,} Gaussians of {len(self.about['batches'])} batch(es))"
@@ -49,7 +49,7 @@ class State:
 
 
 def save_state(path: StrPath, state: State, *, overwrite: bool = False) -> None:
-    """Write a state to a file, whole or not at all; SceneError if the file exists or cannot be written."""
+    """Write a state to a file, completely or not at all; SceneError if the file exists or cannot be written."""
     if state.scene is not None:
         write_scene(path, state.scene, state.about, overwrite=overwrite)
         return
@@ -72,9 +72,9 @@ def save_state(path: StrPath, state: State, *, overwrite: bool = False) -> None:
 
 
 def load_state(path: StrPath) -> State:
-    """Read a state from a file; nothing in it is executed.
+    """Read a state from a file; no code in the file is executed.
 
-    Raises SceneError if the file is missing or damaged, of another format or version, lacks an array, or holds numbers
+    Raises SceneError if the file is missing or damaged, has another format or version, lacks an array, or has numbers
     out of range.
     """
     file = read_gsm(path)
@@ -85,18 +85,18 @@ def load_state(path: StrPath) -> State:
     if file.header["kind"] == FEATURES:
         return State(about, features=_read_features(file))
     scene = load_scene(path).scene
-    if len(scene.gaussians) == len(file.arrays["means"]):  # as they are: scales pass through logarithms
+    if len(scene.gaussians) == len(file.arrays["means"]):  # keep the bits: load_scene takes scales through logarithms
         scene = replace(scene, gaussians=Gaussians(*(file.arrays[f.name] for f in fields(Gaussians))))
     return State(about, scene)
 
 
 def holds_features(path: Path) -> bool:
-    """Return whether a ``.gsm`` holds Feature Gaussians, not results; SceneError if it cannot be read."""
+    """Return whether a ``.gsm`` holds Feature Gaussians instead of results; SceneError if it cannot be read."""
     return bool(read_header(path)["kind"] != SCENE)
 
 
 def _read_features(file: GsmFile) -> FeatureState:
-    """Read Feature Gaussians, with every array checked for its type, shape and range."""
+    """Read Feature Gaussians, and check type, shape and range of every array."""
     networks = {name.removeprefix("networks."): a for name, a in file.arrays.items() if name.startswith("networks.")}
     options, unit = file.header.get("networks"), file.header.get("unit")
     if not isinstance(options, dict):
@@ -119,7 +119,7 @@ def _read_features(file: GsmFile) -> FeatureState:
     columns = {name: _numbers(file, f"merged.{name}", g, *shapes.get(name, ())) for name in COLUMNS}
     merged = FeatureGaussians(
         **columns,
-        views=_whole(file, "merged.views", g, -1, num_views),
+        views=_whole_numbers(file, "merged.views", g, -1, num_views),
         starts=np.zeros(g + 1, np.int64),
         members=np.zeros(0, np.int32),
     )
@@ -134,8 +134,8 @@ def _read_features(file: GsmFile) -> FeatureState:
     return FeatureState(
         merged=merged,
         refined=replace(merged, **corrected),
-        views=_whole(file, "views", g, 0, num_views),
-        num_members=_whole(file, "num_members", g, 1, 1 << 40),
+        views=_whole_numbers(file, "views", g, 0, num_views),
+        num_members=_whole_numbers(file, "num_members", g, 1, 1 << 40),
         saliency=file.finite("saliency", np.float64, g),
         group=_numbers(file, "group", g, GROUP),
         samples=ViewSamples(*samples),
@@ -149,15 +149,15 @@ def _read_features(file: GsmFile) -> FeatureState:
 
 
 def _numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
-    """Return a float32 array; SceneError for numbers that would overflow later."""
+    """Return a float32 array; SceneError if it has numbers that would overflow later."""
     array = file.array(name, np.float32, *shape)
-    if not (np.abs(array).max(initial=0) <= MOST):  # NaN, too
-        raise file.error(f"{name}: expected finite numbers up to {MOST:g}, found others")
+    if not (np.abs(array).max(initial=0) <= LARGEST):  # NaN fails too
+        raise file.error(f"{name}: expected finite numbers up to {LARGEST:g}, found others")
     return array
 
 
-def _whole(file: GsmFile, name: str, count: int, least: int, end: int) -> np.ndarray:
-    """Return whole numbers ``[count]`` from ``least`` to below ``end``; SceneError for others."""
+def _whole_numbers(file: GsmFile, name: str, count: int, least: int, end: int) -> np.ndarray:
+    """Return an array ``[count]`` of whole numbers from ``least`` to below ``end``; SceneError for other numbers."""
     array = file.array(name, np.int64, count)
     if count and not least <= int(array.min()) <= int(array.max()) < end:
         raise file.error(f"{name}: expected numbers from {least} to {end - 1}, found others")

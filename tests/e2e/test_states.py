@@ -272,7 +272,7 @@ def test_feature_gaussians_as_arrays(features: Path, tmp_path: Path, run: Run) -
 def test_what_feature_gaussians_are_not_made_into(features: Path, states: list[Path], tmp_path: Path, run: Run) -> None:
     for words, place, *found in (
         (("compact", features, "--budget", "10"), "--budget", features),
-        (("compact", features, states[0], "-o", tmp_path / "a.ply"), features, "alone", 2),
+        (("compact", features, states[0], "-o", tmp_path / "a.ply"), features, "only input", 2),
         (("compact", features, "--k", "8", "-o", tmp_path / "a.ply"), "k", "1 to 4"),
         (("convert", states[0], states[0], tmp_path / "a.npz"), tmp_path / "a.npz", ".gsm"),
     ):

@@ -72,7 +72,7 @@ def test_what_does_not_fit_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(estimate, "machine_memory", lambda available=available: available)
         assert (memory_problem(30 * 10**9) is None) == fits
     said = memory_problem(30 * 10**9)
-    assert "about 30.0 GB of memory are needed and this machine has 24.0 GB" in said
+    assert "about 30.0 GB of memory are needed, and this machine has 24.0 GB" in said
     assert "--effort draft" in said
 
 

@@ -134,7 +134,7 @@ def test_a_batch_that_shows_something_else_is_refused_unless_asked_for(room: Sce
     other = scenes.take_views(replace(room, gaussians=inverse, images=1 - room.images), range(3))
     compactor = fed(room)
     before = compactor.state
-    with pytest.raises(SceneError, match=r"world of the earlier batches.*other_world"):
+    with pytest.raises(SceneError, match=r"the same world as earlier batches.*other_world"):
         compactor.extend(other)
     assert compactor.state is before
     assert fed(room, other, other_world=True).batches[1]["num_views"] == 3
