@@ -142,7 +142,7 @@ def test_several_outputs_are_all_there_or_none(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("gsmerge.io.formats.write.write_gaussians", full)
-    monkeypatch.setattr("gsmerge.compaction.placement.viewer_cameras", no_room)
+    monkeypatch.setattr("gsmerge.compaction.outputs.viewer_cameras", no_room)
     before = listing(smallest_copy)
     quick = ("--set", "superpixels=40", "--fit", "none")
     outcome = run("compact", smallest_copy, "-o", smallest_copy / "out.ply", *quick, *more, "--quiet")
