@@ -358,11 +358,6 @@ class Scene:
         own = ", of pixels" if self.has_own_pixels else ""
         return f"Scene({len(self.gaussians):,} Gaussians, {views}{images}{own})"
 
-    @staticmethod
-    def of(gaussians: Gaussians, cameras: Cameras) -> Scene:
-        """Make a scene of Gaussians and cameras alone, whose views have numbers for names."""
-        return Scene(gaussians, cameras, None, None, tuple(f"view {view}" for view in range(len(cameras))))
-
     def numpy(self) -> Scene:
         """Return the same scene with NumPy arrays in place of tensors, images in [0, 1]; ValueError for others."""
         names = [name for name in PER_PIXEL if getattr(self, name) is not None]
@@ -423,6 +418,11 @@ class Scene:
     def pixels_per_view(self) -> int:
         """Number of pixels of a view, H·W."""
         return self.cameras.height * self.cameras.width
+
+
+def make_scene(gaussians: Gaussians, cameras: Cameras) -> Scene:
+    """Make a scene of Gaussians and cameras alone, whose views have numbers for names."""
+    return Scene(gaussians, cameras, None, None, tuple(f"view {view}" for view in range(len(cameras))))
 
 
 def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:

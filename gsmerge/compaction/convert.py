@@ -35,7 +35,7 @@ from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean, describe_counts
-from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Scene, StrPath
+from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath, make_scene
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def _clean(
     elif stored is not None:
         cameras = to_cameras(stored)
     placed = place_viewpoints(gaussians) if cameras is None else cameras
-    frame = scene_frame(Scene.of(gaussians, placed))
+    frame = scene_frame(make_scene(gaussians, placed))
     canonical = frame.enter(replace(gaussians, means=gaussians.means.astype(np.float64)))
     return clean(canonical, options.clean, frame.enter_cameras(placed), images, frame.leave)
 

@@ -31,7 +31,7 @@ from gsmerge.raster.photos import NEAR_PLANE, WHOLE, PhotoScore, scene_photos, s
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
 from gsmerge.stages.prune import ROUNDING
-from gsmerge.types import Cameras, Gaussians, Scene, StrPath
+from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene
 
 if TYPE_CHECKING:
     import torch
@@ -108,7 +108,7 @@ class CompactResult:
             scene = self.scene() if isinstance(self.scene, ReferenceType) else self.scene
         if scene is not None:
             return view(scene, self)
-        return view(Scene.of(self.gaussians, self.cameras))
+        return view(make_scene(self.gaussians, self.cameras))
 
     def __repr__(self) -> str:
         levels = f", {len(self.coarser)} coarser level(s)" if self.coarser else ""

@@ -17,7 +17,7 @@ from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Gaussians, make_scene
 
 LEAST = FitOptions().min_contribution  # blending weight of a pixel from which on a view shows a Gaussian, as for a fit
 LEVEL, SIDE = 2, 480  # pictures are that much smaller, as where a fit looks for Gaussians, and at most so wide
@@ -44,7 +44,7 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
 def count_views_in_world(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """Count the views, at least one, that show each of n Gaussians of their own world, ``[n]`` int32."""
-    frame = scene_frame(Scene.of(gaussians, cameras))
+    frame = scene_frame(make_scene(gaussians, cameras))
     return count_views(frame.enter(gaussians), frame.enter_cameras(cameras))
 
 
