@@ -1,6 +1,6 @@
-"""Turn what other libraries return into the arguments of :func:`gsmerge.compact_tensors`, by the names of fields.
+"""Convert the outputs of other libraries to arguments of :func:`gsmerge.compact_tensors`, by the names of fields.
 
-None of the libraries is imported. Each function returns keyword arguments, so that any of them can be changed:
+None of these libraries is imported. Each function returns keyword arguments, so that callers can change any of them:
 
     gsmerge.compact_tensors(**gsmerge.integrations.depth_anything_3(prediction), budget="4%")
 """
@@ -18,14 +18,15 @@ from gsmerge.geometry import normalize, rotmat_to_quat
 from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.matrices import eigh, invert
 
-_OTHER_SIZE = 0.1  # share by which a principal point is farther from the middle than one of this size ever is
-_BYTES = 255.0  # largest value of an image of bytes
+_OTHER_SIZE = 0.1  # intrinsics are of another image size if all principal points differ by more than this share
+_BYTES = 255.0  # largest value of an 8-bit image
 
 
 def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
-    """Convert a ``Prediction`` of Depth Anything 3 with ``infer_gs=True``: all Gaussians, one per pixel, and its views.
+    """Convert a ``Prediction`` of Depth Anything 3 with ``infer_gs=True``: all Gaussians, one per pixel, and the views.
 
-    The files of the model lack Gaussians at borders and far away. Poses of nested models are scaled to the Gaussians.
+    The files that the model writes lack Gaussians at borders and far away. Poses of nested models are scaled to fit the
+    Gaussians.
 
     Args:
         prediction: Has ``gaussians`` (``means``, ``scales``, ``rotations``, ``harmonics``, ``opacities``),
@@ -45,19 +46,19 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     return {
         **_gaussians(gaussians, sh_degree),
         "scales": _one("scales", gaussians.scales, 2),
-        # the same rotations: its z is never negative, by which they would look as if w came last
+        # The same rotations with other signs. The model's z is never negative, as if it were a w that comes last
         "quats": rotations * (1 - 2 * (rotations[:, :1] < 0)),
         "images": _as_floats(photos),
         "viewmats": viewmats,
         "Ks": _in_pixels_of(photos, as_array(_field("prediction", prediction, "intrinsics"))),
-        "check_rotations": False,  # its own renderer takes them as they are
+        "check_rotations": False,  # the model's renderer uses them as they are
     }
 
 
 def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_degree: int = 0) -> dict[str, Any]:
     """Convert the output of AnySplat's ``model.inference``: Gaussians of voxels, which have no pixels, and cameras.
 
-    The files of the model have no cameras.
+    The files that the model writes have no cameras.
 
     Args:
         gaussians: Has ``means``, ``scales``, ``rotations`` xyzw (its files have w first), ``harmonics [1,n,3,k]`` and
@@ -79,15 +80,17 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
 
 
 def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0) -> dict[str, Any]:
-    """Convert what DepthSplat's encoder returns, one Gaussian per pixel; MVSplat and pixelSplat (with one) are alike.
+    """Convert the output of DepthSplat's encoder, with one Gaussian per pixel.
 
-    Its files lack the pixels at borders. Scales and rotations come from the covariances, because the rotations it
-    keeps beside them are the cameras'.
+    Outputs of MVSplat, and of pixelSplat with one Gaussian per pixel, have the same form. The files of the model lack
+    the pixels at borders. Scales and rotations are computed from the covariances, because the rotations in the output
+    are relative to the cameras.
 
     Args:
-        output: The encoder's: Gaussians with ``means``, ``covariances``, ``harmonics [1,n,3,k]`` and ``opacities``, or
+        output: Output of the encoder: Gaussians with ``means``, ``covariances``, ``harmonics [1,n,3,k]`` and
+        ``opacities``, or
             a dictionary that has them as ``gaussians``.
-        context: The batch's context: ``extrinsics [1,V,4,4]`` camera to world, ``intrinsics [1,V,3,3]`` divided by the
+        context: Context of the batch: ``extrinsics [1,V,4,4]`` camera to world, ``intrinsics [1,V,3,3]`` divided by the
             image's size, ``image [1,V,3,H,W]`` in [0, 1].
         sh_degree: Harmonics above this degree are left out, as in its files.
 
@@ -110,7 +113,7 @@ def ffgs(output: Any, images: Array | None = None, cameras: Any = None, *, sh_de
 
     Args:
         output: Has ``gaussians`` (``means``, ``scales``, ``quats`` wxyz, ``opacities``, and ``colors``: harmonics
-            ``[1,n,k,3]``, or RGB ``[1,n,3]`` where ``sh_degree`` is None) and ``cameras``, or None for these.
+            ``[1,n,k,3]``, or RGB ``[1,n,3]`` if its ``sh_degree`` is None) and ``cameras``, which may be None.
         images: ``[1,V,3,H,W]`` of the cameras' views, in [0, 1], at the model's input size; None: no photos.
         cameras: The library's ``Cameras`` in the frame of the output, such as ``views.cameras`` for
             ``output.to_world()``; None: those of the output, if it has any.
@@ -122,14 +125,14 @@ def ffgs(output: Any, images: Array | None = None, cameras: Any = None, *, sh_de
     gaussians = _field("output", output, "gaussians")
     cameras = getattr(output, "cameras", None) if cameras is None else cameras
     opacities = _one("opacities", _field("gaussians", gaussians, "opacities"), 1)
-    kept = opacities != 0  # others fill a batch up
-    rows = {name: _one(name, _field("gaussians", gaussians, name), 2)[kept] for name in ("means", "scales", "quats")}
+    used = opacities != 0  # the other rows only pad the batch
+    rows = {name: _one(name, _field("gaussians", gaussians, name), 2)[used] for name in ("means", "scales", "quats")}
     if gaussians.sh_degree is None:
-        colors = {"colors": _one("colors", gaussians.colors, 2)[kept]}
+        colors = {"colors": _one("colors", gaussians.colors, 2)[used]}
     else:
-        harmonics = _one("colors", gaussians.colors, 3)[kept]
+        harmonics = _one("colors", gaussians.colors, 3)[used]
         colors = {"sh0": harmonics[:, :1], "shN": harmonics[:, 1 : (sh_degree + 1) ** 2]}
-    arguments = {**rows, **colors, "opacities": opacities[kept], "order": "none"}
+    arguments = {**rows, **colors, "opacities": opacities[used], "order": "none"}
     if cameras is None:
         return arguments
     c2w = as_array(_one("c2w", cameras.c2w, 3)).astype(np.float64)
@@ -140,11 +143,11 @@ def ffgs(output: Any, images: Array | None = None, cameras: Any = None, *, sh_de
 
 
 def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]:
-    """Convert the predictions of WorldMirror: Gaussians of voxels, which have no pixels, and cameras.
+    """Convert the predictions of WorldMirror: Gaussians of voxels, which belong to no pixels, and cameras.
 
     Args:
-        predictions: ``splats`` with ``means``, ``scales``, ``quats`` wxyz, ``opacities`` and ``sh``, of each scene of a
-            batch of one; ``camera_poses [1,V,4,4]`` camera to world, ``camera_intrs [1,V,3,3]`` in pixels.
+        predictions: ``splats`` with ``means``, ``scales``, ``quats`` wxyz, ``opacities`` and ``sh``, for a batch of one
+            scene; ``camera_poses [1,V,4,4]`` camera to world, ``camera_intrs [1,V,3,3]`` in pixels.
         images: ``[1,V,3,H,W]`` as the model got them, in [0, 1].
 
     Raises:
@@ -161,16 +164,17 @@ def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]
 
 
 def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) -> dict[str, Any]:
-    """Convert what gsplat's ``simple_trainer.py`` trains, and the views that it trains on, in the trainer's own frame.
+    """Convert the Gaussians of gsplat's ``simple_trainer.py`` and the views that they are trained on, in its own frame.
 
     Args:
-        splats: ``means``, ``quats`` wxyz of any length, ``scales`` as logarithms, ``opacities`` as logits, ``sh0``,
-            ``shN``: the trainer's ``splats``, or those of one of its checkpoints.
-        dataset: For each view ``camtoworld [4,4]``, ``K [3,3]`` in pixels, ``image [H,W,3]`` in [0, 255]: the trainer's
-            ``trainset``.
+        splats: The trainer's ``splats``, or those of one of its checkpoints: ``means``, ``quats`` wxyz of any length,
+            ``scales`` as logarithms, ``opacities`` as logits, ``sh0``, ``shN``.
+        dataset: The trainer's ``trainset``: for each view ``camtoworld [4,4]``, ``K [3,3]`` in pixels, ``image
+        [H,W,3]``
+            in [0, 255].
 
     Raises:
-        SceneError: If an entry is missing, as ``sh0`` is where colours depend on the photo, or photos differ in size.
+        SceneError: If an entry is missing, such as ``sh0`` if colours depend on the photo, or if photos differ in size.
     """
     columns = {name: as_array(_item("splats", splats, name)) for name in ("means", "quats", "scales", "opacities")}
     columns |= {name: as_array(_item("splats", splats, name)) for name in ("sh0", "shN")}
@@ -178,8 +182,10 @@ def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) 
     columns["scales"], columns["opacities"] = exp(columns["scales"]), 1 / (1 + exp(-columns["opacities"]))
     names = ("camtoworld", "K", "image")
     views = [[as_array(_item("dataset", view, name)) for name in names] for view in dataset]
-    if sizes := sorted({image.shape[:2] for _, _, image in views})[1:]:
-        raise SceneError("dataset", f"expected photos of one size, found {len(sizes) + 1} sizes", "pass those of one")
+    num_sizes = len({image.shape[:2] for _, _, image in views})
+    if num_sizes > 1:
+        problem = f"expected photos of one size, found {num_sizes} sizes"
+        raise SceneError("dataset", problem, "pass photos of one size")
     c2w, Ks, photos = (np.stack(columns) for columns in zip(*views, strict=True))
     return {
         **{name: like(column, splats["means"]) for name, column in columns.items()},
@@ -189,13 +195,14 @@ def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) 
 
 
 def _first(name: str, values: Any) -> Any:
-    """Return the only one of a list, or of the first axis."""
+    """Return the only element of a list or of the first axis; SceneError if there is not exactly one."""
     if len(values) != 1:
         raise SceneError(name, f"expected a batch of one scene, found {len(values)}", "pass one scene")
     return values[0]
 
 
 def _field(owner: str, value: Any, name: str) -> Any:
+    """Return a field of an object; SceneError if it is missing or None."""
     content = getattr(value, name, None)
     if content is None:
         remedy = "run the model with infer_gs=True" if name == "gaussians" else ""
@@ -204,13 +211,14 @@ def _field(owner: str, value: Any, name: str) -> Any:
 
 
 def _item(owner: str, values: Mapping[str, Array], name: str) -> Array:
+    """Return an entry of a mapping; SceneError if it is missing."""
     if name not in values:
         raise SceneError(owner, f"expected an entry {name!r}, found {', '.join(map(repr, values.keys()))}")
     return values[name]
 
 
 def _one(name: str, values: Array, num_axes: int) -> Array:
-    """Remove the axis of a batch of one."""
+    """Remove the axis of a batch of one scene; SceneError if the batch has another size."""
     if values.ndim == num_axes:
         return values
     if values.ndim != num_axes + 1 or values.shape[0] != 1:
@@ -219,7 +227,7 @@ def _one(name: str, values: Array, num_axes: int) -> Array:
 
 
 def _gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
-    """Take means, opacities and harmonics, which these models keep channel-major."""
+    """Return means, opacities and harmonics, which these models store channel-major."""
     harmonics = _one("harmonics", _field("gaussians", gaussians, "harmonics"), 3)
     rows = harmonics.swapaxes(1, 2)[:, : (sh_degree + 1) ** 2]
     opacities = _field("gaussians", gaussians, "opacities")
@@ -244,8 +252,8 @@ def _as_floats(photos: np.ndarray) -> np.ndarray:
 def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
     """Scale intrinsics to the size of the photos.
 
-    Depth Anything 3 leaves intrinsics at the original photo size after it has written COLMAP files. The principal point
-    is in the middle at either size.
+    After Depth Anything 3 has written COLMAP files, its intrinsics are those of the original photo size. The principal
+    point is in the middle at both sizes.
     """
     factors = np.array([photos.shape[-2], photos.shape[-3]]) / (2 * Ks[:, (0, 1), 2])
     scaled = np.abs(factors - 1).min() > _OTHER_SIZE
@@ -256,7 +264,7 @@ def _axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split covariances ``[n,3,3]`` into standard deviations ``[n,3]`` and rotations ``[n,4]`` wxyz."""
     finite = np.isfinite(covariances).all((1, 2))
     squares, axes = eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
-    axes[:, :, 0] = np.cross(axes[:, :, 1], axes[:, :, 2])  # a rotation, no mirror
+    axes[:, :, 0] = np.cross(axes[:, :, 1], axes[:, :, 2])  # a rotation, not a reflection
     scales = np.sqrt(np.maximum(squares, 0))
     scales[~finite] = np.nan
     return scales.astype(np.float32), rotmat_to_quat(axes).astype(np.float32)

@@ -127,7 +127,7 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     if totals.unmet:
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
     if totals.left_out:
-        left_out = f"{len(totals.left_out)} of {totals.total} scenes have cameras or photos beside them of other scenes"
+        left_out = f"{len(totals.left_out)} of {totals.total} scenes have cameras or photos that do not belong to them"
         left_out += _first_reason(totals.left_out, listed=not args.silent)
         worse = f"{worse}; {left_out}" if worse else left_out
     if worse and args.strict:

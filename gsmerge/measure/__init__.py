@@ -1,1 +1,1 @@
-"""Measuring: quality, size, speed, and pictures for people."""
+"""Measure quality, size and speed, and draw pictures for people."""

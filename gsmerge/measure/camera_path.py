@@ -1,4 +1,4 @@
-"""Paths through a scene for videos, and a camera outside: the cameras of its views -> other cameras, in float64."""
+"""Cameras of a scene -> cameras along a path for videos, or one outside camera; all in float64."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from gsmerge.types import Cameras
 
 PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline|turntable)(?:,back:(?P<back>[^,]*))?")
 MAX_TURN, MAX_BACK = 90.0, 10.0  # degrees to each side of an orbit; shares of the depth
-FINE = 64  # straight pieces of a curve from camera to camera by which its length is measured
-TURN = 6 * FINE  # the same for a whole orbit
-# How far an orbit goes to the sides, and up and down, shares of the distance of its middle: the least is what one photo
-# bears, the most turns the view by 14 degrees to each side.
-ACROSS, UPRIGHT = (0.06, 0.25), (0.03, 0.125)
-LEVEL = 0.01  # squared sine of the turn of cameras from which on their horizons say more than their mean up
-CLOSE = 0.1  # least radius of a turntable, a share of the depth
-SAME = 1e-9  # of a path's length: cameras that are no farther apart are one
+CURVE_PIECES = 64  # straight pieces between two cameras by which the length of a curve is measured
+ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
+# Least and largest extent of an orbit to the sides, and up and down, as shares of the distance of its centre. The least
+# still looks right with a single photo; the largest turns the view by 14 degrees to each side.
+HORIZONTAL, VERTICAL = (0.06, 0.25), (0.03, 0.125)
+LEVEL = 0.01  # squared sine of the turn of cameras; above it their horizons count more for "up" than their mean up
+CLOSE = 0.1  # least radius of a turntable, as a share of the depth
+SAME = 1e-9  # largest distance of cameras that count as one, as a share of a path's length
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class CameraPath:
 
     Args:
         kind: "orbit", "spline" or "turntable".
-        turn: Degrees by which an orbit turns to each side; None: it stays where cameras are.
-        back: Step back from the path, a share of the viewing depth.
+        turn: Degrees by which an orbit turns to each side; None: as far as the cameras of the scene.
+        back: Distance behind the path, as a share of the viewing depth.
     """
 
     kind: str
@@ -52,7 +52,7 @@ def parse_path(text: str) -> CameraPath | None:
     """Parse a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``; None for a file name.
 
     Raises:
-        ValueError: If the text begins as a path does and goes on otherwise, or a number is out of range.
+        ValueError: If the text begins with the kind of a path and is not one, or if a number is out of range.
     """
     kind = re.split("[:,]", text, maxsplit=1)[0]
     if kind not in ("orbit", "spline", "turntable"):
@@ -67,7 +67,7 @@ def parse_path(text: str) -> CameraPath | None:
 
 
 def _parse_number(text: str | None, expected: str, most: float) -> float | None:
-    """Read a number above 0 and up to ``most``; None where there is none."""
+    """Parse a number above 0 and at most ``most``; None for no text."""
     if text is None:
         return None
     try:
@@ -83,34 +83,34 @@ def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) ->
     """Make the ``count`` cameras of a path through or about the cameras of a scene.
 
     Args:
-        path: Its kind, and how far it leaves the cameras.
-        cameras: c >= 1 cameras of the scene, for a spline in the order in which it passes them.
-        depth: How far away what they show lies, see :func:`viewing_depth`.
-        count: Frames.
+        path: Kind of the path, and its distance from the cameras.
+        cameras: c >= 1 cameras of the scene; a spline passes them in this order.
+        depth: Distance of what the cameras show, see :func:`viewing_depth`.
+        count: Number of frames.
 
     Raises:
-        ValueError: If a spline has fewer than two different cameras, or there are fewer than two frames.
+        ValueError: If a spline has fewer than two different cameras, or if there are fewer than two frames.
     """
     if count < 2:
         raise ValueError(f"frames: expected at least 2, got {count}")
     if path.kind == "spline":
         return spline(step_back(cameras, depth, path.back), (1 + path.back) * depth, count)
-    made = turntable(cameras, depth, count) if path.kind == "turntable" else orbit(cameras, depth, count, path.turn)
-    return step_back(made, depth, path.back)
+    placed = turntable(cameras, depth, count) if path.kind == "turntable" else orbit(cameras, depth, count, path.turn)
+    return step_back(placed, depth, path.back)
 
 
 def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
-    """Move cameras backwards by ``back`` times ``depth``, which is in world units."""
+    """Move cameras backwards by ``back`` times ``depth`` (world units)."""
     if not back:
         return cameras
     return replace(cameras, viewmats=np.stack([step_outside(viewmat, depth, back) for viewmat in cameras.viewmats]))
 
 
 def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]:
-    """Place a camera outside the capture: turn the middle camera about points ``[n,3]`` and step back.
+    """Place a camera outside the capture: turn the middle camera about the points ``[n,3]`` and step back.
 
-    Returns one camera, one of those that :mod:`gsmerge.measure.fog` measures with, and its distance from the point
-    about which it turned, world units.
+    Returns one of the cameras of :mod:`gsmerge.measure.fog`, and its distance, in world units, from the point about
+    which it was turned.
     """
     back, turn = CAMERAS["turned"][-1]
     middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)
@@ -127,38 +127,38 @@ def median_camera(cameras: Cameras) -> int:
     """Return the index of the camera nearest to the median centre and the mean viewing direction."""
     centres = camera_centres(cameras.viewmats)
     forward = cameras.viewmats[:, 2, :3]
-    away = _lengths(centres - lower_median(centres))
-    turned = _lengths(forward - normalize(forward.mean(0)))
-    return int((away / (away.mean() or 1.0) + turned).argmin())
+    distances = _lengths(centres - lower_median(centres))
+    turns = _lengths(forward - normalize(forward.mean(0)))
+    return int((distances / (distances.mean() or 1.0) + turns).argmin())
 
 
 def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None) -> Cameras:
     """Turn the middle camera about the point ``depth`` in front of it, to the sides and up and down.
 
-    Frames are evenly spaced and form a loop; the picture's vertical stays that of the middle camera. ``turn``: degrees
-    to each side, half of it up and down. None: as far as the cameras stand from the middle one in the median, clipped
-    to the shares ``ACROSS`` and ``UPRIGHT`` of the depth.
+    Frames are evenly spaced and form a loop. The vertical of the picture is that of the middle camera. ``turn``:
+    degrees to each side; up and down it is half of it. None: the median offset of the cameras from the middle one,
+    clipped to the shares ``HORIZONTAL`` and ``VERTICAL`` of the depth.
     """
     middle = median_camera(cameras)
     viewmat = cameras.viewmats[middle].astype(np.float64)
     offsets = np.abs(matmul(camera_centres(cameras.viewmats) - camera_centres(viewmat), viewmat[:3, :3].T))
-    sines = (lower_median(offsets)[:2] / depth).clip(*np.transpose([ACROSS, UPRIGHT]))
+    sines = (lower_median(offsets)[:2] / depth).clip(*np.transpose([HORIZONTAL, VERTICAL]))
     turns = np.degrees(arctan2(sines, np.sqrt(1 - sines**2))) if turn is None else turn * np.array([1, 0.5])
 
-    def turned(angles: np.ndarray) -> np.ndarray:
+    def turn_middle(angles: np.ndarray) -> np.ndarray:
         vectors = turns * np.stack([sin(angles), cos(angles)], 1)
         return np.stack([step_outside(viewmat, depth, 0, *vector) for vector in vectors])
 
-    angles = np.linspace(0, 2 * np.pi, TURN + 1)
-    even = _at_equal_steps(camera_centres(turned(angles)), angles, np.arange(count) / count)
-    return replace(cameras[[middle] * count], viewmats=turned(even))
+    angles = np.linspace(0, 2 * np.pi, ORBIT_PIECES + 1)
+    even = _at_equal_steps(camera_centres(turn_middle(angles)), angles, np.arange(count) / count)
+    return replace(cameras[[middle] * count], viewmats=turn_middle(even))
 
 
 def turntable(cameras: Cameras, depth: float, count: int) -> Cameras:
-    """Turn once about the scene's middle, which stays in the middle of the picture, with a level horizon.
+    """Turn once about the centre of the scene, which stays in the middle of the picture, with a level horizon.
 
-    Height and distance are the medians of the cameras'; the first frame is on the side of the middle camera. Frames
-    are evenly spaced and form a loop.
+    Height and distance are the medians of those of the cameras. The first frame is on the side of the middle camera.
+    Frames are evenly spaced and form a loop.
     """
     middle, up, towards = _axis(cameras, depth)
     offsets = camera_centres(cameras.viewmats) - middle
@@ -166,14 +166,14 @@ def turntable(cameras: Cameras, depth: float, count: int) -> Cameras:
     radius = max(float(np.median(_lengths(offsets - heights[:, None] * up))), CLOSE * depth)
     angles = 2 * np.pi * np.arange(count)[:, None] / count
     eyes = radius * (cos(angles) * towards + sin(angles) * np.cross(up, towards)) + np.median(heights) * up
-    looks = normalize(-eyes)
-    right = normalize(np.cross(looks, up))
-    turned = np.stack([right, np.cross(looks, right), looks], 1)
-    return replace(cameras[[median_camera(cameras)] * count], viewmats=_viewmats(turned, middle + eyes))
+    forward = normalize(-eyes)
+    right = normalize(np.cross(forward, up))
+    rotations = np.stack([right, np.cross(forward, right), forward], 1)
+    return replace(cameras[[median_camera(cameras)] * count], viewmats=_viewmats(rotations, middle + eyes))
 
 
 def turned_degrees(cameras: Cameras, depth: float) -> float:
-    """Measure the degrees of a :func:`turntable` within which all cameras stand."""
+    """Measure the arc of a :func:`turntable`, in degrees, within which all cameras are."""
     middle, up, towards = _axis(cameras, depth)
     offsets = camera_centres(cameras.viewmats) - middle
     angles = np.sort(arctan2((offsets * np.cross(up, towards)).sum(1), (offsets * towards).sum(1)))
@@ -182,50 +182,52 @@ def turned_degrees(cameras: Cameras, depth: float) -> float:
 
 
 def _axis(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the axis of a turntable: a point ``[3]`` on it, the way up, and the level way back of the middle camera.
+    """Find the axis of a turntable: a point on it, its upward direction, and a level direction, ``[3]`` each.
 
-    The point is the median of those ``depth`` in front of the cameras. Up is the mean of the cameras' own, and at right
-    angles to what they hold level, if they turn.
+    The point is the median of the points ``depth`` in front of the cameras. Up is the mean of the cameras' upward
+    directions; if the cameras turn, it is made perpendicular to their horizons. The level direction points backwards
+    from the middle camera.
     """
     axes = cameras.viewmats[:, :3, :3].astype(np.float64)
     middle = lower_median(camera_centres(cameras.viewmats) + depth * axes[:, 2])
     own = axes[median_camera(cameras)]
     rights = axes[:, 0]
-    # A little of the middle camera's up, since those of all may cancel each other
+    # Add a little of the middle camera's up, since the directions of all may cancel each other
     mean = -axes[:, 1].mean(0) - SAME * own[1]
     up = normalize(solve(matmul(rights.T, rights) / len(axes) + LEVEL * np.eye(3), mean))
     back = (own[2] * up).sum() * up - own[2]
-    return middle, up, normalize(back if _lengths(back) > CLOSE else np.cross(own[0], up))  # it may look straight down
+    # The middle camera may look straight down
+    return middle, up, normalize(back if _lengths(back) > CLOSE else np.cross(own[0], up))
 
 
 def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
     """Pass through all cameras in their order on a smooth curve, from the first to the last.
 
-    Frames are evenly spaced, a turn counting as far as it moves a point ``depth`` away. The curve is a centripetal
-    Catmull-Rom spline (Barry and Goldman 1988) of positions and quaternions; intrinsics change linearly. ValueError if
-    there are no two different cameras.
+    Frames are evenly spaced; a rotation counts as the distance by which it moves a point ``depth`` away. The curve is a
+    centripetal Catmull-Rom spline (Barry and Goldman 1988) of positions and quaternions; intrinsics change linearly.
+    ValueError if there are fewer than two different cameras.
     """
-    rows, kept = _pose_rows(cameras, depth)
-    origin, rows, Ks = rows[0, :3].copy(), rows[kept], cameras.Ks[kept].astype(np.float64)
+    rows, distinct = _pose_rows(cameras, depth)
+    origin, rows, Ks = rows[0, :3].copy(), rows[distinct], cameras.Ks[distinct].astype(np.float64)
     if len(rows) < 2:
-        raise ValueError("spline: expected at least 2 different cameras, got 1; an orbit needs one")
+        raise ValueError("spline: expected at least 2 different cameras, got 1; use an orbit, which needs one")
     rows[:, :3] -= origin
     knots = np.concatenate([np.zeros(1), np.sqrt(_lengths(np.diff(rows, axis=0))).cumsum()])
-    fine = np.interp(np.arange(FINE * (len(rows) - 1) + 1) / FINE, np.arange(len(rows)), knots)
+    fine = np.interp(np.arange(CURVE_PIECES * (len(rows) - 1) + 1) / CURVE_PIECES, np.arange(len(rows)), knots)
     times = _at_equal_steps(_curve(rows, knots, fine, depth), fine, np.arange(count) / (count - 1))
     poses = _curve(rows, knots, times, depth)
-    turned = quat_to_rotmat(poses[:, 3:]).swapaxes(1, 2)
+    rotations = quat_to_rotmat(poses[:, 3:]).swapaxes(1, 2)
     pieces, shares = _pieces(knots, times)
     shares = shares[:, None, None]
     between = (1 - shares) * Ks[pieces] + shares * Ks[pieces + 1]
-    return replace(cameras, viewmats=_viewmats(turned, origin + poses[:, :3]), Ks=between)
+    return replace(cameras, viewmats=_viewmats(rotations, origin + poses[:, :3]), Ks=between)
 
 
 def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses as rows ``[c,7]`` whose distances measure differences of poses, without repeated poses.
+    """Return poses as rows ``[c,7]`` whose distances measure pose differences, and a mask ``[c]`` of distinct poses.
 
-    A row has the camera's position, and its quaternion times twice the depth. Quaternion signs follow the row before. A
-    small rotation changes the row by the angle times the depth.
+    A row has the camera's position, and its quaternion times twice the depth. The sign of a quaternion follows the row
+    before. A small rotation changes a row by the angle times the depth.
     """
     quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].astype(np.float64).swapaxes(1, 2))
     opposite = (quats[1:] * quats[:-1]).sum(1) < 0
@@ -263,11 +265,12 @@ def _at_equal_steps(points: np.ndarray, times: np.ndarray, shares: np.ndarray) -
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
+    """Return the lengths of vectors along the last axis."""
     return np.sqrt((vectors * vectors).sum(-1))
 
 
 def _viewmats(rotations: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Make world-to-camera matrices ``[n,4,4]`` of rotations to camera axes and centres in the world."""
+    """Make world-to-camera matrices ``[n,4,4]`` from rotations to camera axes and centres in the world."""
     out = np.tile(np.eye(4), (len(centres), 1, 1))
     out[:, :3, :3] = rotations
     out[:, :3, 3] = -(rotations * centres[:, None]).sum(-1)

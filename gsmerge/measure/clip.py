@@ -1,4 +1,4 @@
-"""Clips: scenes from the same cameras under a line that moves, with captions, as a video or a GIF."""
+"""Write clips as a video or a GIF: scenes from the same cameras, separated by moving lines, with captions."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from gsmerge.measure.preview import FACE, Picture, shorten_text
 from gsmerge.settings.pictures import GIF
 from gsmerge.types import StrPath
 
-# Encoders by the ending of a name, the first that OpenCV has is used, with their names. Browsers play all but the last
-# of .mp4. VP8 takes a third of the time of VP9 and 1.6 times the space.
+# Code and name of the encoders for each ending; the first that OpenCV has is used. Browsers play all but MPEG-4. VP8
+# takes a third of the time of VP9 and 1.6 times the space.
 ENCODERS = {".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")), ".webm": (("VP80", "VP8"), ("VP90", "VP9"))}
-# How the program ffmpeg encodes frames with so many channels, and the encoder that it needs: nearly every program plays
-# H.264, and browsers and editors read the alpha of VP9
+# Name, encoder, container and options of the program ffmpeg by the number of channels. Nearly every program plays
+# H.264; browsers and editors read the alpha of VP9
 BY_FFMPEG = {
     3: ("H.264", "libx264", "mp4", (
         "-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709",  # as players expect of large frames
@@ -38,15 +38,15 @@ BY_FFMPEG = {
         "-crf", "24", "-b:v", "0", "-pix_fmt", "yuva420p", "-deadline", "realtime", "-cpu-used", "6",
     )),
 }  # fmt: skip
-MAX_VIDEO_PIXELS = 1 << 23  # of a frame, a little more than 3840 x 2160: encoders take 150 bytes for each
-MAX_GIF_PIXELS = 1 << 27  # of all frames: 400 MB of memory, and files that nobody sends
-GIF_SAMPLE = 1 << 20  # pixels that the palette of a GIF is made of
+MAX_VIDEO_PIXELS = 1 << 23  # per frame, a little more than 3840 x 2160; encoders take 150 bytes per pixel
+MAX_GIF_PIXELS = 1 << 27  # of all frames together; more take over 400 MB of memory, and files too large to send
+GIF_SAMPLE = 1 << 20  # pixels from which the palette of a GIF is made
 OPENCV = "opencv-contrib-python-headless"
 FOLDER = "name a folder instead, for one picture a frame"
-SWIPE_SECONDS = 6  # in which the line goes to both sides and back
-SWAY = 0.9  # of the way to the neighbouring lines, or the border
-BLUE_FIRST = [2, 1, 0, 3]
-LINE = 480  # by which the width of a frame is divided for that of the line
+SWIPE_SECONDS = 6  # time in which a line moves to both sides and back
+SWIPE_SHARE = 0.9  # of the distance to the next line or the border, how far a line moves
+BLUE_FIRST = [2, 1, 0, 3]  # order of channels for OpenCV and ffmpeg
+LINES_PER_WIDTH = 480  # width of a frame divided by the width of a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,58 +55,58 @@ class Caption:
 
     left: int
     top: int
-    text: np.ndarray  # [h,w,1] how much of a pixel is text, 0 to 1
+    text: np.ndarray  # [h,w,1] share of each pixel that is text, 0 to 1
 
     def draw(self, picture: Picture) -> None:
         """Draw the caption into a picture."""
         height, width = self.text.shape[:2]
         box = picture[self.top : self.top + height, self.left : self.left + width]
-        text = self.text[: box.shape[0], : box.shape[1]]  # of a tiny frame
+        text = self.text[: box.shape[0], : box.shape[1]]  # a tiny frame cuts it off
         box[:] = (0.35 * box * (1 - text) + 245 * text).round()
 
 
 def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int) -> list[Caption]:
     """Place the captions of scenes side by side at the bottom of a frame, from left to right.
 
-    ``texts``: of each scene name, count and size, the latter two in one line where there is room.
+    ``texts``: name, count and size of each scene; count and size share a line if there is room.
     """
     scale, thickness = max(0.45, height / 900), max(1, round(height / 600))
     line = round(32 * scale)
     margin, most = line // 2, width // len(texts) - 2 * line
 
-    def wide(text: str) -> int:
+    def text_width(text: str) -> int:
         return int(cv2.getTextSize(text, FACE, scale, thickness)[0][0])
 
     rows: list[tuple[str, ...]] = [(name, f"{count}, {size}") for name, count, size in texts]
-    rows = rows if max(wide(row[1]) for row in rows) <= most else list(texts)
-    scale *= min(1.0, max(0.6, 0.95 * most / max(wide(row[1]) for row in rows)))
-    made = []
+    rows = rows if max(text_width(row[1]) for row in rows) <= most else list(texts)
+    scale *= min(1.0, max(0.6, 0.95 * most / max(text_width(row[1]) for row in rows)))
+    captions = []
     for i, row in enumerate(rows):
         lines = [shorten_text(text, most, scale, thickness) for text in row]
-        box = np.zeros((line * len(lines) + margin, max(map(wide, lines)) + 2 * margin), np.uint8)
+        box = np.zeros((line * len(lines) + margin, max(map(text_width, lines)) + 2 * margin), np.uint8)
         for number, text in enumerate(lines, 1):
             cv2.putText(box, text, (margin, number * line - margin // 4), FACE, scale, 255, thickness, cv2.LINE_AA)
         left = margin + (width - box.shape[1] - 2 * margin) * i // max(len(rows) - 1, 1)
-        made.append(Caption(max(left, 0), max(height - margin - len(box), 0), box[..., None] / np.float32(255)))
-    return made
+        captions.append(Caption(max(left, 0), max(height - margin - len(box), 0), box[..., None] / np.float32(255)))
+    return captions
 
 
 def swipe_places(count: int, frames: int, fps: float, width: int) -> list[list[int]]:
-    """Place the columns ``[frames,count+1]`` between which each of ``count`` scenes shows, 0 and ``width`` among them.
+    """Place the borders of ``count`` scenes in each frame: ``[frames,count+1]`` columns from 0 to ``width``.
 
-    They begin evenly spread, and move together to the right, to the left, and back.
+    The inner borders begin evenly spread, and move together to the right, to the left, and back.
     """
     rounds = max(1, round(frames / fps / SWIPE_SECONDS))
-    sways = SWAY * sin(2 * np.pi * rounds * np.arange(frames) / frames)
-    places = (np.arange(count + 1) + sways[:, None]) * width / count
+    shifts = SWIPE_SHARE * sin(2 * np.pi * rounds * np.arange(frames) / frames)
+    places = (np.arange(count + 1) + shifts[:, None]) * width / count
     places[:, 0], places[:, -1] = 0, width
     return [list(map(int, row)) for row in places.round()]
 
 
 def draw_swipe(pictures: Sequence[Picture], places: Sequence[int], captions: Sequence[Caption]) -> Picture:
-    """Join the columns of scenes from the same camera in one frame, each with its caption, with lines between."""
+    """Join columns of pictures from the same camera to one frame, each with its caption, and draw lines between."""
     frame = np.empty_like(pictures[0])
-    half = max(1, frame.shape[1] // (2 * LINE))
+    half = max(1, frame.shape[1] // (2 * LINES_PER_WIDTH))
     for picture, caption, left, right in zip(pictures, captions, places[:-1], places[1:], strict=True):
         caption.draw(picture)
         frame[:, left:right] = picture[:, left:right]
@@ -117,7 +117,7 @@ def draw_swipe(pictures: Sequence[Picture], places: Sequence[int], captions: Seq
 
 
 class FfmpegWriter:
-    """Write frames of three or four channels with the program ffmpeg, by the calls of :class:`cv2.VideoWriter`."""
+    """Write frames of three or four channels with the program ffmpeg; has the methods of :class:`cv2.VideoWriter`."""
 
     def __init__(self, program: str, path: Path, shape: tuple[int, ...], fps: float) -> None:
         height, width, channels = shape
@@ -130,7 +130,7 @@ class FfmpegWriter:
     def write(self, frame: np.ndarray) -> None:
         """Add a frame ``[h,w,c]`` in the order blue, green, red, alpha."""
         assert self.process.stdin is not None
-        with suppress(BrokenPipeError):  # it has ended: the frames that are missing are counted later
+        with suppress(BrokenPipeError):  # ffmpeg has ended; missing frames are noticed later
             self.process.stdin.write(np.ascontiguousarray(frame).tobytes())
 
     def release(self) -> None:
@@ -140,7 +140,7 @@ class FfmpegWriter:
 
 
 def find_ffmpeg(encoder: str) -> str | None:
-    """Find a program ffmpeg that has an encoder on the PATH; None if there is none."""
+    """Find a program ffmpeg on the PATH that has an encoder; None if there is none."""
     program = shutil.which("ffmpeg")
     with suppress(OSError):
         if program is not None:
@@ -150,21 +150,22 @@ def find_ffmpeg(encoder: str) -> str | None:
 
 
 def stored_size(path: StrPath, width: int, height: int) -> tuple[int, int]:
-    """Return the size that frames have in a clip: colours of videos are kept for pairs of pixels, so sides are even."""
-    odd = 0 if Path(path).suffix.lower() == GIF else 1
-    return width + width % 2 * odd, height + height % 2 * odd
+    """Return the size of frames in a clip. Sides of videos are even, since they store colours for pairs of pixels."""
+    if Path(path).suffix.lower() == GIF:
+        return width, height
+    return width + width % 2, height + height % 2
 
 
 def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrite: bool = False) -> str:
-    """Write pictures ``[h,w,3]`` of one size as a video or a GIF, and return the name of its encoding.
+    """Write pictures ``[h,w,3]`` or ``[h,w]`` of one size as a video or a GIF; return the name of its encoding.
 
-    Grey pictures ``[h,w]`` are taken, too. A ``.mp4`` is H.264 if :func:`find_ffmpeg` finds a program for it; otherwise
-    the first encoding that OpenCV has is used. A ``.webm`` of pictures with alpha ``[h,w,4]`` needs that program. All
-    frames of a GIF share a palette, and are in memory together.
+    A ``.mp4`` has the encoding H.264 if :func:`find_ffmpeg` finds a program for it, otherwise the first encoding that
+    OpenCV has. A ``.webm`` of pictures with alpha ``[h,w,4]`` needs that program. All frames of a GIF share a palette,
+    and are in memory together.
 
-    Of a video one frame is in memory at a time, and of :func:`stored_size`: odd sides get one more row or column, a
-    copy of the last. SceneError if there is no encoder for the ending of the name, or the file cannot be
-    written completely.
+    Of a video, one frame is in memory at a time. Its frames have the :func:`stored_size`: an odd side gets one more row
+    or column, a copy of the last one. SceneError if there is no encoder for the ending of the name, or if the file
+    cannot be written completely.
     """
     path = Path(path)
     with atomic_output(path, overwrite=overwrite) as temporary:
@@ -180,7 +181,7 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
             writer.write(frame[..., BLUE_FIRST[: frame.shape[2]]])
 
         try:
-            with ThreadPoolExecutor(1) as encoder:  # which takes one thread, while the next frame is drawn
+            with ThreadPoolExecutor(1) as encoder:  # encode on one thread, while the next frame is drawn
                 for frame in chain([first], even):
                     if written:
                         written[-1].result()
@@ -193,21 +194,23 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
 
 
 def _write_gif(path: Path, frames: Sequence[Picture], fps: float) -> None:
-    """Write a GIF that plays again and again, with the colours of a sample of all frames."""
+    """Write a GIF that repeats forever, with a palette from a sample of all frames."""
     step = 1 + len(frames) * frames[0].shape[0] * frames[0].shape[1] // GIF_SAMPLE
     sample = np.concatenate([frame.reshape(-1, 3)[i % step :: step] for i, frame in enumerate(frames)])
     palette = Image.fromarray(sample[None]).quantize(256, Image.Quantize.FASTOCTREE)
-    # Without dithering, which flickers, costs 1.6 dB and a quarter more bytes
-    plain = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
-    first, *others = plain
+    # No dithering, which flickers, costs 1.6 dB and takes a quarter more bytes
+    paletted = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    first, *others = paletted
     first.save(path, "GIF", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
 
 
 def _to_channels(picture: Picture) -> Picture:
+    """Return a picture with three or four channels; a grey one is repeated."""
     return picture if picture.ndim == 3 else picture[..., None].repeat(3, 2)
 
 
 def _to_even(picture: Picture) -> Picture:
+    """Repeat the last row and column of a picture with odd sides."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
@@ -219,7 +222,7 @@ def _open_writer(path: Path, temporary: Path, first: Picture, fps: float) -> tup
     if path.suffix.lower() == f".{container}" and (program := find_ffmpeg(encoder)):
         return FfmpegWriter(program, temporary, first.shape, fps), name
     if channels > 3:
-        problem = f"pictures with alpha need the program ffmpeg with {encoder} on the PATH, and none was found"
+        problem = f"pictures with alpha need the program ffmpeg with {encoder} on the PATH, which was not found"
         raise SceneError(path, problem, FOLDER)
     encoders = ENCODERS[path.suffix.lower()]
     for code, name in encoders:
@@ -228,15 +231,15 @@ def _open_writer(path: Path, temporary: Path, first: Picture, fps: float) -> tup
             writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
         if writer.isOpened():
             return writer, name
-    os.stat(str(temporary))  # fails, and says why, where the folder has vanished meanwhile
+    os.stat(str(temporary))  # if the folder has vanished, this raises an error with the reason
     names = " and ".join(name for _, name in encoders)
     raise SceneError(
-        path, f"this OpenCV cannot write it: it has none of the encoders {names}", f"{FOLDER}, or install {OPENCV}"
+        path, f"this OpenCV has none of the encoders {names}, so it cannot write it", f"{FOLDER}, or install {OPENCV}"
     )
 
 
 def _check_frames(path: Path, temporary: Path, count: int) -> None:
-    """Raise a SceneError if frames of a video are missing, since encoders do not report a full disk."""
+    """Raise SceneError if frames of a video are missing, since encoders do not report a full disk."""
     with _silent_stderr():
         reader = cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG)
         readable = 0
@@ -245,16 +248,16 @@ def _check_frames(path: Path, temporary: Path, count: int) -> None:
         reader.release()
     if readable != count:
         os.stat(str(temporary))  # as in _open_writer
-        problem = f"could not be written whole: {readable} of {count} frames can be read"
+        problem = f"could not be written completely, {readable} of {count} frames can be read"
         raise SceneError(path, problem, "free some space, or write elsewhere")
 
 
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Suppress what OpenCV and FFmpeg print about encoders, at the level of the process."""
+    """Suppress messages of OpenCV and FFmpeg about encoders, by redirecting the descriptor of stderr."""
     try:
-        kept = os.dup(2)
-    except OSError:  # closed: there is nothing to keep away
+        stderr = os.dup(2)
+    except OSError:  # stderr is closed, so nothing is printed
         yield
         return
     sink = os.open(os.devnull, os.O_WRONLY)
@@ -264,6 +267,6 @@ def _silent_stderr() -> Iterator[None]:
         os.dup2(sink, 2)
         yield
     finally:
-        os.dup2(kept, 2)
+        os.dup2(stderr, 2)
         os.close(sink)
-        os.close(kept)
+        os.close(stderr)

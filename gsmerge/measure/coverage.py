@@ -1,4 +1,4 @@
-"""Where a scene's Gaussians lie, how large they are, and how much of the views they cover."""
+"""Measure where a scene's Gaussians lie, how large they are, and how much of the views they cover."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.types import Gaussians, Scene
 
-HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
+HUGE_SCALE_SHARE = 0.1  # of the box's diagonal; larger scales show no detail
 
 
 def extents(gaussians: Gaussians) -> dict[str, Any]:
-    """Measure where finite Gaussians lie and how large they are, world units, on a sample if there are many.
+    """Measure positions and sizes of finite Gaussians, in world units; on a sample if there are many.
 
     Returns:
-        ``box_low`` and ``box_high``: 1 % and 99 % of the positions per axis; ``diagonal`` of that box;
-        ``share_outliers`` beyond ten times the box about its middle; ``share_floaters``: isolated, or beyond that;
-        ``scale_median`` of each Gaussian's largest scale; ``scale_max`` of all; ``share_huge``: scales above a tenth
-        of the diagonal. Zeros where there are no Gaussians.
+        ``box_low`` and ``box_high``: percentiles 1 and 99 of the positions per axis; ``diagonal`` of that box;
+        ``share_outliers``: beyond ten times the box about its centre; ``share_floaters``: isolated, or beyond that;
+        ``scale_median`` of each Gaussian's largest scale; ``scale_max``: the largest scale of all; ``share_huge``:
+        scales above a tenth of the diagonal. All are 0 if there are no Gaussians.
     """
     names = ("diagonal", "share_outliers", "share_floaters", "scale_median", "scale_max", "share_huge")
     if len(gaussians) == 0:
@@ -39,10 +39,10 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def coverage(scene: Scene) -> list[dict[str, Any]]:
-    """Measure, for each view, the share of its pixels with a visible Gaussian. Layers count as views.
+    """Measure how much of each view the Gaussians cover. Layers count as views.
 
-    For each view: its ``name``, ``share_of_pixels`` that have a visible one of their own (None where views have none),
-    and ``share_of_gaussians`` whose centre is inside the picture.
+    Returns for each view its ``name``, ``share_of_pixels``: the share of pixels with a visible Gaussian of their own
+    (None if views have no own Gaussians), and ``share_of_gaussians``: the share whose centre is inside the picture.
     """
     if len(scene) == 0:
         return []
@@ -58,7 +58,7 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
 
 
 def shares_inside(scene: Scene, most: int) -> list[float]:
-    """Measure the share of the Gaussians, of at most so many, whose centres lie in each view."""
+    """Measure the share of Gaussians whose centres lie in each view, on a sample of at most ``most``."""
     rows = np.arange(0, scene.num_gaussians, max(1, -(-scene.num_gaussians // most)))
     points = scene.file_gaussians.means[rows].astype(np.float64)
     return [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]

@@ -1,4 +1,4 @@
-"""Drawings of scenes: a panel beside photos, a picture for each camera, and clips along a path."""
+"""Draw scenes: a panel beside photos, a picture for each camera, or a clip along a path."""
 
 from __future__ import annotations
 
@@ -49,51 +49,50 @@ from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
 
 PANEL_VIEWS = 4  # rows of a panel
-SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # of a path, at least
-VIEW_FRAMES = 4  # for each view of a spline, at least
+SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # least duration of a path
+VIEW_FRAMES = 4  # least number of frames for each view of a spline
 FPS, GIF_FPS = 30.0, 12.5  # frames per second
-GIF_SIDE = 640  # pixels at most of a GIF of which no size is asked for
-PLACED_SIZE = 1280, 720  # pixels of pictures where there are no cameras whose size they could have
-OPAQUE = 0.5  # alpha from which a pixel has a depth
-HALF_TURN = 180  # degrees about the middle: of less, a turntable also shows the side that no photo shows
-
+GIF_SIDE = 640  # largest side of a GIF, pixels, unless a size is given
+PLACED_SIZE = 1280, 720  # width and height of pictures from placed cameras, pixels
+OPAQUE = 0.5  # least alpha of a pixel that has a depth
+HALF_TURN = 180  # degrees; if the cameras span less, a turntable also shows a side that no photo shows
 
 Channel = Literal["color", "alpha", "depth"]
-FULL = {"alpha": 255, "depth": 65535}  # what stands for 1, and for the farthest depth
+FULL = {"alpha": 255, "depth": 65535}  # pixel values of alpha 1 and of the farthest depth
 
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """Options of a drawing: the scenes, how to read them, the kind of pictures, and where they go."""
+    """Options of a drawing: scenes, hints for reading, kind of pictures, and output."""
 
     files: SceneFiles  # Of the first scene
-    paths: Sequence[Path]  # Of all scenes, as they are called
-    like: SceneFiles  # Of the scene whose frame the cameras are moved into
+    paths: Sequence[Path]  # Of all scenes, as the user named them
+    framing: SceneFiles  # Of the scene into whose frame the cameras are moved
     output: Path  # A picture, a video, or a folder for pictures
     opacity: OpacityChoice = "auto"
     hints: ReadHints = AUTO
-    views: int | str | None = None  # Views at most, or the name of the only one; None: all, of a panel four
+    views: int | str | None = None  # Largest number of views, or the name of a single one; None: all, in a panel four
     path: str | None = None  # See :func:`gsmerge.measure.camera_path.parse_path`, or a file of cameras
-    frames: int | None = None  # Along the path; None: those of SECONDS, of a spline at least 4 for each view
+    frames: int | None = None  # Along the path; None: by SECONDS, for a spline at least VIEW_FRAMES for each view
     size: tuple[int, int] | None = None  # Width and height of a picture; None: those of the cameras
-    overlay: str | None = None  # "support": colours by how many views show a Gaussian
-    background: float | Literal["none"] = 0.0  # Grey level; none: nothing, so that pictures have alpha
-    channel: Channel = "color"  # What pictures show
+    overlay: str | None = None  # "support": colour Gaussians by the number of views that show them
+    background: float | Literal["none"] = 0.0  # Grey level; "none": pictures have alpha
+    channel: Channel = "color"  # Content of the pictures
 
     @property
     def grey(self) -> float:
-        """Return the grey level behind pictures that have no alpha."""
+        """Grey level behind pictures without alpha."""
         return 0.0 if isinstance(self.background, str) else self.background
 
     def choose(self, names: Sequence[str], most: int | None = None) -> list[int]:
-        """Choose ids of views: by the option ``views``, or else ``most``; None: all."""
+        """Choose the ids of views by the option ``views``, by default at most ``most`` views; None: all."""
         if isinstance(self.views, str):
             return [find_view(self.views, names)]
         return pick_views(len(names), self.views or most or len(names))
 
     @property
     def legend(self) -> str:
-        """Words for the colours of an overlay, behind a name."""
+        """Words for the colours of an overlay, to follow a name."""
         return "" if self.overlay is None else " (yellow: one view shows it, red: none)"
 
     @property
@@ -102,7 +101,7 @@ class DrawOptions:
         return GIF_FPS if self.output.suffix.lower() == GIF else FPS
 
     def resize(self, cameras: Cameras) -> Cameras:
-        """Give cameras the size of the pictures: they show what fills it."""
+        """Give cameras the size of the pictures, which they fill."""
         if self.size is not None:
             return fill_cameras(cameras, *self.size)
         return shrink_cameras(cameras, GIF_SIDE) if self.output.suffix.lower() == GIF else cameras
@@ -110,11 +109,11 @@ class DrawOptions:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A drawing before it is made: paths, facts, and a function that yields the pictures one by one."""
+    """A prepared drawing: paths, facts, and a function that yields the pictures one by one."""
 
-    paths: list[Path]  # Of the pictures, or that of the video
-    facts: dict[str, Any]  # About them, for the report
-    draw: Callable[[int], Iterator[Picture]]  # Draws with so many threads, as many views being in memory
+    paths: list[Path]  # Of the pictures, or of the video
+    facts: dict[str, Any]  # For the report
+    draw: Callable[[int], Iterator[Picture]]  # Takes the number of threads, which is that of views in memory too
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +123,7 @@ class DrawnScenes:
     scenes: list[tuple[Path, Gaussians]]
     sizes: list[int]  # Bytes of their files
     notes: list[str]
-    load: Loaded  # The scene whose frame it is
+    load: Loaded  # The scene whose frame they share
 
     def counts(self) -> dict[str, int]:
         """Return the number of Gaussians of every scene by its path."""
@@ -138,21 +137,22 @@ class DrawnScenes:
         near: float = 0.01,
         places: Sequence[Sequence[int]] | None = None,
     ) -> Iterator[tuple[Picture, ...]]:
-        """Yield the 8-bit pictures of all scenes for each camera; memory holds one view per thread.
+        """Yield the 8-bit pictures of all scenes for each camera, with one view per thread in memory.
 
-        Of each camera's pictures at least the columns between ``places``, one more than there are scenes, are drawn.
+        ``places`` are the borders between scenes in each picture, one more than there are scenes. Of each scene at
+        least the columns between its borders are drawn.
         """
         if options.background == NONE or options.channel != "color":
             ((_, gaussians),) = self.scenes
             return ((picture,) for picture in _draw_layers(gaussians, cameras, options, near))
-        how: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
+        settings: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
         drawn = (
             render_in_turn(
                 gaussians,
                 cameras,
                 options.grey,
                 columns=None if places is None else [(row[i], row[i + 1]) for row in places],
-                **how,
+                **settings,
             )
             for i, (_, gaussians) in enumerate(self.scenes)
         )
@@ -160,7 +160,7 @@ class DrawnScenes:
 
 
 def _draw_layers(gaussians: Gaussians, cameras: Cameras, options: DrawOptions, near: float) -> Iterator[Picture]:
-    """Yield the colours of each camera with alpha ``[h,w,4]``, its alpha, or its depth ``[h,w]``."""
+    """Yield for each camera its colours with alpha ``[h,w,4]``, its alpha ``[h,w]``, or its depth ``[h,w]``."""
     for view in range(len(cameras)):
         drawn = render(gaussians, cameras[[view]], near=near, with_depths=options.channel == "depth")
         alphas = drawn.alphas[0].clip(0, 1)
@@ -176,22 +176,22 @@ def _draw_layers(gaussians: Gaussians, cameras: Cameras, options: DrawOptions, n
 
 
 def farthest_depth(gaussians: Gaussians, cameras: Cameras) -> float:
-    """Return the depth, world units, beyond which no visible Gaussian lies from any camera."""
+    """Return the largest depth of a visible Gaussian from any camera, in world units."""
     means = gaussians.means[gaussians.opacities > 0].astype(np.float64)
     return max(float(camera_depths(means, viewmat[None]).max()) for viewmat in cameras.viewmats)
 
 
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
-    """Find the files of the scene that gives the cameras' frame: what a scene was compacted from, or itself."""
+    """Find the files of the scene that gives the cameras' frame: the source of a compacted scene, or itself."""
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
     if match is None or not (source := files.ply.with_name(f"{match[1]}.ply")).is_file():
         return files
-    like = find_scene_files(source, cameras=cameras, images=images)
-    return like if like.cameras is not None else replace(like, cameras=files.cameras)
+    framing = find_scene_files(source, cameras=cameras, images=images)
+    return framing if framing.cameras is not None else replace(framing, cameras=files.cameras)
 
 
 def prepare_panel(options: DrawOptions) -> Drawing:
-    """Prepare one picture of photo, before, after, ... with a row for each of some views and one from outside."""
+    """Prepare one picture with the columns photo, before, after, ... and a row for each view and the outside view."""
     group = _read(options, photos=True)
     used = list(group.load.views.used)
     cameras, photos = options.resize(group.load.views.cameras[used]), group.load.views.images
@@ -205,7 +205,8 @@ def prepare_panel(options: DrawOptions) -> Drawing:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         plain = options.overlay is None
         rows = view_pictures(parts, cameras[ids], shown, ids, scored=plain, background=options.grey)
-        around = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]  # not from inside
+        # Of placed views, the second half is inside the scene
+        around = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
         outside = outside_pictures(parts, around, photos=shown is not None, background=options.grey)
         yield contact_sheet([*rows, outside])
 
@@ -214,7 +215,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
 
 
 def prepare_pictures(options: DrawOptions) -> Drawing:
-    """Prepare a picture for each camera, of several scenes side by side; the only one where no folder is named."""
+    """Prepare a picture for each camera, with several scenes side by side; without a folder, for a single camera."""
     group = _read(options, photos=False)
     is_folder = options.output.suffix.lower() not in PICTURES
     ids = options.choose(group.load.views.names) if is_folder or options.views else [0]
@@ -231,20 +232,20 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
 
 
 def _depth_unit(group: DrawnScenes, cameras: Cameras, options: DrawOptions) -> dict[str, float]:
-    """Return the world units of one step of depth pictures, for the report."""
+    """Return the size of one step of depth pictures in world units, for the report."""
     if options.channel != "depth":
         return {}
     return {"depth_unit": farthest_depth(group.scenes[0][1], cameras) / FULL["depth"]}
 
 
 def prepare_clip(options: DrawOptions) -> Drawing:
-    """Prepare a clip, or its frames as pictures, of the scenes along a path, with lines that move between them."""
+    """Prepare a clip of the scenes along a path, with moving lines between them; in a folder, its frames."""
     group, cameras, near, ids = _path_cameras(options)
     cameras = options.resize(cameras)
     paths = [path.absolute() for path, _ in group.scenes]
-    same = len({path.name for path in paths}) < len(paths)
+    repeats_names = len({path.name for path in paths}) < len(paths)
     texts = [
-        ("/".join(path.parts[-2:]) if same else path.name, f"{len(gaussians):,} Gaussians", human_bytes(size))
+        ("/".join(path.parts[-2:]) if repeats_names else path.name, f"{len(gaussians):,} Gaussians", human_bytes(size))
         for path, (_, gaussians), size in zip(paths, group.scenes, group.sizes, strict=True)
     ]
 
@@ -266,8 +267,8 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     width, height = stored_size(options.output, cameras.width, cameras.height)
     if (width, height) != (cameras.width, cameras.height):
         group.notes.append(
-            f"frames of {cameras.width} x {cameras.height} are written as {width} x {height}, the last row or column"
-            " twice: a video has even sides"
+            f"frames of {cameras.width} x {cameras.height} are written as {width} x {height}, with the last row or"
+            " column repeated, since a video has even sides"
         )
     return Drawing([options.output], facts | {"width": width, "height": height, "fps": options.fps}, draw)
 
@@ -275,23 +276,23 @@ def prepare_clip(options: DrawOptions) -> Drawing:
 def _check_frames(output: Path, width: int, height: int, count: int) -> None:
     """Raise SceneError if the frames of a clip would take too much memory to encode."""
     if width * height > MAX_VIDEO_PIXELS:
-        problem = f"expected at most {MAX_VIDEO_PIXELS:,} pixels a frame of a video, found {width} x {height}"
+        problem = f"expected at most {MAX_VIDEO_PIXELS:,} pixels per frame of a video, found {width} x {height}"
         raise SceneError(output, problem, FOLDER)
     if output.suffix.lower() == GIF and count * width * height > MAX_GIF_PIXELS:
-        problem = f"expected at most {MAX_GIF_PIXELS:,} pixels in all of a GIF, found {count} x {width} x {height}"
+        problem = f"expected at most {MAX_GIF_PIXELS:,} pixels in a GIF, found {count} x {width} x {height}"
         raise SceneError(output, problem, "lower --size or --frames, or name a .mp4")
 
 
 def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
-    """Read scenes and place the cameras of a path in them; return both, the near plane, and the views of the path."""
+    """Read scenes and make the cameras of a path; return both, the near plane, and the ids of the path's views."""
     assert options.path is not None
     path = parse_path(options.path)
-    file, separate = None if path else Path(options.path), True
-    if file is not None and _lacks_cameras(options.like):
-        options, separate = replace(options, like=replace(options.like, cameras=file)), False
+    file, is_separate = None if path else Path(options.path), True
+    if file is not None and _lacks_cameras(options.framing):
+        options, is_separate = replace(options, framing=replace(options.framing, cameras=file)), False
     group = _read(options, photos=False)
     placed = group.load.views.cameras
-    cameras = placed if file is None or not separate else _place_file(file, group.load)
+    cameras = placed if file is None or not is_separate else _place_file(file, group.load)
     assert not isinstance(options.views, str)
     ids = pick_views(len(cameras), options.views or len(cameras))
     cameras = cameras[ids]
@@ -299,8 +300,8 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
     if path is not None:
         if path.kind == "turntable" and (turn := turned_degrees(cameras, depth)) < HALF_TURN:
             group.notes.append(
-                f"the photos stand within {turn:.0f} degrees about the scene's middle, and a turntable also shows it"
-                " from where none is; --path orbit stays among them"
+                f"the photos span {turn:.0f} degrees about the scene's centre, and a turntable also shows sides without"
+                " photos; --path orbit stays near the photos"
             )
         least = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
         try:
@@ -312,7 +313,7 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
 
 
 def _place_file(file: Path, load: Loaded) -> Cameras:
-    """Read the cameras of a path into the frame of a scene; cameras without a size get that of the scene."""
+    """Read the cameras of a path into the frame of a scene; cameras without a size get that of the scene's views."""
     cameras = load.views.cameras
     stored = read_cameras(file) if load.cameras is None else read_into_frame(load, file)[0]
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
@@ -322,32 +323,32 @@ DRAWINGS = {"panel": prepare_panel, "views": prepare_pictures, "path": prepare_c
 
 
 def _lacks_cameras(files: SceneFiles) -> bool:
-    """Return whether a scene has no cameras and no photos from which they can be estimated."""
+    """Return whether a scene has neither cameras nor photos from which cameras can be estimated."""
     return files.cameras is None and files.images is None and read_sharp_camera(files.ply) is None
 
 
 def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
-    """Read the scenes, and place the cameras in the frame of ``options.like``."""
-    files, like, paths = options.files, options.like, options.paths
+    """Read the scenes, and move the cameras into the frame of ``options.framing``."""
+    files, framing, paths = options.files, options.framing, options.paths
     first = read_gaussian_file(files, opacity=options.opacity, hints=options.hints)
     plys = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
-    same_file = like.ply == files.ply
-    rows = first if same_file else read_gaussian_file(like, opacity="auto", hints=AUTO)
-    own = move_cameras_to_scene(rows, like, hints=options.hints, photos=photos)
+    same_file = framing.ply == files.ply
+    rows = first if same_file else read_gaussian_file(framing, opacity="auto", hints=AUTO)
+    own = move_cameras_to_scene(rows, framing, hints=options.hints, photos=photos)
     load = _with_views(own, inside=photos)
     if options.overlay is not None and load is not own:
-        load = replace(load, notes=(*load.notes, "overlay: these views count, so it says nothing of photos"))
+        load = replace(load, notes=(*load.notes, "overlay: it counts these placed views, not those of photos"))
     scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
-    named = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
+    with_paths = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
     if options.overlay is not None and len(load.scene):
         scenes = [tint(gaussians, count_views_in_world(gaussians, load.scene.cameras)) for gaussians in scenes]
     sizes = [file.info.file_bytes for file in (first, *plys)]
-    return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, named if plys else list(notes[0]), load)
+    return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, with_paths if plys else list(notes[0]), load)
 
 
 def _with_views(load: Loaded, *, inside: bool) -> Loaded:
-    """Place views about a scene that has none, for a path without those ``inside`` of it."""
+    """Place views around a scene that has none, and also ``inside`` it if asked."""
     if len(load.scene):
         return load
     with record_run() as record:
@@ -355,7 +356,7 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     scene = scene if inside else subset(scene, range(len(scene) // 2))
     cameras = fill_cameras(scene.cameras, *PLACED_SIZE)
     views = SceneViews(cameras, NO_IMAGES, scene.names, tuple(range(len(scene))))
-    notes = [text for text in record.notes if text != NO_VIEWS]  # that is for results
+    notes = [text for text in record.notes if text != NO_VIEWS]  # that note concerns results
     placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
     return replace(load, scene=scene, views=views, notes=(*load.notes, *notes, placed))
 
@@ -365,13 +366,13 @@ def find_view(view: str, names: Sequence[str]) -> int:
     stems = picture_stems(names)
     places = [place for place, name in enumerate(names) if view in (name, Path(name).name, stems[place])]
     if len(places) != 1:
-        found = f"{len(places)} views of this name" if places else "no view of this name"
-        raise UsageError(f"--views {view}: expected a number or the name of a view, such as {stems[0]}, found {found}")
+        problem = f"{len(places)} views of this name" if places else "no view of this name"
+        raise UsageError(f"--views {view}: expected a number or a name of a view such as {stems[0]}, found {problem}")
     return places[0]
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:
-    """Choose unique file names for the views: image names, else paths joined by ``_``, else numbers."""
+    """Choose unique file names for views: names of images, or else paths joined by ``_``, or else numbers."""
     paths = []
     for name in names:
         parts = [part for part in re.split(r"[\\/]+", name) if part not in ("", ".", "..")] or ["view"]
@@ -381,13 +382,13 @@ def picture_stems(names: Sequence[str]) -> list[str]:
     numbers = [[f"view_{i:03d}"] for i in range(len(names))]
     for candidates in ([path[-1:] for path in paths], paths, numbers):
         stems = ["_".join(path) for path in candidates]
-        if len({stem.lower() for stem in stems}) == len(stems):  # some file systems do not tell case apart
+        if len({stem.lower() for stem in stems}) == len(stems):  # some file systems ignore case
             break
     return stems
 
 
 def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> dict[str, Any]:
-    """Draw the pictures and write them, making folders as needed; return facts known only after drawing."""
+    """Draw the pictures and write them, and make folders as needed; return facts that only drawing reveals."""
     total, fps = drawing.facts.get("frames", len(drawing.paths)), drawing.facts.get("fps")
 
     def count(pictures: Iterator[Picture]) -> Iterator[Picture]:
@@ -412,8 +413,8 @@ def drawing_line(document: Mapping[str, Any]) -> str:
         line += f", {document['frames'] / document['fps']:.1f} s" if "fps" in document else ""
         if "encoding" not in document:
             return line
-        less_played = document["encoding"] != BY_FFMPEG[3][0] and document["pictures"][0].lower().endswith(".mp4")
-        hint = ", which not all programs play: with ffmpeg on the PATH it would be H.264" if less_played else ""
+        is_less_played = document["encoding"] != BY_FFMPEG[3][0] and document["pictures"][0].lower().endswith(".mp4")
+        hint = ", which not all programs play; with ffmpeg on the PATH it would be H.264" if is_less_played else ""
         return f"{line}, {document['encoding']}{hint}"
     count, views = len(document["pictures"]), len(document["views"])
     unit = document.get("depth_unit")

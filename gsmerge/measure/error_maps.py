@@ -1,8 +1,8 @@
-"""Gaussians, cameras and photos -> a map for each view of how far off a new view from there is likely to be.
+"""Gaussians, cameras and photos -> a map for each view of the likely error of a new view from there.
 
-A result has seen the photos of its own views, so its error there says little. So each pixel's surface, as the result
-has it, is looked up in the nearest photos of other views, and what they show there is compared with what is drawn.
-Where none of them looks, nothing but the view's own photo speaks for what is drawn.
+A result was fitted to the photos of its own views, so its error on these says little. Instead, the surface of each
+pixel, as the result has it, is projected into the nearest photos of other views, and their colours are compared with
+the render. Where no other photo shows the surface, only the view's own photo supports the render.
 """
 
 from __future__ import annotations
@@ -24,67 +24,69 @@ from gsmerge.raster import render
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
-SIDE = 320  # pixels, at most, of the longer side of a map
-# Nearest other photos that are asked, and how many of those that see a surface count, the nearest: held-out errors of
-# four captures rank as those by two (0.53 to 0.63), less as those by four (0.44 to 0.58): some show what stands before
+SIDE = 320  # largest longer side of a map, pixels
+# Number of nearest other photos that are compared, and of those that count for a pixel: the nearest that see its
+# surface. The rank correlation with held-out errors of four captures is 0.53 to 0.63 with two, and 0.44 to 0.58 with
+# four, since some photos show what stands in front
 NEIGHBORS, COUNTED = 8, 2
-NEEDED = 2  # views with photos, for each to have another
-OPAQUE = 0.5  # opacity from which on a pixel shows a surface
-BEHIND = 1.05  # times the depth that the other view has there, from which on it is hidden from it
-SIGMA = 2.0  # pixels that errors are averaged over: their sum in a pixel is chance
-MOST = 0.2  # error, of the range of a channel, from which on it has the last colour
-STOPS = ((0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164))  # of errors, even steps; sRGB
-UNKNOWN = (0, 130, 140)  # where no other photo looks
+MIN_PHOTOS = 2  # so that each photo has another one
+OPAQUE = 0.5  # least opacity of a pixel that shows a surface
+BEHIND = 1.05  # a surface is hidden from another view if it is so many times as deep as what that view shows
+SIGMA = 2.0  # standard deviation, pixels, of the blur of errors; the error of a single pixel is random
+MAX_ERROR = 0.2  # error, as a share of a channel's range, that has the last colour
+STOPS = ((0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164))  # colours of errors, sRGB
+UNKNOWN = (0, 130, 140)  # colour of pixels that no other photo shows
 
 
 @dataclass(frozen=True, eq=False)
-class Witnesses:
-    """Photos that say how far off a canonical scene is, and how deep it sees from them."""
+class ErrorReference:
+    """A canonical scene and the photos by which its errors are estimated."""
 
     gaussians: Gaussians
     views: Views  # canonical cameras, photos of at most SIDE pixels
-    masks: np.ndarray | None  # [v,h,w] bool, where these count; None: everywhere
-    looks: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # of views that were drawn
+    masks: np.ndarray | None  # [v,h,w] bool, pixels of the photos that count; None: all
+    drawn: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # picture and depth by view
 
-    def look(self, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Draw the picture and the depth of a view as :func:`look_from`, once."""
-        if view not in self.looks:
-            self.looks[view] = look_from(self.gaussians, self.views.cameras[[view]])
-        return self.looks[view]
+    def draw(self, view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Draw picture and depth of a view as :func:`draw_camera` does, and keep them."""
+        if view not in self.drawn:
+            self.drawn[view] = draw_camera(self.gaussians, self.views.cameras[[view]])
+        return self.drawn[view]
 
 
-def call_witnesses(gaussians: Gaussians, views: Views, masks: np.ndarray | None = None) -> Witnesses:
-    """Take the photos of canonical ``views``, where ``masks [v,h,w]`` let them, for witnesses of a canonical scene."""
+def make_reference(gaussians: Gaussians, views: Views, masks: np.ndarray | None = None) -> ErrorReference:
+    """Take canonical ``views`` with photos as the reference of a canonical scene's errors, inside ``masks [v,h,w]``."""
     small = shrink_views(views, SIDE)
     size = small.cameras.width, small.cameras.height
-    return Witnesses(gaussians, small, None if masks is None else np.stack([resize_mask(one, *size) for one in masks]))
+    resized = None if masks is None else np.stack([resize_mask(mask, *size) for mask in masks])
+    return ErrorReference(gaussians, small, resized)
 
 
-def expected_errors(witnesses: Witnesses, camera: Cameras, own: int | None = None) -> np.ndarray:
-    """Measure by the photos of other views how far off a canonical camera's picture is likely to be.
+def expected_errors(reference: ErrorReference, camera: Cameras, own: int | None = None) -> np.ndarray:
+    """Estimate the likely error of a canonical camera's picture by the photos of other views.
 
     Returns ``[h,w]`` float32 of at most ``SIDE`` pixels a side: mean absolute differences of the channels, in [0, 1],
-    from the nearest photos that see the surface there; NaN where none does. ``own``: the view of the camera, whose
-    photo does not count.
+    from the nearest photos that show the surface of a pixel; NaN if no photo shows it. ``own``: the view of the camera,
+    whose photo does not count.
     """
     camera = shrink_cameras(camera, SIDE)
-    image, depth = look_from(witnesses.gaussians, camera) if own is None else witnesses.look(own)
+    image, depth = draw_camera(reference.gaussians, camera) if own is None else reference.draw(own)
     ids = np.flatnonzero(depth > 0)
     points, colors = lift_pixels(depth, depth > 0, camera), image.reshape(-1, 3).take(ids, 0)
     sums, counts = np.zeros((2, len(ids)), np.float32)
-    open_rows, small = np.arange(len(ids)), witnesses.views.cameras
+    open_rows, small = np.arange(len(ids)), reference.views.cameras
     for other in _nearest(small, camera, own):
         (pixels,), (z,) = project(points.take(open_rows, 0), small[[other]])
         seen = np.flatnonzero((z > 0) & is_inside(pixels, small))
         pixels, rows = pixels.take(seen, 0), open_rows.take(seen)
         column, row = pixels.astype(np.int64).T
-        there = row * small.width + column
-        shown = z.take(seen) < BEHIND * witnesses.look(other)[1].reshape(-1).take(there)
-        if witnesses.masks is not None:
-            shown &= witnesses.masks[other].reshape(-1).take(there)
+        places = row * small.width + column
+        shown = z.take(seen) < BEHIND * reference.draw(other)[1].reshape(-1).take(places)
+        if reference.masks is not None:
+            shown &= reference.masks[other].reshape(-1).take(places)
         pixels, rows = pixels.compress(shown, 0), rows.compress(shown)
-        apart = np.abs(sample_bilinear(witnesses.views.images[other], *(pixels.T - 0.5)) - colors.take(rows, 0))
-        sums[rows] += (apart[:, 0] + apart[:, 1] + apart[:, 2]) / np.float32(3)
+        differences = np.abs(sample_bilinear(reference.views.images[other], *(pixels.T - 0.5)) - colors.take(rows, 0))
+        sums[rows] += (differences[:, 0] + differences[:, 1] + differences[:, 2]) / np.float32(3)
         counts[rows] += 1
         open_rows = open_rows.compress(counts.take(open_rows) < COUNTED)
     errors = np.zeros((depth.size, 2), np.float32)
@@ -96,14 +98,14 @@ def expected_errors(witnesses: Witnesses, camera: Cameras, own: int | None = Non
 
 
 def draw_errors(errors: np.ndarray) -> Picture:
-    """Draw errors ``[h,w]``: from black over red to yellow, which is 0.2 or more, and teal where nothing is known."""
-    places = np.nan_to_num(errors).clip(0, MOST) * ((len(STOPS) - 1) / MOST)
+    """Colour errors ``[h,w]`` from black over red to yellow (0.2 or more), and teal where the error is not known."""
+    places = np.nan_to_num(errors).clip(0, MAX_ERROR) * ((len(STOPS) - 1) / MAX_ERROR)
     colors = [np.interp(places, range(len(STOPS)), channel) for channel in np.array(STOPS).T]
     return np.where(np.isnan(errors)[..., None], UNKNOWN, np.stack(colors, 2)).round().astype(np.uint8)
 
 
-def look_from(gaussians: Gaussians, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Draw the picture ``[h,w,3]`` and the depth ``[h,w]``, 0 where nothing is opaque, of a camera."""
+def draw_camera(gaussians: Gaussians, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """Draw the picture ``[h,w,3]`` and the depth ``[h,w]``, 0 where nothing is opaque, of one camera."""
     drawn = render(gaussians, camera, near=NEAR_PLANE, with_depths=True)
     assert drawn.depths is not None
     (depth,), (alpha,) = drawn.depths[..., 0], drawn.alphas[..., 0]
@@ -111,19 +113,19 @@ def look_from(gaussians: Gaussians, camera: Cameras) -> tuple[np.ndarray, np.nda
 
 
 def _nearest(cameras: Cameras, camera: Cameras, own: int | None) -> list[int]:
-    """Return the nearest other views of a camera, the nearest first."""
-    away = np.square(cameras.centres - camera.centres[0]).sum(1)
-    order = [int(view) for view in np.argsort(away, kind="stable") if view != own]
+    """Return the other views nearest to a camera, the nearest first."""
+    distances = np.square(cameras.centres - camera.centres[0]).sum(1)
+    order = [int(view) for view in np.argsort(distances, kind="stable") if view != own]
     return order[:NEIGHBORS]
 
 
 def require_photos(scene: Scene, path: Path) -> None:
-    """Raise SceneError with the ``path`` of a scene unless two of its views or more have a photo."""
+    """Raise SceneError with the ``path`` of a scene unless at least two of its views have a photo."""
     count = 0 if scene.images is None else len(scene)
     if scene.images is not None and scene.masks is not None:  # a view without a photo has an empty mask
         count = int(scene.masks.any((1, 2)).sum())
-    if count < NEEDED:
-        problem = f"expected photos of {NEEDED} views or more for maps, which compare each with others; found {count}"
+    if count < MIN_PHOTOS:
+        problem = f"expected photos of at least {MIN_PHOTOS} views for maps, which compare photos, found {count}"
         raise SceneError(path, problem, "name their folder with --images")
 
 
@@ -137,28 +139,28 @@ def draw_sheets(
 ) -> Iterator[tuple[str, int, Picture]]:
     """Draw the photo, the picture and the map of each result and view, side by side.
 
-    Yields (result, number of the view among all, the input views first, sheet). ``cameras`` are those of the input
-    views by name of a result that was made with others; without ``context`` held-out views alone are drawn. The
-    scene has photos, see :func:`require_photos`.
+    Yields (result, number of the view among all views, sheet); the input views come first. ``cameras``: those of the
+    input views, by name of each result whose cameras differ from the scene's. Without ``context`` only held-out views
+    are drawn. The scene must have photos, see :func:`require_photos`.
     """
     assert scene.images is not None
     frame = scene_frame(scene)
     for name, gaussians in results.items():
         placed = frame.enter_cameras(cameras.get(name, scene.cameras))
-        witnesses = call_witnesses(frame.enter(gaussians), Views(placed, scene.images, scene.names), scene.masks)
-        views: list[tuple[Views, int, int | None]] = [(witnesses.views, view, view) for view in range(len(placed))]
+        reference = make_reference(frame.enter(gaussians), Views(placed, scene.images, scene.names), scene.masks)
+        views: list[tuple[Views, int, int | None]] = [(reference.views, view, view) for view in range(len(placed))]
         if targets is not None:
             held_out = shrink_views(replace(targets, cameras=frame.enter_cameras(targets.cameras)), SIDE)
             views += [(held_out, view, None) for view in range(len(held_out))]
-        for number, (of, view, own) in enumerate(views):
+        for number, (source, view, own) in enumerate(views):
             if own is not None and not (context and (scene.masks is None or scene.masks[view].any())):
                 continue
-            camera = of.cameras[[view]]
-            drawn, _ = look_from(witnesses.gaussians, camera) if own is None else witnesses.look(own)
-            errors = expected_errors(witnesses, camera, own)
-            pictures = to_picture(of.images[view]), to_picture(drawn), draw_errors(errors)
+            camera = source.cameras[[view]]
+            drawn, _ = draw_camera(reference.gaussians, camera) if own is None else reference.draw(own)
+            errors = expected_errors(reference, camera, own)
+            pictures = to_picture(source.images[view]), to_picture(drawn), draw_errors(errors)
             known = errors[~np.isnan(errors)]
             mean = f"error {known.mean():.3f}, " if len(known) else ""
-            said = f"{mean}yellow {MOST}; teal, {100 * (1 - len(known) / errors.size):.0f} %, unknown"
-            texts = f"view {number}: {of.names[view]}{'' if own is not None else ', held out'}", name, said
+            legend = f"{mean}yellow {MAX_ERROR}; teal, {100 * (1 - len(known) / errors.size):.0f} %, unknown"
+            texts = f"view {number}: {source.names[view]}{'' if own is not None else ', held out'}", name, legend
             yield name, number, contact_sheet([list(zip(texts, pictures, strict=True))])

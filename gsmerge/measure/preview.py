@@ -1,4 +1,4 @@
-"""Pictures for people: scenes from the same cameras side by side, mean colours, heat maps."""
+"""Draw pictures for people: scenes from the same cameras side by side, mean colours, heat maps."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr, psnr_words
 from gsmerge.types import Cameras, Gaussians
 
-Picture = NDArray[np.uint8]  # [h,w,3], sRGB, RGB order
+Picture = NDArray[np.uint8]  # [h,w,3], sRGB
 FACE = cv2.FONT_HERSHEY_SIMPLEX
-MAX_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}  # pixels, of a format and of its encoder
-BAND, WIDE = 22, 640  # height of the band that carries a tile's label, pixels, and width of a tile from which it grows
-DARK = 32  # level of the bands, and of the cell without a photo
-GAP = 4
-OUTSIDE = "step back"  # name of the view from outside
+MAX_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}  # largest side that a format or its encoder takes, pixels
+BAND, WIDE = 22, 640  # pixels: height of the label above a picture, which grows for each multiple of this width
+DARK = 32  # grey level of labels, and of cells without a photo
+GAP = 4  # pixels between pictures
+OUTSIDE = "step back"  # name of the outside view
 
 
 def to_picture(image: np.ndarray) -> Picture:
-    """Convert a picture ``[h,w,3]``, float in [0, 1], to 8 bit RGB."""
+    """Convert a picture ``[h,w,3]``, float in [0, 1], to 8 bits."""
     return (image.clip(0, 1) * 255).round().astype(np.uint8)
 
 
 def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool = True) -> None:
     """Write a picture in the format of the file name; ``settings`` go to :func:`cv2.imencode`.
 
-    It has three channels, four with alpha, or none: ``[h,w]`` of 8 or 16 bits.
+    The picture is ``[h,w,3]``, ``[h,w,4]`` with alpha, or ``[h,w]``, with 8 or 16 bits.
     """
     stored = picture if picture.ndim == 2 else picture[..., [2, 1, 0, 3][: picture.shape[2]]]
     most, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
     if max(height, width) > most:
-        problem = f"expected at most {most:,} pixels a side of a {path.suffix}, got {width} x {height}"
+        problem = f"expected at most {most:,} pixels per side of a {path.suffix}, got {width} x {height}"
         raise SceneError(path, problem, "name a .png, or lower --size")
     _, data = cv2.imencode(path.suffix, np.ascontiguousarray(stored), settings)
     with atomic_output(path, overwrite=overwrite) as temporary:
@@ -56,7 +56,7 @@ def picture_html(picture: Picture, text: str) -> str:
 
 
 def label(picture: Picture, text: str) -> Picture:
-    """Put a dark band with one line of text above a picture, shortening the text to fit."""
+    """Put a dark band with one line of text above a picture; shorten the text to fit."""
     factor = max(1, picture.shape[1] // WIDE)
     scale = 0.42 * factor
     text = shorten_text(text, picture.shape[1] - 8, scale, factor)
@@ -66,8 +66,8 @@ def label(picture: Picture, text: str) -> Picture:
 
 
 def shorten_text(text: str, width: int, scale: float, thickness: int) -> str:
-    """Leave out the end of a text that would be wider than ``width`` pixels as OpenCV draws it."""
-    text = text.encode("utf-8", "replace").decode()  # OpenCV does not survive halves of characters
+    """Cut the end of a text that OpenCV would draw wider than ``width`` pixels."""
+    text = text.encode("utf-8", "replace").decode()  # lone surrogates would crash OpenCV
     while len(text) > 1 and cv2.getTextSize(text, FACE, scale, thickness)[0][0] > width:
         text = text[:-1]
     return text
@@ -84,9 +84,9 @@ def view_pictures(
 ) -> list[list[tuple[str, Picture]]]:
     """Render each scene in every view, in rows that begin with the photo if there is one.
 
-    Every picture comes with a line of text: its name, its number of Gaussians, and, if it is ``scored``, its PSNR
-    to the whole photo ``[h,w,3]``, or without photos to the first scene; a photo with the number of its view in
-    ``ids``. Of a view whose photo is None a dark picture comes first. ``drawing`` is passed on to
+    Every picture comes with a line of text. For a scene it has the name, the number of Gaussians and, if ``scored``,
+    the PSNR against the whole photo ``[h,w,3]``, or against the first scene without photos. For a photo it has the
+    number of the view in ``ids``. A view whose photo is None begins with a dark picture. ``drawing`` is passed to
     :func:`gsmerge.render`.
     """
     renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
@@ -100,8 +100,8 @@ def view_pictures(
             columns.insert(0, (f"view {view}: no photo", np.full_like(renders[0][row], DARK / 255)))
         first, *others = columns
         if scored and (photo is not None or photos is None):
-            what = "the photo" if photos is not None else scenes[0][0]
-            others = [(f"{text}, {psnr_words(psnr(image, first[1]))} to {what}", image) for text, image in others]
+            reference = "the photo" if photos is not None else scenes[0][0]
+            others = [(f"{text}, {psnr_words(psnr(image, first[1]))} to {reference}", image) for text, image in others]
         views.append([(text, to_picture(image)) for text, image in (first, *others)])
     return views
 
@@ -109,9 +109,9 @@ def view_pictures(
 def outside_pictures(
     scenes: Sequence[tuple[str, Gaussians]], cameras: Cameras, *, photos: bool, **drawing: Any
 ) -> list[tuple[str, Picture]]:
-    """Render each scene from outside the capture, as one row like those of :func:`view_pictures`.
+    """Render each scene from outside the capture, in one row like those of :func:`view_pictures`.
 
-    Every picture comes with its name. With ``photos`` a dark picture comes first, in the photos' column.
+    Every picture comes with its name. With ``photos`` the row begins with a dark picture, in the column of photos.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
     renders = [(f"{name}: {OUTSIDE}", to_picture(render(scene, camera, **drawing).images[0])) for name, scene in scenes]
@@ -119,7 +119,7 @@ def outside_pictures(
 
 
 def contact_sheet(views: Sequence[Sequence[tuple[str, Picture]]], *, min_width: int = 320) -> Picture:
-    """Arrange pictures in a sheet, a labelled row per view, enlarged by a whole factor to ``min_width`` columns."""
+    """Arrange pictures in a sheet with a labelled row per view, enlarged by a whole factor to ``min_width`` pixels."""
     factor = max(1, -(-min_width // views[0][0][1].shape[1]))
     rows = []
     for pictures in views:
@@ -129,7 +129,7 @@ def contact_sheet(views: Sequence[Sequence[tuple[str, Picture]]], *, min_width: 
 
 
 def _join(pictures: Sequence[Picture], axis: int) -> Picture:
-    """Put pictures in a row or a column, with a gap between."""
+    """Join pictures to a row or a column, with gaps between them."""
     shape = list(pictures[0].shape)
     shape[axis] = GAP
     gap = np.full(shape, 255, np.uint8)
@@ -138,9 +138,9 @@ def _join(pictures: Sequence[Picture], axis: int) -> Picture:
 
 
 def draw_borders(labels: np.ndarray, ids: np.ndarray, factor: int) -> NDArray[np.uint8]:
-    """Enlarge ``labels [h,w]`` by a whole factor and draw where the left or upper neighbour has another one.
+    """Enlarge ``labels [h,w]`` by a whole factor, and draw borders one pixel wide between different labels.
 
-    Returns the ``ids [k]`` uint8 of the labels at these borders, which are one pixel wide, and 0 elsewhere.
+    Returns the ``ids [k]`` uint8 of the labels whose left or upper neighbour has another label, and 0 elsewhere.
     """
     (height, width), own = labels.shape, ids[labels]
     drawn = np.zeros((height, factor, width, factor), np.uint8)

@@ -1,4 +1,4 @@
-"""Documents of evaluations: JSON with a stable schema, a CSV of one row per view, and tables for people."""
+"""Make documents of evaluations: JSON with a stable schema, a CSV with one row per view, and tables for people."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from gsmerge.runtime.memory import human_bytes, human_share
 Row = Sequence[str]
 Table = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
 
-KINDS = {"context": "input", "target": "held-out"}  # views, for people
-ZOOMED = ("psnr", "ssim")  # what is measured at other sizes
+KINDS = {"context": "input", "target": "held-out"}  # words for the views of a split
+ZOOMED = ("psnr", "ssim")  # measures that are also taken at other sizes
 COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
 OUTSIDE = {
     "fog_near": "near fog", "fog_far": "far fog", "holes": "holes", "veil": "veil", "veil_worst": "worst veil",
     "spikes": "spikes", "strokes": "strokes",
 }  # fields of Fog  # fmt: skip
-# Columns that a narrow terminal leaves out, the first one first
+# Columns that are left out on a narrow terminal, in this order
 LEAST = ("bytes each", "overdraw", "smaller by", "threads", "earned back after", "ms/view", "kept")
-MASKED = "_visible"  # suffix of what is measured over the pixels that the input views have seen
-COVERED = "_covered"  # and over those that the input covers
+MASKED = "_visible"  # suffix of measures over the pixels that the input views have seen
+COVERED = "_covered"  # suffix of measures over the pixels that the input covers
 CSV_COLUMNS = (
     "schema_version", "result", "num_gaussians", "ratio", "split", "view", "visible_share",
     *METRICS, *(name + MASKED for name in METRICS), *(name + COVERED for name in ("share", *ZOOMED)), *OUTSIDE,
@@ -40,11 +40,11 @@ def evaluation_document(
 ) -> dict[str, Any]:
     """Convert an evaluation to plain JSON types, with further facts on each result, such as path and bytes.
 
-    ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, fog, holes, veils and
-    spikes, null for the input, means by split, a score for each view), notes. Means and scores have ``zooms`` if other
-    sizes than that of the photos were requested; ``photo_side`` is present if it is not 0, ``antialiased`` if it is
-    true, ``lpips_views`` if LPIPS was measured on fewer views of some split. Within one schema version keys are only
-    added.
+    ``schema_version`` 1 has tool, reference, views, results and notes. A result has its facts, count, ratio, render
+    seconds, fog, holes, veils and spikes (null for the input), means by split, and a score for each view. Means and
+    scores have ``zooms`` if sizes other than that of the photos were requested. ``photo_side`` is present if it is not
+    0, ``antialiased`` if it is true, ``lpips_views`` if LPIPS was not measured on all views of some split. Within a
+    schema version keys may be added, but not removed.
     """
     return {
         **document_head(),
@@ -59,12 +59,13 @@ def evaluation_document(
 
 
 def _some_lpips(evaluation: Evaluation) -> bool:
-    """Return whether LPIPS was measured on a part of the views."""
+    """Return whether LPIPS was measured on some of the views only."""
     most = evaluation.options.lpips_views
     return bool(evaluation.options.lpips and most and most < max(evaluation.num_views.values()))
 
 
 def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert the scores of one result, with its ``facts``."""
     return {
         "name": result.name,
         **facts,
@@ -89,6 +90,7 @@ def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, An
 
 
 def _mean(result: ResultScores, split: str, evaluation: Evaluation) -> dict[str, Any]:
+    """Convert the mean scores of a result over the views of a split."""
     options = evaluation.options
     sizes = () if options.zoom == (1,) else options.zoom
     return {
@@ -99,37 +101,39 @@ def _mean(result: ResultScores, split: str, evaluation: Evaluation) -> dict[str,
 
 
 def _zooms(scores: Mapping[float, Pair]) -> dict[str, Any]:
-    """Make the list ``zooms`` in the requested order, if there are any."""
+    """Make the list ``zooms`` of scores at other sizes, in the requested order; nothing without such scores."""
     names = [name + suffix for suffix in ("", MASKED) for name in ZOOMED]
     flat = [(zoom, _flat(pair)) for zoom, pair in scores.items()]
     return {"zooms": [{"zoom": zoom, **{name: score[name] for name in names}} for zoom, score in flat]} if flat else {}
 
 
 def _covered(share: float | None, quality: Quality) -> dict[str, float | None]:
+    """Convert the share of covered pixels and the scores over them."""
     return {"share" + COVERED: share} | {name + COVERED: getattr(quality, name) for name in ZOOMED}
 
 
 def _flat(pair: Pair) -> dict[str, float | None]:
+    """Convert the scores over all and over visible pixels to one dictionary."""
     full, masked = map(asdict, pair)
     return full | {name + MASKED: value for name, value in masked.items()}
 
 
 def evaluation_csv(document: Mapping[str, Any]) -> str:
-    """Write an evaluation as CSV with one row per result and view; cells without a measurement are empty.
+    """Format an evaluation as CSV with one row per result and view; cells without a measurement are empty.
 
-    Columns such as ``psnr_zoom_0.5`` and ``psnr_visible_zoom_0.5`` follow where other sizes were measured.
+    If other sizes were measured, columns such as ``psnr_zoom_0.5`` and ``psnr_visible_zoom_0.5`` follow.
     """
     rows = []
     for result in document["results"]:
-        same = {"schema_version": document["schema_version"], "result": result["name"]}
-        same |= {name: result[name] for name in ("num_gaussians", "ratio", *OUTSIDE)}
-        rows += [same | _more_columns(view) for view in result["views"]]
+        shared = {"schema_version": document["schema_version"], "result": result["name"]}
+        shared |= {name: result[name] for name in ("num_gaussians", "ratio", *OUTSIDE)}
+        rows += [shared | _flatten_zooms(view) for view in result["views"]]
     columns = dict.fromkeys(CSV_COLUMNS) | dict.fromkeys(name for row in rows for name in row)
     return csv_text(list(columns), rows)
 
 
-def _more_columns(view: Mapping[str, Any]) -> dict[str, Any]:
-    """Flatten the score of a view to a column for each figure at another size."""
+def _flatten_zooms(view: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scores of a view with a key for each figure at another size, in place of ``zooms``."""
     row = {key: value for key, value in view.items() if key != "zooms"}
     for score in view.get("zooms", ()):
         row |= {f"{key}_zoom_{score['zoom']:g}": value for key, value in score.items() if key != "zoom"}
@@ -137,7 +141,7 @@ def _more_columns(view: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
-    """Make text tables of an evaluation: heading, columns and rows."""
+    """Make the text tables of an evaluation: heading, columns and rows of each."""
     results = document["results"]
     yield (
         "Size",
@@ -149,7 +153,7 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     how += f", LPIPS on {document['lpips_views']} views" if "lpips_views" in document else ""
     seen = f"against {document['reference']}, over the pixels that the input views have seen{how}"
     first = next(iter(results[0]["mean"].values()))
-    lacks = (first["share" + COVERED] or 1) < WHOLE  # of the input's own views, where they are measured
+    lacks = (first["share" + COVERED] or 1) < WHOLE  # on the input views, if they are measured
     sizes = [entry["zoom"] for entry in first.get("zooms", ())]
     heads = [f"{name.upper()} {zoom:g}x" for zoom in sizes for name in ZOOMED]
     quality = "Quality" if "target" in document["num_views"] else "No view was held out: quality"
@@ -177,6 +181,7 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
 
 
 def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
+    """Return the row of a result in the table of sizes; ``first``: the result that it is compared with."""
     size, whole, overdraw = result.get("bytes"), first.get("bytes"), result.get("overdraw")
     each = sum(result.get("bytes_by_attribute", {}).values()) / max(result["num_gaussians"], 1)
     return (
@@ -192,6 +197,7 @@ def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
 
 
 def _speed_row(result: Mapping[str, Any], speed: Mapping[str, Any]) -> Row:
+    """Return a row of the table of render times."""
     faster = f"{speed['speedup']:.1f} x" if "speedup" in speed else ""
     frames, merge = speed.get("break_even_frames"), result.get("merge_seconds")
     earned = "" if merge is None else "never" if frames is None else f"{frames:,.0f} frames ({merge:.1f} s of merging)"
@@ -200,25 +206,26 @@ def _speed_row(result: Mapping[str, Any], speed: Mapping[str, Any]) -> Row:
 
 
 def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED) -> Iterator[str]:
-    """Format the figures of the visible pixels, or those of another ``suffix``; empty for missing figures."""
+    """Format the figures over visible pixels, or those with another ``suffix``; missing figures become ""."""
     for name in names:
         yield _number(score[name + suffix], 2 if name == "psnr" else 3)
 
 
 def _number(value: float | None, digits: int = 3) -> str:
+    """Format a number; "" for None."""
     return "" if value is None else f"{value:.{digits}f}"
 
 
 def filled_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     """Make the tables of :func:`evaluation_tables` without empty columns and tables."""
     for heading, head, rows in evaluation_tables(document):
-        kept = [i for i in range(len(head)) if i == 0 or any(row[i] for row in rows)]
+        filled = [i for i in range(len(head)) if i == 0 or any(row[i] for row in rows)]
         if rows:
-            yield heading, [head[i] for i in kept], [[row[i] for i in kept] for row in rows]
+            yield heading, [head[i] for i in filled], [[row[i] for i in filled] for row in rows]
 
 
 def evaluation_lines(document: Mapping[str, Any], columns: int | None = None) -> list[str]:
-    """Write the tables of an evaluation as lines for a terminal of so many ``columns``; None: of any width."""
+    """Format the tables of an evaluation as lines for a terminal of ``columns`` width; None: unlimited."""
     lines = list[str]()
     for heading, head, rows in filled_tables(document):
         least = [head.index(name) for name in LEAST if name in head]
@@ -228,7 +235,7 @@ def evaluation_lines(document: Mapping[str, Any], columns: int | None = None) ->
 
 
 def evaluation_markdown(document: Mapping[str, Any]) -> str:
-    """Write the tables and notes of an evaluation in Markdown."""
+    """Format the tables and notes of an evaluation in Markdown."""
     lines = [f"# {_plain(page_title(document))}", f"<!-- gsmerge {document['tool']['version']} -->", ""]
     for title, head, rows in filled_tables(document):
         lines += [f"## {title}", "", _line(head), _line(["---", *["---:"] * (len(head) - 1)]), *map(_line, rows), ""]
@@ -244,19 +251,20 @@ def page_title(document: Mapping[str, Any]) -> str:
 
 
 def page_notes(document: Mapping[str, Any]) -> list[str]:
-    """Return the notes with file paths cut to folder and name, for a page that others read."""
+    """Return the notes with file paths shortened to folder and name, for a page that is passed on."""
     paths = [Path(result["path"]).absolute() for result in document["results"] if "path" in result]
-    above = {f"{path.parent.parent}/" for path in paths} - {"/"}
+    prefixes = {f"{path.parent.parent}/" for path in paths} - {"/"}
     notes = document["notes"]
-    for folder in sorted(above, key=len, reverse=True):
+    for folder in sorted(prefixes, key=len, reverse=True):
         notes = [note.replace(folder, "") for note in notes]
     return list(notes)
 
 
 def _line(cells: Row) -> str:
+    """Format the row of a table in Markdown."""
     return "| " + " | ".join(_plain(cell).replace("|", "\\|") for cell in cells) + " |"
 
 
 def _plain(text: str) -> str:
-    """Escape text so that it is one line and no HTML in Markdown."""
+    """Escape text for Markdown, so that it is one line without HTML."""
     return " ".join(html.escape(text, quote=False).split())

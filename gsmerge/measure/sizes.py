@@ -1,4 +1,4 @@
-"""Cameras, photos and masks at other sizes: what is compared is rendered at the size that its photo is resized to."""
+"""Resize cameras, photos and masks, so that renders and photos that are compared have the same size."""
 
 from __future__ import annotations
 
@@ -18,41 +18,42 @@ SomeViews = TypeVar("SomeViews", bound=Views)
 
 
 def zoom_cameras(cameras: Cameras, zoom: float) -> Cameras:
-    """Resize the cameras' images to ``zoom`` times as many pixels per side, with intrinsics of that size."""
+    """Scale the image size of cameras to ``zoom`` times the pixels per side, and their intrinsics with it."""
     long_side = max(cameras.width, cameras.height)
     factor = max(1, round(zoom * long_side)) / long_side
     return resize_cameras(cameras, max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor)))
 
 
 def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
-    """Shrink the cameras' images to at most ``side`` pixels on the longer side; 0: leave them."""
+    """Shrink the image size of cameras to at most ``side`` pixels on the longer side; 0: keep it."""
     long_side = max(cameras.width, cameras.height)
     return zoom_cameras(cameras, side / long_side) if 0 < side < long_side else cameras
 
 
 def fill_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """Resize the cameras' images until they fill ``[height,width]``, and cut off what is beyond, evenly."""
-    wide, high = _filling_size(cameras.width, cameras.height, width, height)
-    resized = resize_cameras(cameras, wide, high)
+    """Resize the images of cameras until they fill ``[height,width]``, and crop both ends of the longer axis evenly."""
+    new_width, new_height = _filling_size(cameras.width, cameras.height, width, height)
+    resized = resize_cameras(cameras, new_width, new_height)
     Ks = resized.Ks.astype(np.float64)
-    Ks[:, :2, 2] -= (wide - width) // 2, (high - height) // 2
+    Ks[:, :2, 2] -= (new_width - width) // 2, (new_height - height) // 2
     return replace(resized, Ks=Ks, width=width, height=height)
 
 
 def fill_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize and cut a photo ``[h,w,3]`` as :func:`fill_cameras` does its camera."""
-    wide, high = _filling_size(photo.shape[1], photo.shape[0], width, height)
-    top, left = (high - height) // 2, (wide - width) // 2
-    return resize_photo(photo, wide, high)[top : top + height, left : left + width]
+    """Resize and crop a photo ``[h,w,3]`` as :func:`fill_cameras` does with its camera."""
+    new_width, new_height = _filling_size(photo.shape[1], photo.shape[0], width, height)
+    top, left = (new_height - height) // 2, (new_width - width) // 2
+    return resize_photo(photo, new_width, new_height)[top : top + height, left : left + width]
 
 
 def _filling_size(old_width: int, old_height: int, width: int, height: int) -> tuple[int, int]:
+    """Return the least size with the old aspect ratio that covers ``width`` x ``height``."""
     scale = max(width / old_width, height / old_height)
     return max(width, round(scale * old_width)), max(height, round(scale * old_height))
 
 
 def shrink_views(views: SomeViews, side: int) -> SomeViews:
-    """Shrink photos and cameras together to at most ``side`` pixels on the longer side; 0: leave them."""
+    """Shrink photos and cameras together to at most ``side`` pixels on the longer side; 0: keep them."""
     cameras = shrink_cameras(views.cameras, side)
     if cameras is views.cameras:
         return views
@@ -62,7 +63,7 @@ def shrink_views(views: SomeViews, side: int) -> SomeViews:
 
 
 def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize a photo ``[h,w,3]`` in pixels: area averages to shrink, cubic interpolation to enlarge."""
+    """Resize a photo ``[h,w,3]``, by area averages to shrink it, by cubic interpolation to enlarge it."""
     if width * height < photo.shape[0] * photo.shape[1]:
         resized = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
     else:
@@ -71,16 +72,16 @@ def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
-    """Resize a mask ``[h,w]`` to ``[height,width]``; a new pixel is True if it lies completely in the mask."""
+    """Resize a mask ``[h,w]`` to ``[height,width]``; a new pixel is True if it lies completely inside the mask."""
     holes = np.pad(np.cumsum(np.cumsum(~mask, 0, dtype=np.int64), 1), ((1, 0), (1, 0)))
     (top, bottom), (left, right) = (
-        _covered(old, new) for old, new in zip(mask.shape, (height, width), strict=True)
+        _overlapped(old, new) for old, new in zip(mask.shape, (height, width), strict=True)
     )  # fmt: skip
     inside = holes[bottom][:, right] - holes[top][:, right] - holes[bottom][:, left] + holes[top][:, left]
     return np.asarray(inside == 0)
 
 
-def _covered(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the first and the (exclusive) last of ``old`` pixels in a row that each of ``new`` pixels overlaps."""
+def _overlapped(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first and the (exclusive) last of ``old`` pixels in a row that each of ``new`` pixels overlaps."""
     pixel = np.arange(new)
     return pixel * old // new, -(-(pixel + 1) * old // new)

@@ -1,4 +1,4 @@
-"""Costs of drawing scenes: render time, Gaussians blended into a pixel, and frames until merging pays."""
+"""Measure the costs of drawing scenes: render time, Gaussians blended per pixel, and frames until merging pays."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from gsmerge.raster.weights import view_weights
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians
 
-NUM_VIEWS, REPEATS = 3, 3  # evenly spread views that are rendered, each so many times
-MAX_REPEATED_SECONDS = 2.0  # what takes longer is rendered once
+NUM_VIEWS, REPEATS = 3, 3  # number of evenly spread views, and how often each is rendered
+MAX_REPEATED_SECONDS = 2.0  # views that take longer are rendered once
 
 
 def measure_costs(
@@ -30,11 +30,13 @@ def measure_costs(
 ) -> dict[str, dict[str, Any]]:
     """Measure the costs of drawing each scene.
 
-    The scenes are drawn in turns, so that a machine that slows down slows all of them; scenes are compared with the
-    first. A few of the ``cameras`` are drawn, at ``zooms`` times their own size. ``near`` is in world units;
-    ``merge_seconds`` is the time that making a scene took, if known; ``threads`` None: all. Returns plain JSON types by
-    name: ``overdraw``, Gaussians blended into a pixel; ``speeds`` by zoom: seconds per view, and for all scenes but the
-    first ``speedup`` and ``break_even_frames``, next to ``merge_seconds``.
+    A few of the ``cameras`` are drawn at ``zooms`` times their own size. The scenes are drawn in turns, so that a
+    machine that slows down slows all of them. ``near``: near plane, in world units. ``merge_seconds``: time that it
+    took to make a scene, by name, if known. ``threads`` None: all processors.
+
+    Returns plain JSON types by name: ``overdraw``, the Gaussians blended per pixel, and ``speeds``, for each zoom the
+    seconds per view. All scenes but the first also have ``merge_seconds``, and in ``speeds`` the ``speedup`` against
+    the first scene and ``break_even_frames``.
     """
     few = cameras[pick_views(len(cameras), NUM_VIEWS)]
     costs: dict[str, dict[str, Any]] = {
@@ -58,17 +60,17 @@ def measure_costs(
 
 
 def time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) -> dict[str, float]:
-    """Measure the seconds per view that drawing each scene takes, at best of a few turns.
+    """Measure the seconds per view of drawing each scene, the least of ``REPEATS`` rounds.
 
-    The scenes are drawn one after the other and again, so that a machine that slows down slows all of them. ``views``
-    are few; ``near`` is in the scenes' units.
+    Each round draws all scenes one after the other, so that a machine that slows down slows all of them. ``near``: near
+    plane, in the units of the scenes.
     """
     shortest = {name: np.full(len(views), np.inf) for name in scenes}
     for gaussians in scenes.values():  # fills caches
         time_render(gaussians, views[[0]], near)
-    for turn in range(REPEATS):
+    for round_number in range(REPEATS):
         for name, gaussians in scenes.items():
-            if turn and shortest[name].max() > MAX_REPEATED_SECONDS:
+            if round_number and shortest[name].max() > MAX_REPEATED_SECONDS:
                 continue
             for view in range(len(views)):
                 shortest[name][view] = min(shortest[name][view], time_render(gaussians, views[[view]], near))
@@ -76,14 +78,14 @@ def time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) 
 
 
 def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
-    """Measure the seconds that rendering a view takes."""
+    """Measure the seconds of rendering a view."""
     start = time.perf_counter()
     render(gaussians, view, near=near)
     return time.perf_counter() - start
 
 
 def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
-    """Measure the mean number of Gaussians blended into a pixel, which determines the render time."""
+    """Measure the mean number of Gaussians blended per pixel, which determines the render time."""
     splats, entries = make_splats(gaussians), 0
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     for view in range(len(cameras)):

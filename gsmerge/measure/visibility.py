@@ -1,4 +1,4 @@
-"""Pixels of a view that show what the input views have seen (supplement A)."""
+"""Find the pixels of a view that show what the input views have seen (supplement A)."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
 Points = NDArray[np.float64]  # [n,3]
-_OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
-_NEAR, _BEHIND = 0.01, 1.05  # times the median depth of a view; times a surface's depth, from which on it hides
-MAX_SAMPLE_GAUSSIANS = 200_000  # Gaussians that a share is measured on
-_CHUNK = 1 << 16  # points at a time: all of them, in every thread, would take too much memory
-_DILATION = 3  # pixels of the input views per side of the square that every sample marks
+_OPAQUE = 0.5  # least alpha of a pixel whose rendered depth is that of a surface
+_NEAR = 0.01  # near plane, as a share of the median depth of a view
+_BEHIND = 1.05  # a surface hides centres beyond so many times its depth
+MAX_SAMPLE_GAUSSIANS = 200_000  # on which a share is measured
+_CHUNK = 1 << 16  # points processed at a time; all of them, in every thread, would take too much memory
+_DILATION = 3  # side, in pixels of the input views, of the square that a sample marks
 
 
 def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
-    """Return the surface points ``[n,3]``, world, that the pixels of the input views show.
+    """Return the surface points ``[n,3]``, in world units, that the pixels of the input views show.
 
-    Where views have Gaussians of their own these are they; otherwise depth beyond ``near``, world units, is rendered
-    into the ``cameras``; None: those of the scene.
+    If views have Gaussians of their own, the points are their centres. Otherwise they are depths rendered beyond
+    ``near`` (world units) in the ``cameras``; None: those of the scene.
     """
     if scene.has_own_pixels:
         return scene.file_gaussians.means.astype(np.float64)
@@ -35,13 +36,14 @@ def context_points(scene: Scene, near: float, cameras: Cameras | None = None) ->
 
 
 def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points:
+    """Return the surface points that the rendered depth of one camera shows."""
     drawn = render(gaussians, camera, near=near, with_depths=True)
     assert drawn.depths is not None
     return lift_pixels(drawn.depths[0, ..., 0], drawn.alphas[0, ..., 0] > _OPAQUE, camera)
 
 
 def lift_pixels(depths: np.ndarray, shown: np.ndarray, camera: Cameras) -> Points:
-    """Return the points ``[n,3]``, world, at the ``depths [h,w]`` of the pixels ``shown [h,w]`` of a camera, by row."""
+    """Return the points ``[n,3]``, world, at the ``depths [h,w]`` of a camera's pixels in the mask ``shown [h,w]``."""
     y, x = np.nonzero(shown)
     rays = matmul(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), invert(camera.Ks[0].astype(np.float64)).T)
     pose = invert(camera.viewmats[0].astype(np.float64))
@@ -49,10 +51,10 @@ def lift_pixels(depths: np.ndarray, shown: np.ndarray, camera: Cameras) -> Point
 
 
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
-    """Return masks ``[c,h,w]`` of pixels on or next to which a point ``[n,3]`` falls, occluded or not.
+    """Return masks ``[c,h,w]`` of the pixels at or next to the projection of a point ``[n,3]``, occluded or not.
 
-    Points nearer than ``near``, world units, do not count. If the views have smaller pixels than the views of the
-    points (``sources``), a point marks proportionally more pixels, so that there are no gaps.
+    Points nearer than ``near`` (world units) do not count. If the views have smaller pixels than the ``sources``, the
+    cameras of the points, a point marks proportionally more pixels, so that there are no gaps.
     """
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
@@ -60,7 +62,7 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
         seen = hit > 0
         side = _side(Ks[view], sources)
-        own = len(points) * view // len(cameras)  # where, in most scenes, the view's own points begin: they come first
+        own = len(points) * view // len(cameras)  # in most scenes the view's own points begin here; start with them
         for first in (*range(own, len(points), _CHUNK), *range(0, own, _CHUNK)):
             chunk = points[first : first + _CHUNK]
             image = matmul(matmul(chunk, viewmats[view, :3, :3].T) + viewmats[view, :3, 3], Ks[view].T)
@@ -77,7 +79,7 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
 
 
 def _side(K: np.ndarray, sources: Cameras | None) -> int:
-    """Choose the side, an odd number of pixels, of the square that a sample marks under the intrinsics ``K [3,3]``."""
+    """Choose the side, an odd number of pixels, of the square that a sample marks with the intrinsics ``K [3,3]``."""
     if sources is None:
         return _DILATION
     focals = [np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64))]  # pixels
@@ -85,7 +87,7 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
 
 
 def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
-    """Return for each view the rows whose centres it shows: inside its picture, and not hidden by a surface."""
+    """Return for each view the rows whose centres are inside its picture and not hidden by a surface."""
     rows = []
     for view in range(len(cameras)):
         (pixels,), (depths,) = project(gaussians.means, cameras[[view]])

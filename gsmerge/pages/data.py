@@ -14,7 +14,7 @@ from gsmerge.frame import Frame, scene_frame
 from gsmerge.geometry import middle_depth
 from gsmerge.io.photo_files import encode_indexed, encode_picture, photo_array
 from gsmerge.measure.camera_path import outside_camera
-from gsmerge.measure.error_maps import Witnesses, call_witnesses, draw_errors, expected_errors
+from gsmerge.measure.error_maps import ErrorReference, draw_errors, expected_errors, make_reference
 from gsmerge.measure.evaluate import (
     INPUT,
     EvaluateOptions,
@@ -205,12 +205,12 @@ def page_data(
     views = _page_views(splits, evaluation, stills, frame, means)
     shown, num_superpixels = with_outlines(_shown(views), pictures)
     moved = {name: frame.enter_cameras(own.numpy()) for name, own in (cameras or {}).items()}
-    witnesses = {
-        name: call_witnesses(canonical[name], Views(moved.get(name, own_cameras), pictures, scene.names), scene.masks)
+    references = {
+        name: make_reference(canonical[name], Views(moved.get(name, own_cameras), pictures, scene.names), scene.masks)
         for name in (inspected if len(pictures) > 1 else ())
     }
     splats = {name: make_splats(canonical[name]) for name in inspected}
-    shown = tuple(replace(view, maps=tuple(_map(witnesses.get(name), view) for name in named)) for view in shown)
+    shown = tuple(replace(view, maps=tuple(_map(references.get(name), view) for name in named)) for view in shown)
     *drawn, outside = (
         _with_marks(view, splats, marks, near) for view in (*shown, _outside_view(scene, named, frame, len(views)))
     )
@@ -322,13 +322,13 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     return encode_indexed(drawn, np.pad(colors, ((1, 0), (0, 0))))
 
 
-def _map(witnesses: Witnesses | None, view: PageView) -> bytes | None:
+def _map(reference: ErrorReference | None, view: PageView) -> bytes | None:
     """Draw the likely error of one side in a view, estimated by other photos; None without other photos."""
-    if witnesses is None:
+    if reference is None:
         return None
     own = None if view.held_out else view.place
-    camera = view.camera if own is None else witnesses.views.cameras[[own]]
-    return encode_still(draw_errors(expected_errors(witnesses, camera, own)))
+    camera = view.camera if own is None else reference.views.cameras[[own]]
+    return encode_still(draw_errors(expected_errors(reference, camera, own)))
 
 
 def _pack(

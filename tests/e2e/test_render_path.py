@@ -106,7 +106,7 @@ def test_a_clip_is_an_orbit_by_default(
     assert (document["path"], document["fps"], document["encoding"]) == ("orbit", 12.5, "GIF")
     assert (tmp_path / "a.gif").read_bytes()[:6] == b"GIF89a"
     said = run("render", small_scene, "--path", "turntable", "--frames", 2, "-o", "orbit", code=0).err
-    assert names(said, "degrees about the scene's middle", "--path orbit")  # beyond the photos
+    assert names(said, "degrees about the scene's centre", "--path orbit")  # beyond the photos
     assert list(listing(tmp_path / "orbit")) == ["frame_00000.png", "frame_00001.png"]
 
 

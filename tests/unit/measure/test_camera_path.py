@@ -14,8 +14,8 @@ from sweeps import sweep
 from gsmerge.geometry import camera_centres, motion_matrices, project
 from gsmerge.kernels import elementary
 from gsmerge.measure.camera_path import (
-    ACROSS,
-    UPRIGHT,
+    HORIZONTAL,
+    VERTICAL,
     CameraPath,
     median_camera,
     orbit,
@@ -179,13 +179,13 @@ def test_an_orbit_is_closed_even_upright_and_looks_at_its_middle(walk: Cameras, 
         assert steps.max() / steps.min() < (1.01 if count > 50 else 1.2)
 
 
-@sweep(("apart", "radius"), [(0.0, ACROSS[0] * DEPTH), (0.5, 0.5), (9.0, ACROSS[1] * DEPTH)], often=2)
+@sweep(("apart", "radius"), [(0.0, HORIZONTAL[0] * DEPTH), (0.5, 0.5), (9.0, HORIZONTAL[1] * DEPTH)], often=2)
 def test_an_orbit_is_as_wide_as_the_cameras_stand_within_limits(apart: float, radius: float) -> None:
     places = [[-apart, 0, 0], [0, 0, 0], [apart, 0, 0]]
     cameras = make_cameras(places, np.zeros((3, 3)).tolist())
     centres = camera_centres(orbit(cameras, DEPTH, 100).viewmats)
     assert median_camera(cameras) == (1 if apart else 0)
-    assert np.abs(centres).max(0)[:2] == pytest.approx([radius, UPRIGHT[0] * DEPTH], rel=0.01)
+    assert np.abs(centres).max(0)[:2] == pytest.approx([radius, VERTICAL[0] * DEPTH], rel=0.01)
 
 
 def test_the_middle_camera_is_none_that_looks_elsewhere() -> None:

@@ -14,13 +14,13 @@ from gsmerge import Scene
 from gsmerge.errors import SceneError
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.measure.error_maps import (
-    MOST,
+    MAX_ERROR,
     STOPS,
     UNKNOWN,
-    call_witnesses,
     draw_errors,
     draw_sheets,
     expected_errors,
+    make_reference,
     require_photos,
 )
 from gsmerge.types import Views
@@ -37,7 +37,7 @@ def wall() -> Scene:
 def errors_of(scene: Scene, view: int) -> np.ndarray:
     assert scene.images is not None
     views = Views(scene.cameras, scene.images, scene.names)
-    return expected_errors(call_witnesses(scene.gaussians, views), scene.cameras[[view]], view)
+    return expected_errors(make_reference(scene.gaussians, views), scene.cameras[[view]], view)
 
 
 def test_what_other_photos_confirm_is_likely_right(wall: Scene) -> None:
@@ -75,7 +75,7 @@ def test_where_no_other_photo_looks_nothing_is_known(wall: Scene) -> None:
     turned = wall.cameras.viewmats.copy()
     turned[1:] = np.diag([-1.0, 1, -1, 1]) @ turned[1:]
     away = Views(replace(wall.cameras, viewmats=turned), wall.images, wall.names)
-    errors = expected_errors(call_witnesses(wall.gaussians, away), wall.cameras[[0]], 0)
+    errors = expected_errors(make_reference(wall.gaussians, away), wall.cameras[[0]], 0)
     assert np.isnan(errors).all()
     assert (draw_errors(errors) == UNKNOWN).all()
 
@@ -93,11 +93,11 @@ def test_views_without_a_photo_say_nothing(wall: Scene) -> None:
     assert [view for _, view, _ in draw_sheets(alone, {"small": wall.gaussians}, None, {})] == [0]
     assert wall.images is not None
     views = Views(wall.cameras, wall.images, wall.names)
-    assert np.isnan(expected_errors(call_witnesses(wall.gaussians, views, masks), wall.cameras[[0]], 0)).all()
+    assert np.isnan(expected_errors(make_reference(wall.gaussians, views, masks), wall.cameras[[0]], 0)).all()
 
 
 def test_colours_go_from_none_to_much() -> None:
-    picture = draw_errors(np.array([[0, MOST, 9, np.nan, MOST / 4]], np.float32))
+    picture = draw_errors(np.array([[0, MAX_ERROR, 9, np.nan, MAX_ERROR / 4]], np.float32))
     assert [tuple(color) for color in picture[0]] == [STOPS[0], STOPS[-1], STOPS[-1], UNKNOWN, STOPS[1]]
 
 

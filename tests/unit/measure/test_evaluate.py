@@ -124,7 +124,7 @@ def test_without_photos_and_pixels_the_input_s_renders_are_the_reference(scene: 
     assert actual.reference == "renders of the input"
     assert all(math.isinf(s.full.psnr or 0) for s in actual.results[0].scores)
     assert all((s.full.psnr or 99) < 60 for s in actual.results[1].scores)
-    assert "flatter" in actual.notes[0]
+    assert "no held-out views" in actual.notes[0]
     document = json.loads(to_json(evaluation_document(actual, {})))
     assert document["results"][0]["mean"]["context"]["psnr"] is None  # strict JSON knows no infinity
 

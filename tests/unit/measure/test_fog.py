@@ -20,7 +20,7 @@ from gsmerge.measure.fog import (
     HAZE,
     VEILED,
     Fog,
-    Sight,
+    OutsidePicture,
     count_pixels,
     describe_fog,
     mean_fog,
@@ -125,7 +125,8 @@ def test_a_veil_is_what_stands_before_seven_tenths_of_a_surface() -> None:
     few = np.zeros((4, 4))
     few[0, 3] = 0.95
     counts = [
-        count_pixels(Sight(given, given, 2 * ones), Sight(seen, seen, half)) for given in (seen, few, np.zeros((4, 4)))
+        count_pixels(OutsidePicture(given, given, 2 * ones), OutsidePicture(seen, seen, half))
+        for given in (seen, few, np.zeros((4, 4)))
     ]
     fog = mean_fog(np.stack(counts))
     assert (fog.veil, fog.veil_worst) == (0.75, 1)
@@ -133,7 +134,7 @@ def test_a_veil_is_what_stands_before_seven_tenths_of_a_surface() -> None:
 
 def pixels(given: np.ndarray, result: np.ndarray) -> np.ndarray:
     """Count the pixels of two pictures of opacities at one depth."""
-    return count_pixels(*(Sight(one, one, np.ones_like(one)) for one in (given, result)))
+    return count_pixels(*(OutsidePicture(one, one, np.ones_like(one)) for one in (given, result)))
 
 
 def test_missing_pieces_are_holes() -> None:

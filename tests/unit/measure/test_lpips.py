@@ -158,12 +158,12 @@ def test_references_that_are_remembered_change_nothing(package: Path) -> None:
     photos = [RNG.random((32, 32, 3), np.float32) for _ in range(perceptual.MAX_CACHED + 2)]
     fresh = []
     for photo in photos:
-        perceptual._kept_features.cache_clear()
+        perceptual._cached_features.cache_clear()
         fresh.append(lpips(FIRST[:32, :32], photo, "vgg"))
-    perceptual._kept_features.cache_clear()
+    perceptual._cached_features.cache_clear()
     for _ in range(2):
         assert [lpips(FIRST[:32, :32], photo, "vgg") for photo in photos] == fresh
-        assert perceptual._kept_features.cache_info().currsize == perceptual.MAX_CACHED
+        assert perceptual._cached_features.cache_info().currsize == perceptual.MAX_CACHED
     changed = photos[-1].copy()
     changed[0, 0, 0] += 0.5
     assert lpips(FIRST[:32, :32], changed, "vgg") != fresh[-1]
@@ -171,9 +171,9 @@ def test_references_that_are_remembered_change_nothing(package: Path) -> None:
 
 def test_large_references_are_not_remembered(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(perceptual, "MAX_CACHED_PIXELS", 32 * 32)
-    perceptual._kept_features.cache_clear()
+    perceptual._cached_features.cache_clear()
     lpips(FIRST, SECOND, "vgg")
-    assert perceptual._kept_features.cache_info().currsize == 0
+    assert perceptual._cached_features.cache_info().currsize == 0
 
 
 def test_tensors_and_odd_arrays_give_the_same(package: Path) -> None:
