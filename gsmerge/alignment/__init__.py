@@ -1,11 +1,18 @@
-"""Find cameras that show Gaussians in their place, the pixel of each row, and estimate cameras; modules are private.
+"""Align rows with cameras: find the pixel of each row, and the cameras that show the Gaussians in place.
 
-``rows_first`` takes files that are plain, or leads the search: by layouts of as many rows (``layouts``) at a size that
-cameras and photos can have (``grids``), whose views ``match`` finds among the file's cameras, in which of the
-``frames``; by ``centres`` of pixels; and by the grid that rows show (``row_grid``). ``score`` measures readings,
-``judge`` takes one, and ``explain`` says why none fits. ``cameras`` reads or moves poses, ``unaligned`` chooses those
-of rows without pixels, ``upright`` those of rows in a frame that no file has, ``estimate`` (with ``dropped_rows``) and
-``focal`` solve for cameras. What few files need loads at first use.
+``rows_first`` controls the search. It accepts plain files at once, whose rows are the pixels in order. For other files
+it tries in turn:
+
+- layouts (``layouts``) that have the right number of rows, at each size that cameras and photos can have (``grids``):
+  ``match`` finds the camera of each view, and the frame (``frames``) of the cameras in the world of the Gaussians;
+- cameras under which the Gaussians lie on the centres of pixels (``centres``);
+- the grid that the rows themselves show (``row_grid``).
+
+``score`` measures how well a layout fits, ``judge`` chooses one, and ``explain`` reports why none fits. ``cameras``
+reads poses in other conventions and moves inexact cameras. ``unaligned`` chooses cameras for rows without pixels, and
+``upright`` for rows in a frame that no file stores. ``estimate`` (with ``dropped_rows``) and ``focal`` solve for
+cameras that no file gives. ``depth_choice`` and ``dropped_depths`` use depth maps. Modules are private; those that few
+files need are loaded at first use.
 """
 
 # ruff: noqa: F401  names for other packages
@@ -31,26 +38,26 @@ from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, che
 
 if TYPE_CHECKING:
     from gsmerge.alignment.cameras import move_cameras, other_conventions
-    from gsmerge.alignment.doubted_depths import choose_depths
+    from gsmerge.alignment.depth_choice import choose_depths
     from gsmerge.alignment.dropped_depths import fill_from_depths
     from gsmerge.alignment.estimate import estimate_cameras, estimate_from_rows
     from gsmerge.alignment.explain import explain_misalignment, misalignment_error
     from gsmerge.alignment.focal import estimate_focal
     from gsmerge.alignment.unaligned import check_cameras, choose_poses
 
-_LATER = {
+_LOADED_LATER = {
     "cameras": ("move_cameras", "other_conventions"),
-    "doubted_depths": ("choose_depths",),
+    "depth_choice": ("choose_depths",),
     "dropped_depths": ("fill_from_depths",),
     "estimate": ("estimate_cameras", "estimate_from_rows"),
     "explain": ("explain_misalignment", "misalignment_error"),
     "focal": ("estimate_focal",),
     "unaligned": ("check_cameras", "choose_poses"),
 }
-_HOMES = {name: home for home, names in _LATER.items() for name in names}
+_MODULES = {name: module for module, names in _LOADED_LATER.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -1,7 +1,7 @@
-"""Calibrate cameras from points and the pixels that show them: poses, and common or separate intrinsics.
+"""Calibrate cameras from points and their pixels: poses, and intrinsics for each view or common to all.
 
-Intrinsics are as simple as the points allow: of several models that with the smallest Bayesian information criterion
-(Schwarz 1978) is chosen.
+Intrinsics are as simple as the points allow: of several models, the one with the smallest Bayesian information
+criterion is chosen (Schwarz 1978).
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
-_FOCALS = (1.2, 4.8)  # of the longer side, with which the search for a focal length begins
+_FOCALS = (1.2, 4.8)  # focal lengths, over the longer side, at which the search begins
 _FREE = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
-_ROUNDS = 2  # each time without the points that lie far from their pixels
-_FAR, _FAR_PX = 3.0, 1.0  # times the median, and pixels, from which a point is far
-_SMALLEST_PX = 1e-3  # distances are compared as if none were smaller: means have 24 bits
-_MAX_UNCERTAINTY = 0.05  # of the focal length: points that are nearly a plane in front of the camera
+_ROUNDS = 2  # of solving; each round leaves out the points that the round before found far from their pixels
+_FAR, _FAR_PX = 3.0, 1.0  # a point is far beyond that many times the median distance and that many pixels
+_SMALLEST_PX = 1e-3  # smaller distances count as this, since means have only 24 bits
+_MAX_UNCERTAINTY = 0.05  # of the focal length, relative; larger where points are nearly a plane in front of the camera
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Cameras of v views, and how near points lie to the pixels that show them."""
+    """Cameras of v views, and the distance of the points from their pixels."""
 
     cameras: Cameras
     worst_px: float  # largest median distance of a view, pixels
@@ -48,12 +48,12 @@ class Calibration:
 
 @dataclass(frozen=True)
 class _Model:
-    """Intrinsics ``Ks [v,3,3]`` and poses ``[v,4,4]``, how many intrinsics are free, and what is left to explain."""
+    """Cameras of v views with a number of free intrinsics, and their residuals."""
 
-    Ks: np.ndarray
-    poses: np.ndarray
-    free: int
-    errors: tuple[np.ndarray, ...]  # distances from the pixels, of each view
+    Ks: np.ndarray  # [v,3,3]
+    poses: np.ndarray  # [v,4,4] world to camera
+    free: int  # number of free intrinsics, over all views
+    errors: tuple[np.ndarray, ...]  # of each view, distances of its points from their pixels
 
     @property
     def worst_px(self) -> float:
@@ -62,7 +62,7 @@ class _Model:
         return worst if math.isfinite(worst) else math.inf
 
     def criterion(self, far: float) -> float:
-        """Compute the Bayesian information criterion, with distances cut off at ``far`` pixels."""
+        """Compute the Bayesian information criterion, with distances clipped at ``far`` pixels."""
         with np.errstate(invalid="ignore"):
             errors = np.nan_to_num(np.concatenate(self.errors), nan=far).clip(_SMALLEST_PX, far)
         count = 2.0 * len(errors)
@@ -72,8 +72,8 @@ class _Model:
 def calibrate(pairs: Correspondences, width: int, height: int, count: int = 0) -> Calibration | None:
     """Calibrate the cameras of views of ``width`` x ``height`` pixels from ``pairs`` of Gaussians and pixels.
 
-    There are ``count`` views, or as many as pairs show; one without pairs has the camera of the view before. None where
-    the points do not determine cameras, or where Gaussians lie farther from their pixels than is allowed.
+    ``count`` is the least number of views; pairs of later views add to it. A view without pairs gets the camera of the
+    view before. None if the points do not determine the cameras, or if they lie farther from their pixels than allowed.
     """
     if not len(pairs.rows):
         return None
@@ -90,24 +90,29 @@ def calibrate(pairs: Correspondences, width: int, height: int, count: int = 0) -
         return None
     viewmats = model.poses.copy()
     viewmats[:, :3, 3] = unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], middle)
-    every = np.arange(max(count, int(numbers[-1]) + 1))
-    camera = np.maximum(np.searchsorted(numbers, every, side="right") - 1, 0)
+    all_views = np.arange(max(count, int(numbers[-1]) + 1))
+    camera = np.maximum(np.searchsorted(numbers, all_views, side="right") - 1, 0)
     return Calibration(Cameras(viewmats[camera], model.Ks[camera], width, height), model.worst_px)
 
 
 def _choose_model(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float
 ) -> _Model | None:
-    """Choose the simplest intrinsics that explain the pixels; ``bound``: error of projective cameras, pixels."""
+    """Choose the simplest intrinsics that explain the pixels; ``bound`` is the error of projective cameras, pixels."""
     models: list[_Model] = []
-    with suppress(np.linalg.LinAlgError):  # of a model that the points do not determine; the simple ones come first
-        models.extend(_models(points, pixels, size, bound))
+    with suppress(np.linalg.LinAlgError):  # raised at the first model that the points do not determine
+        models.extend(_solve_models(points, pixels, size, bound))
     far = max(_FAR_PX, _FAR * min((model.worst_px for model in models), default=math.inf))
     return min(models, key=lambda model: model.criterion(far), default=None)
 
 
-def _models(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float) -> Iterator[_Model]:
-    """Yield models with common intrinsics, then with separate intrinsics if common ones leave an error to explain."""
+def _solve_models(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float
+) -> Iterator[_Model]:
+    """Yield models from simple to complex: with intrinsics common to all views, then with intrinsics for each view.
+
+    The latter are left out if common intrinsics are already as near to the pixels as projective cameras.
+    """
     simple = []
     for share in _FOCALS:
         focal = share * max(size)
@@ -122,7 +127,7 @@ def _models(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Si
             simple += [model] if free == ONE_FOCAL else []
             start = start if free == ONE_FOCAL else model
             yield model
-        if is_as_near(model.worst_px, bound):  # nothing is left to explain
+        if is_as_near(model.worst_px, bound):  # more intrinsics cannot be nearer
             return
     model = min(simple, key=lambda model: model.worst_px)
     for free in _FREE if len(points) > 1 else ():
@@ -134,11 +139,15 @@ def _models(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Si
 
 
 def _solve(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start: _Model, free: int) -> _Model:
-    """Solve for poses and ``free`` common intrinsics; numpy.linalg.LinAlgError where points do not determine them."""
-    K, poses, near, where = start.Ks[0], start.poses, points, pixels
+    """Solve for poses and ``free`` common intrinsics.
+
+    Raises numpy.linalg.LinAlgError if the points do not determine them.
+    """
+    K, poses, near_points, near_pixels = start.Ks[0], start.poses, points, pixels
     for _ in range(_ROUNDS):
-        K, poses = refine_poses(near, where, K, poses, free=free)
+        K, poses = refine_poses(near_points, near_pixels, K, poses, free=free)
         errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]
-        kept = [e <= max(_FAR_PX, _FAR * float(np.median(e))) for e in errors]
-        near, where = ([part[k] for part, k in zip(parts, kept, strict=True)] for parts in (points, pixels))
+        are_near = [e <= max(_FAR_PX, _FAR * float(np.median(e))) for e in errors]
+        near_points = [part[near] for part, near in zip(points, are_near, strict=True)]
+        near_pixels = [part[near] for part, near in zip(pixels, are_near, strict=True)]
     return _Model(np.tile(K, (len(poses), 1, 1)), poses, free, tuple(errors))

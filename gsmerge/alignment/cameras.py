@@ -1,8 +1,8 @@
 """Read poses in another convention, and move inexact cameras.
 
-Models that predict poses write Gaussians and cameras that differ a little. A pose for each view follows from its
-pixels and their Gaussians alone; the photos show much later which of the two was wrong
-(``gsmerge/facts/move_poses.py``).
+Models that predict poses write Gaussians that lie a little beside the pixels of their cameras. The pixels of a view and
+their Gaussians determine its pose. Here the cameras are moved to these poses; whether the cameras or the Gaussians were
+wrong is decided later, from the photos (``gsmerge/facts/move_poses.py``).
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from gsmerge.io.photo_files import NO_IMAGES
 from gsmerge.kernels.matrices import invert, matmul, transform
 from gsmerge.types import Cameras
 
-_SAME = 1e-6  # of the cameras' distances: no difference
+_SAME = 1e-6  # tolerance for equal poses, relative to the largest number in them
 
-MAX_PX, MAX_SHARE = 12.0, 0.05  # pixels, and share of a small image's side, that cameras may be off
-NEAR_PX = 0.5  # cameras that are nearer stay where they are
-SAME_FOCAL = 0.01  # by which focal lengths of other intrinsics may differ, relative, where they count as the same
-CLEAR = 0.96  # of the difference of colours between photos that other poses leave: better
+MAX_PX, MAX_SHARE = 12.0, 0.05  # error up to which cameras are moved: pixels, and share of the side of small images
+NEAR_PX = 0.5  # cameras with smaller errors are not moved
+SAME_FOCAL = 0.01  # largest relative difference of focal lengths that count as equal
+CLEAR = 0.96  # the given poses are better if they reduce the disagreement between photos to this share
 _LINE_ROUNDS = 4  # of reweighted least squares
 
 
@@ -56,21 +56,21 @@ def describe_convention(convention: Convention) -> str:
     return f"{convention[0]} matrices with {convention[1]} axes"
 
 
-def describe_reading(convention: Convention, usual: Convention) -> str:
-    """Describe in words that poses fit in a ``convention`` other than ``usual``, that of the format."""
+def describe_other_convention(convention: Convention, usual: Convention) -> str:
+    """Describe in words that poses fit in a ``convention`` other than ``usual``, the convention of the format."""
     words = describe_convention(convention)
     return f"the poses fit when read as {words}, where this format has {usual[0]} with {usual[1]} axes"
 
 
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
-    """List the poses ``viewmats [c,4,4]`` as read in each other convention, without duplicates."""
-    stored, readings = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
+    """List the poses ``viewmats [c,4,4]`` as they are in each other convention, without duplicates."""
+    stored, all_poses = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
     for other in CONVENTIONS:
-        read = to_viewmats(stored, other)
-        stacks = [poses.viewmats for poses in readings]
-        if not any(np.allclose(read, stack, atol=_SAME * (1 + np.abs(stack).max())) for stack in stacks):
-            readings.append(Poses(other, read))
-    return readings[1:]
+        converted = to_viewmats(stored, other)
+        stacks = [poses.viewmats for poses in all_poses]
+        if not any(np.allclose(converted, stack, atol=_SAME * (1 + np.abs(stack).max())) for stack in stacks):
+            all_poses.append(Poses(other, converted))
+    return all_poses[1:]
 
 
 @dataclass(frozen=True)
@@ -78,13 +78,13 @@ class MovedCameras:
     """Cameras moved to fit their Gaussians, and how far each was moved."""
 
     cameras: Cameras
-    worst_px: float  # the largest median distance of a view's Gaussians from their pixels before
-    moves: list[dict[str, Any]]  # of every view, see list_moves; empty where the principal points alone were wrong
-    confirmed: bool = False  # whether the photos agree better if the Gaussians are moved to the given cameras instead
+    worst_px: float  # largest median distance of a view's Gaussians from their pixels, before the move
+    moves: list[dict[str, Any]]  # of every view, see list_moves; empty if only the principal points were wrong
+    confirmed: bool = False  # True if photos confirm the given cameras, so the Gaussians have to be moved instead
 
     @property
     def note(self) -> str:
-        """Sentence for the user about the move."""
+        """Note about the move, one sentence."""
         if not self.moves:
             x, y = (self.cameras.Ks[:, :2, 2] - (self.cameras.width / 2, self.cameras.height / 2)).mean(0)
             return f"principal points lie ({x:.1f}, {y:.1f}) px from the middle, as the Gaussians' pixels show"
@@ -101,7 +101,7 @@ class MovedCameras:
 
 
 def max_pixels(width: int, height: int) -> float:
-    """Return the largest median distance, pixels, by which cameras may be moved; beyond it scenes are refused."""
+    """Return the largest median error, pixels, that moving a camera may correct."""
     return max(pixel_limit(width, height), min(MAX_PX, MAX_SHARE * math.sqrt(width * height)))
 
 
@@ -110,10 +110,10 @@ def move_cameras(
 ) -> MovedCameras | None:
     """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far off.
 
-    ``images [c,h,w,3]`` are photos that may show the given poses to be right.
+    ``images [c,h,w,3]`` are photos, which may confirm the given poses.
 
-    Where the intrinsics rather than the poses are wrong, principal points in the middle, which are likely no more than
-    assumed, are moved; other intrinsics raise SceneError, which names ``source``.
+    If changed intrinsics fit as well as moved poses, only principal points in the middle of the image are moved,
+    because these are probably just assumed. Other changes of intrinsics raise SceneError, which names ``source``.
     """
     before = check_pairs(pairs, cameras)
     if not before.worst_px <= max_pixels(cameras.width, cameras.height):
@@ -139,14 +139,17 @@ def move_cameras(
 
 
 def _photos_confirm(pairs: Correspondences, images: np.ndarray, given: Cameras, moved: Cameras) -> bool:
-    """Return whether photos agree better from the given poses, each with the Gaussians of its view, than moved."""
+    """Return True if photos agree better from the given poses than from the moved ones.
+
+    For the given poses the Gaussians of each view are moved with its camera.
+    """
     motions = matmul(invert(given.viewmats), moved.viewmats)[pairs.views]
     points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
     return _disagreement(points, pairs, images, given) < CLEAR * _disagreement(pairs.points, pairs, images, moved)
 
 
 def _disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:
-    """Measure the median distance of colours between photos of the same points; inf where only one shows each."""
+    """Measure the median difference in colour between photos of the same points; inf if no point is in two photos."""
     x, y = pairs.pixels.astype(np.int64).T
     own, errors = photo_colors(images, pairs.views, y, x), []
     for view in range(len(cameras)):
@@ -178,8 +181,11 @@ def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -> Cameras | None:
-    """Change all intrinsics in one way that fits the Gaussians as well as moved poses do; None if none does."""
-    if len(np.unique(pairs.views)) < 2:  # in one view a turn and a shift of the picture are one
+    """Scale and shift the intrinsics of all views alike, so that they fit as well as moved poses; None if they cannot.
+
+    ``moved_px`` is the largest median error of the moved poses, pixels.
+    """
+    if len(np.unique(pairs.views)) < 2:  # in a single view a shift of the picture cannot be told from a rotation
         return None
     with np.errstate(all="ignore"):
         places, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
@@ -195,7 +201,7 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
 
 
 def _check_assumed(cameras: Cameras, other: Cameras, before_px: float, source: str) -> None:
-    """Raise SceneError if intrinsics that fit differ in more than principal points that were in the middle."""
+    """Raise SceneError unless only principal points differ that were in the middle of the image."""
     factors = other.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
     middle = cameras.width / 2, cameras.height / 2
     if (cameras.Ks[:, :2, 2] == middle).all() and (np.abs(factors - 1) <= SAME_FOCAL).all():
@@ -203,8 +209,8 @@ def _check_assumed(cameras: Cameras, other: Cameras, before_px: float, source: s
     x, y = (other.Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
     raise SceneError(
         source,
-        f"expected intrinsics that fit the Gaussians, found others, under which they lie {before_px:.1f} px off their"
-        " pixels in every view alike",
+        f"expected intrinsics that fit the Gaussians, found ones that put them {before_px:.1f} px off their pixels in"
+        " the same way in every view",
         f"multiply fx by {factors[0]:.4g} and fy by {factors[1]:.4g}, and add {x:.2f} to cx and {y:.2f} to cy"
         f" (pixels of {cameras.width} x {cameras.height})",
     )

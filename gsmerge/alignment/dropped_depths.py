@@ -1,4 +1,4 @@
-"""Fill pixels that an exporter dropped, borders and the farthest ones, from depth maps."""
+"""Fill pixels that an exporter dropped, at borders and far away, from depth maps."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from gsmerge.geometry import camera_depths, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Gaussians, Scene, fill_pixels
 
-_MAX_SPREAD = 0.15  # of the Gaussians' depth over a depth map's: above it the map is not that of the Gaussians
+_MAX_SPREAD = 0.15  # median relative deviation of depth ratios; above it the map does not belong to the Gaussians
 
 
 def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scene:
-    """Add a Gaussian at the depth of ``maps [v,h,w]`` for each pixel without one.
+    """Add a Gaussian at the depth of ``maps [v,h,w]`` for each pixel without a Gaussian.
 
-    The unit of the depths, and whether they are along z or distances, follow from the other pixels. Colours are those
-    of the photos ``images [v,h,w,3]``. Opacity, rotation and size in pixels are copied from the pixel before. The scene
-    is returned unchanged if its Gaussians do not lie at the depths of the maps.
+    The unit of the maps follows from the pixels with a Gaussian, and so does their kind: depth along z or distance. The
+    colours of new Gaussians are those of the photos ``images [v,h,w,3]``. Their opacity, rotation and size in pixels
+    are copied from the previous pixel with a Gaussian. The scene is returned unchanged if its Gaussians do not lie at
+    the depths of the maps.
     """
     g, V, fronts = scene.gaussians, scene.cameras.viewmats, scene.get_pixels().fronts.reshape(len(scene), -1)
     height, width = scene.cameras.height, scene.cameras.width
@@ -31,22 +32,22 @@ def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scen
         return scene
     ratio = z[usable] / maps[usable]
     fits = []
-    for along, ratios in enumerate((ratio, ratio * length[usable])):  # depth along z, distance
+    for is_distance, ratios in enumerate((ratio, ratio * length[usable])):
         middle = float(np.median(ratios))
-        fits.append((float(np.median(np.abs(ratios / middle - 1))), middle, along))
-    spread, unit, along = min(fits)
+        fits.append((float(np.median(np.abs(ratios / middle - 1))), middle, is_distance))
+    spread, unit, is_distance = min(fits)
     if spread > _MAX_SPREAD:
         return scene
     places = np.flatnonzero((fronts < 0) & known)
     views = places // (height * width)
-    new_z = (unit * maps / (length if along else 1)).reshape(-1)[places]
+    new_z = (unit * maps / (length if is_distance else 1)).reshape(-1)[places]
     local = rays.reshape(-1, 3)[places] * new_z[:, None]
     means = (V[views, :3, :3] * (local - V[views, :3, 3])[:, :, None]).sum(1)
-    before = np.flatnonzero(usable)
-    before = before[np.maximum(np.searchsorted(before, places) - 1, 0)]
-    like = g[fronts.reshape(-1)[before]]
-    scales = like.scales * (new_z / z.reshape(-1)[before]).astype(np.float32)[:, None]
+    previous = np.flatnonzero(usable)
+    previous = previous[np.maximum(np.searchsorted(previous, places) - 1, 0)]
+    models = g[fronts.reshape(-1)[previous]]
+    scales = models.scales * (new_z / z.reshape(-1)[previous]).astype(np.float32)[:, None]
     sh0 = rgb_to_sh0(images.reshape(-1, 1, 3)[places]).astype(g.sh0.dtype)
     means = means.astype(g.means.dtype)
-    added = Gaussians(means, like.quats, scales, like.opacities, sh0, np.zeros_like(like.shN))
+    added = Gaussians(means, models.quats, scales, models.opacities, sh0, np.zeros_like(models.shN))
     return fill_pixels(scene, added, places)

@@ -1,8 +1,8 @@
-"""Find the grid of rows that lack some pixels, from the rows alone: view after view, and line after line in each.
+"""Find the grid of rows from the rows alone if some pixels have no row; rows are view by view and line by line.
 
-Where whole lines follow each other, as of views without borders and far pixels, the step back to the left repeats after
-a line. A projective camera that shows a few of them in their pixels shows the lines before and after in theirs, up to
-where the rows of a view end, and also those that lack pixels.
+Some lines are complete, for example in the middle of views without borders and far pixels. Between complete lines, the
+long step back to the left edge repeats once per line. A projective camera is solved from a few such lines. It then
+shows the lines before and after them in their pixels, also the incomplete ones, up to the end of the view.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from gsmerge.alignment.score import find_correspondences, is_as_near
 from gsmerge.kernels.matrices import matmul
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line
-_LOOKED_AT = 1500  # rows whose nearest neighbour is searched among those that follow
-_ALIKE, _LENGTHS = 0.02, 2  # share of them that have it as far, and such distances that are tried
-_SEEDS, _TRIED = 12, 200  # series of lines: looked at first, and solved
-_RARE = 0.05  # of the lines that a column has, at least
-_WRAP, _BELOW = 8.0, 0.25  # times the usual step: back to the left; share of it at most, to the pixel below
-_MOST_JUMPS = 100  # in a line; more are rows in no order
-_MIN_LINES = 6  # whole lines in a row
+_SAMPLES = 1500  # rows whose nearest neighbour is searched among the rows after them
+_MIN_SHARE, _MAX_LENGTHS = 0.02, 2  # share of samples with the same distance in rows; number of distances tried
+_SEEDS, _MAX_SERIES = 12, 200  # number of series of lines that are solved first, and in all
+_RARE = 0.05  # columns in a smaller share of the lines than the fullest column are left out
+_WRAP, _BELOW = 8.0, 0.25  # least step back to the left, over the usual step; largest step down, over the step back
+_MAX_JUMPS = 100  # long steps per line; with more, rows are in no order
+_MIN_LINES = 6  # complete lines that follow each other
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 1.0  # median distance of rows from their pixels
-_SAME = 2  # pixels by which the principal point may be off
-_AHEAD, _MIN_AHEAD = 0.3, 2  # lines that a camera is trusted beyond those it is solved from, as a share, and at least
-_MOST_LOST = 16  # rows one after the other that follow no pixels: another view begins
-_MIN_PLACED = 0.9  # share of the rows that come to a pixel
+_SAME = 2  # pixels of tolerance for the principal point
+_AHEAD, _MIN_AHEAD = 0.3, 2  # lines beyond the solved ones that a camera predicts: as a share of these, and at least
+_MAX_LOST = 16  # consecutive rows without a pixel, after which another view begins
+_MIN_PLACED = 0.9  # share of the rows that must have a pixel
 
 
 def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Calibration] | None:
-    """Find the pixels of rows ``means [n,3]`` that lack some, and the cameras of their views; None for other rows.
+    """Find the pixels of rows ``means [n,3]`` and the cameras of their views, if some pixels have no row.
 
-    ``valid [n]`` bool. The grid has the lines and columns that some rows have.
+    ``valid [n]`` bool. The grid has only lines and columns with rows. None if the rows are in no such order.
     """
     rows = np.flatnonzero(valid)
     if len(rows) < _MIN_LINES * _MIN_SIDE:
@@ -57,38 +57,39 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
 
 
 def _find_lengths(points: np.ndarray) -> list[int]:
-    """Find after how many rows most often the nearest neighbour of a row follows."""
-    most = min(_MAX_WIDTH, len(points) // 4)
-    starts = np.linspace(0, len(points) - most - 1, _LOOKED_AT).astype(int)
+    """List the most common distances in rows from a row to its nearest neighbour after it: lengths of lines."""
+    longest = min(_MAX_WIDTH, len(points) // 4)
+    starts = np.linspace(0, len(points) - longest - 1, _SAMPLES).astype(int)
     x, y, z = points.T.astype(np.float32)
 
     def find_nearest(start: int) -> int:
-        rows = slice(start + _MIN_SIDE, start + most)
+        rows = slice(start + _MIN_SIDE, start + longest)
         right, down, ahead = x[rows] - x[start], y[rows] - y[start], z[rows] - z[start]
         return _MIN_SIDE + int(np.argmin(right * right + down * down + ahead * ahead))
 
-    counts = np.bincount([find_nearest(start) for start in starts], minlength=2 * most)
+    counts = np.bincount([find_nearest(start) for start in starts], minlength=2 * longest)
     beside = np.maximum(np.roll(counts, 1), np.roll(counts, -1))
     peaks = np.where(counts >= beside, counts, 0)
-    return [int(lag) for lag in np.argsort(-peaks, kind="stable")[:_LENGTHS] if peaks[lag] >= _ALIKE * len(starts)]
+    highest = np.argsort(-peaks, kind="stable")[:_MAX_LENGTHS]
+    return [int(length) for length in highest if peaks[length] >= _MIN_SHARE * len(starts)]
 
 
 @dataclass(frozen=True)
 class _View:
-    """Consecutive rows of one view, with their pixels; lines are counted from any of them."""
+    """Consecutive rows of one view, with their pixels; the origin of the pixels is arbitrary."""
 
     rows: np.ndarray  # ``[p]`` in order
-    x: np.ndarray
-    y: np.ndarray
+    x: np.ndarray  # ``[p]``
+    y: np.ndarray  # ``[p]``
     camera: np.ndarray  # ``[3,4]`` projective
     px: float = np.inf  # median distance of rows from their pixels
 
 
 def _find_views(points: np.ndarray, length: int) -> list[_View]:
     """Find the views whose lines have ``length`` rows."""
-    series = _find_lines(points, length)[:_TRIED]
-    first = [_solve_lines(points, starts) for starts in series[:_SEEDS]]
-    nearest = min((seed.px for seed in first if seed is not None), default=None)
+    series = _find_lines(points, length)[:_MAX_SERIES]
+    seeds = [_solve_lines(points, starts) for starts in series[:_SEEDS]]
+    nearest = min((seed.px for seed in seeds if seed is not None), default=None)
     if nearest is None:
         return []
     views = list[_View]()
@@ -96,38 +97,38 @@ def _find_views(points: np.ndarray, length: int) -> list[_View]:
     for i, starts in enumerate(series):
         if not free[starts[0] : starts[-1]].all():
             continue
-        seed = first[i] if i < len(first) else _solve_lines(points, starts)
+        seed = seeds[i] if i < len(seeds) else _solve_lines(points, starts)
         if seed is not None and is_as_near(seed.px, nearest):
             view = _grow(points, free, seed, length)
             free[view.rows[0] : view.rows[-1] + 1] = False
-            views.append(_common_columns(view))
+            views.append(_drop_rare_columns(view))
     return sorted(views, key=lambda view: int(view.rows[0]))
 
 
 def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
-    """Find series of rows with which lines begin, one below the other and ``length`` apart; the longest first.
+    """Find series of rows that begin consecutive lines, ``length`` rows apart; the longest series first.
 
-    Where a line begins a long step leads back near to where the line before began.
+    The first row of a line follows a long step back to the left, and lies near the first row of the line before.
     """
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     count = len(steps) // length * length
     usual = np.median(steps[:count].reshape(-1, length), 1).repeat(length)
     usual = np.pad(usual, (0, len(steps) - count), mode="edge")
     rows = np.flatnonzero(steps > _WRAP * usual) + 1
-    if len(rows) * length > _MOST_JUMPS * len(points):
+    if len(rows) * length > _MAX_JUMPS * len(points):
         return []
-    jumps, near = steps[rows - 1], points[rows]
-    before, distance = np.full(len(rows), -1), _BELOW * jumps
+    jumps, firsts = steps[rows - 1], points[rows]
+    before, least = np.full(len(rows), -1), _BELOW * jumps  # for each row, the row that begins the line before it
     for back in range(1, len(rows)):
         apart = rows[back:] - rows[:-back]
         if apart.min() > length:
             break
         ids = np.flatnonzero(apart == length)
-        there = np.linalg.norm(near[ids + back] - near[ids], axis=1)
-        closer = there < distance[ids + back]
-        ids, there = ids[closer], there[closer]
-        before[ids + back], distance[ids + back] = ids, there
-    lines = np.zeros(len(rows), np.int64)
+        distances = np.linalg.norm(firsts[ids + back] - firsts[ids], axis=1)
+        closer = distances < least[ids + back]
+        ids, distances = ids[closer], distances[closer]
+        before[ids + back], least[ids + back] = ids, distances
+    lines = np.zeros(len(rows), np.int64)  # number of lines before each
     for i, previous in enumerate(before.tolist()):
         lines[i] = lines[previous] + 1 if previous >= 0 else 0
     series, used = [], np.zeros(len(rows), bool)
@@ -144,31 +145,31 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
 
 
 def _solve_lines(points: np.ndarray, starts: np.ndarray) -> _View | None:
-    """Solve for the camera of the lines of one length that begin at ``starts``; None if they are no lines."""
+    """Solve for the camera of lines of one length that begin at ``starts``; None if the rows do not fit a camera."""
     rows = np.arange(starts[0], starts[-1])
     y, x = np.divmod(rows - starts[0], starts[1] - starts[0])
     view = _solve(points, _View(rows, x, y, np.empty(0)))
     return view if view.px <= _MAX_PX else None
 
 
-def _common_columns(view: _View) -> _View:
-    """Leave out the rows of columns that few lines have; count columns from the first one left."""
+def _drop_rare_columns(view: _View) -> _View:
+    """Leave out the rows of outer columns that few lines have; count columns from the first remaining one."""
     first = int(view.x.min())
     counts = np.bincount(view.x - first)
     common = first + np.flatnonzero(counts >= _RARE * counts.max())
-    kept = (view.x >= common[0]) & (view.x <= common[-1])
-    return _shift(replace(view, rows=view.rows[kept], x=view.x[kept], y=view.y[kept]), -int(common[0]))
+    inside = (view.x >= common[0]) & (view.x <= common[-1])
+    return _shift(replace(view, rows=view.rows[inside], x=view.x[inside], y=view.y[inside]), -int(common[0]))
 
 
 def _shift(view: _View, columns: int) -> _View:
-    """Count columns from another one."""
+    """Add a number to the columns of a view."""
     camera = view.camera.copy()
     camera[0] += columns * camera[2]
     return replace(view, x=view.x + columns, camera=camera)
 
 
 def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _View:
-    """Grow a view over the free rows before and after it, as far as a row in some follows its pixels."""
+    """Extend a view over the free rows before and after it, as long as its camera shows rows in the order of pixels."""
     low, high = _free_range(free, view.rows)
     while True:
         top, lines = int(view.y.min()), int(np.ptp(view.y)) + 1
@@ -179,7 +180,7 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
         part = np.ascontiguousarray(points[first:last], np.float32)
         pixels = follow_rows(part, viewmat[None], shift[None], width, lines + 2 * reach)
         rows = np.flatnonzero(pixels >= 0)
-        stretches = np.split(rows, np.flatnonzero(np.diff(rows) > _MOST_LOST) + 1)
+        stretches = np.split(rows, np.flatnonzero(np.diff(rows) > _MAX_LOST) + 1)
         rows = max(stretches, key=len)
         y, x = np.divmod(pixels[rows], width)
         grown = _solve(points, _View(first + rows, x, y + top - reach, view.camera)) if len(rows) else view
@@ -189,7 +190,7 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
 
 
 def _free_range(free: np.ndarray, rows: np.ndarray) -> tuple[int, int]:
-    """Return the first row and the end of the free rows around some."""
+    """Return the first row and the end of the free rows around ``rows``."""
     before, after = np.flatnonzero(~free[: rows[0]]), np.flatnonzero(~free[rows[-1] :])
     return int(before[-1]) + 1 if len(before) else 0, int(rows[-1] + after[0]) if len(after) else len(free)
 
@@ -204,24 +205,27 @@ def _solve(points: np.ndarray, view: _View) -> _View:
 
 
 def _make_layout(rows: np.ndarray, views: list[_View]) -> Layout:
-    """Lay out views on one grid, in which they have the same principal point."""
-    lefts, width = _place([(view.x, _principal(view, 0)) for view in views])
-    tops, height = _place([(view.y, _principal(view, 1)) for view in views])
+    """Lay out views on grids of one size, so that they have the same principal point."""
+    lefts, width = _choose_shifts([(view.x, _principal(view, 0)) for view in views])
+    tops, height = _choose_shifts([(view.y, _principal(view, 1)) for view in views])
     pixels = tuple((view.y + top) * width + view.x + left for view, top, left in zip(views, tops, lefts, strict=True))
     ids = np.full(rows[-1] + 1, -1)
-    for number, (view, own) in enumerate(zip(views, pixels, strict=True)):
-        ids[rows[view.rows]] = number * height * width + own
+    for number, (view, view_pixels) in enumerate(zip(views, pixels, strict=True)):
+        ids[rows[view.rows]] = number * height * width + view_pixels
     return dropped_layout(ids, len(views), width, height)
 
 
-def _place(views: Sequence[tuple[np.ndarray, float]]) -> tuple[list[int], int]:
-    """Choose the shifts of views along an axis, from their pixels and principal points there; also return the size."""
+def _choose_shifts(views: Sequence[tuple[np.ndarray, float]]) -> tuple[list[int], int]:
+    """Choose the shift of each view along an axis and the size of the grid.
+
+    ``views`` are pairs of the pixels of a view along the axis and the coordinate of its principal point.
+    """
     firsts, middles = np.array([pixels.min() for pixels, _ in views]), np.array([middle for _, middle in views])
     sizes = np.array([pixels.max() for pixels, _ in views]) - firsts + 1
     starts = firsts - middles
     places = np.rint(starts - np.median(starts[sizes == sizes.max()])).astype(int)
-    within = places.clip(0, sizes.max() - sizes)
-    places = np.where(np.abs(places - within) <= _SAME, within, places)
+    inside = places.clip(0, sizes.max() - sizes)  # of the largest view
+    places = np.where(np.abs(places - inside) <= _SAME, inside, places)
     places -= places.min()
     return (places - firsts).tolist(), int((places + sizes).max())
 

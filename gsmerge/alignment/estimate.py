@@ -1,4 +1,4 @@
-"""Estimate cameras where no file gives any, from the pixels that the rows belong to."""
+"""Estimate cameras from the pixels of the rows, if no file gives cameras."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def estimate_cameras(
 ) -> CameraFile | None:
     """Estimate cameras that show each row of a full or trimmed grid in its own pixel.
 
-    ``names`` are the names of the views, which have one of the ``sizes`` (width, height) in pixels; ``valid [n]`` bool;
-    ``path`` is for messages. None if no order of the rows fits at least twice as well as all other orders.
+    ``names`` are the names of the views. All views have one of the ``sizes`` (width, height) in pixels. ``valid [n]``
+    is bool, and ``path`` is for messages. None if no order of the rows fits at least twice as well as all other orders.
     """
     layouts = [each for size in dict.fromkeys(sizes) for each in exact_layouts(len(gaussians), len(names), *size)]
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
@@ -42,9 +42,9 @@ def estimate_cameras(
 
 
 def estimate_from_rows(path: Path, gaussians: Gaussians, valid: np.ndarray) -> CameraFile | None:
-    """Estimate the cameras of rows that form a grid of unknown size, whole or without some pixels; None for other rows.
+    """Estimate the cameras of rows that are the pixels of a grid of unknown size; None for other rows.
 
-    ``valid [n]`` bool; ``path`` is for messages.
+    The grid may lack some pixels. ``valid [n]`` is bool, and ``path`` is for messages.
     """
     grid = find_grid(gaussians, valid) or find_dropped_grid(gaussians.means, valid)
     if grid is None:

@@ -1,4 +1,4 @@
-"""Explain why rows are no pixels of their cameras, in one sentence with a remedy."""
+"""Explain in one sentence, with a remedy, why rows are not the pixels of their cameras."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.alignment.cameras import describe_reading, other_conventions
+from gsmerge.alignment.cameras import describe_other_convention, other_conventions
 from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, exact_layouts, subsample
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
@@ -22,38 +22,43 @@ from gsmerge.io.cameras.camera_file import CameraFile, Convention
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.types import Cameras, Gaussians
 
-_SOME_CAMERA = 4.0  # times the limit, within which rows are pixels of some camera
-_ORDERS = {  # in which rows may be instead, by the order of their layout
+_SOME_CAMERA = 4.0  # times the limit; rows that are nearer to their pixels are the pixels of some projective camera
+_ORDERS = {  # other orders of rows in words, by the order of the layout
     "view-fastest": "row, column, view (view fastest)",
     "column-major": "view, column, row (column-major)",
 }
 
 
 def count_error(ply: FileInfo, cameras: Cameras) -> SceneError:
-    """Make the SceneError for rows that are no pixels of the cameras."""
+    """Make the SceneError for rows that are not the pixels of the cameras."""
     views, width, height = len(cameras), cameras.width, cameras.height
     expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
-    found = f"{ply.count} in no known order" if ply.count == views * height * width else str(ply.count)
-    problem = f"expected one Gaussian per pixel, {expected}, found {found}"
+    actual = f"{ply.count} in no known order" if ply.count == views * height * width else str(ply.count)
+    problem = f"expected one Gaussian per pixel, {expected}, found {actual}"
     return SceneError(ply.path, problem, "give the cameras of their views, in the frame of the Gaussians")
 
 
 def check_frame(inputs: AlignmentInput, camera_file: CameraFile) -> None:
-    """Raise SceneError if rows are the pixels of some cameras in order, which are not those of the file."""
+    """Raise SceneError if the rows are in order the pixels of some cameras, but not of the file's cameras."""
     cameras = inputs.cameras
     if inputs.order in MAY_BE_UNALIGNED or len(inputs.gaussians) != len(cameras) * cameras.width * cameras.height:
         return
     pairs = sample_pixels(inputs.gaussians, cameras, inputs.valid)
-    alignment, first = check_pairs(pairs, cameras), pairs.select(pairs.views == 0)
-    if projective_error(first.points, first.pixels) < _SOME_CAMERA * alignment.limit_px:
+    alignment, of_first_view = check_pairs(pairs, cameras), pairs.select(pairs.views == 0)
+    if projective_error(of_first_view.points, of_first_view.pixels) < _SOME_CAMERA * alignment.limit_px:
         raise misalignment_error(camera_file.path, alignment, None)
 
 
 def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
-    """Make the SceneError for rows as many as pixels, which fit no layout or several."""
+    """Make the SceneError for as many rows as pixels that fit no layout, or several layouts if ``alignment`` is ok.
+
+    ``reason``: another convention or order that fits, see :func:`explain_misalignment`.
+    """
     if alignment.ok:
-        found = f"several that do, to {alignment.worst_px:.1f} px"
-        problem = f"expected one order of the Gaussians that fits the pixels, found {found}"
+        problem = (
+            "expected one order of the Gaussians that fits the pixels, found several that fit within"
+            f" {alignment.worst_px:.1f} px"
+        )
         return SceneError(path, problem, "name their order with --hint order=NAME")
     problem = (
         f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
@@ -67,11 +72,11 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
 def explain_misalignment(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, convention: Convention
 ) -> str | None:
-    """Name another convention of the cameras, or order of the rows, that fits the scene; None if none does."""
+    """Describe another convention of the cameras or another order of the rows that fits; None if none fits."""
     pairs = sample_pixels(gaussians, cameras, valid)
     for poses in other_conventions(cameras.viewmats, convention):
         if check_pairs(pairs, replace(cameras, viewmats=poses.viewmats)).ok:
-            return describe_reading(poses.convention, convention)
+            return describe_other_convention(poses.convention, convention)
     for layout in exact_layouts(len(gaussians), len(cameras), cameras.width, cameras.height):
         pairs = find_correspondences(gaussians.means, valid.reshape(-1), subsample(layout, MAX_CHECKED))
         if layout.kind == "full" and layout.order in _ORDERS and check_pairs(pairs, cameras).ok:

@@ -1,9 +1,9 @@
-"""Estimate the focal length of cameras whose poses alone are known.
+"""Estimate the focal length of cameras of which only the poses are known.
 
-Where rows are pixels it follows from their rays: under a pose, a pixel's place is a linear
-function of the slope of its Gaussian's direction; the factor is the focal length, the place of
-slope 0 the principal point. Otherwise the photos show it: under the right one, Gaussians project
-to places of their own colours.
+If rows are pixels, the focal length follows from their rays. Under a given pose, the coordinate of a pixel is a linear
+function of the slope of the direction to its Gaussian. The factor is the focal length, and the coordinate at slope 0 is
+the principal point. Otherwise the focal length is searched for which Gaussians project to pixels of their own colours
+in the photos.
 """
 
 from __future__ import annotations
@@ -32,59 +32,59 @@ from gsmerge.kernels.pictures import sample_bilinear
 from gsmerge.types import Cameras, Gaussians
 
 _GRID_GAUSSIANS = 500  # Gaussians per view that intrinsics are solved from
-_MAX_UNEVEN = 1.5  # of one focal length to the other
-_MAX_VIEWS = 12  # whose photos are compared with the Gaussians
-_SIDE = 256  # the longer one of these photos, pixels
-_SHORTEST = 0.25  # focal length that is tried, over the photo's longer side
-_STEP = 1.06  # from one that is tried to the next
-_STEPS = 48  # so that the last is four sides
-_FEW_GAUSSIANS = 3000  # Gaussians that are compared with the photos at each of these
-_SAMPLE_GAUSSIANS = 20_000  # and near the best
-_SPANS = (0.3, 0.08, 0.02, 0.005, 0.00125)  # shares of it around the best that are searched next
-_STRIDES = 0, 1, 2, 4  # of a round's change that are gone once more: along a valley (Hooke and Jeeves 1961)
-_ROUNDS = 16  # of each of them, at most
-_FINE, _FEWER = 0.01, 8  # above this span every eighth of the Gaussians is compared
-_MOST = 0.1  # distance of a Gaussian's colour from the photo's that counts, of 1: what is larger is another surface
-_HALF = 4  # places on either side in each
-_ENTRIES = (((0, 0), (1, 1)), ((0, 0),), ((1, 1),), ((0, 2),), ((1, 2),))  # of intrinsics, changed in turn
+_MAX_UNEVEN = 1.5  # largest ratio of the two focal lengths
+_MAX_VIEWS = 12  # number of photos that are compared with the Gaussians
+_SIDE = 256  # longer side of these photos, pixels
+_SHORTEST = 0.25  # shortest focal length that is tried, over the photo's longer side
+_STEP = 1.06  # ratio of neighbouring focal lengths that are tried
+_STEPS = 48  # number of focal lengths that are tried; the last is four times the longer side
+_FEW_GAUSSIANS = 3000  # Gaussians that are compared with the photos at each of these focal lengths
+_SAMPLE_GAUSSIANS = 20_000  # Gaussians that are compared near the best focal length
+_SPANS = (0.3, 0.08, 0.02, 0.005, 0.00125)  # ranges around the best, over the focal length, that are searched in turn
+_STRIDES = 0, 1, 2, 4  # multiples of a round's change that are added, to move along a valley (Hooke and Jeeves 1961)
+_ROUNDS = 16  # of search in each range, at most
+_FINE, _FEWER = 0.01, 8  # in ranges above this one only every eighth Gaussian is compared
+_MAX_ERROR = 0.1  # largest colour error of a Gaussian, of 1; a larger one means that the photo shows another surface
+_HALF = 4  # number of steps to either side of the best
+_ENTRIES = (((0, 0), (1, 1)), ((0, 0),), ((1, 1),), ((0, 2),), ((1, 2),))  # of the intrinsics that change together
 _CHANGES = [np.array([[float((i, j) in entries) for j in range(3)] for i in range(3)]) for entries in _ENTRIES]
 
 
 @dataclass(frozen=True)
 class _Pictures:
-    """Views whose photos are compared with the Gaussians."""
+    """Small photos that are compared with the Gaussians."""
 
-    views: list[int]  # of the camera file
-    images: np.ndarray  # ``[v,h,w,3]`` float32, small
-    ratio: float  # of their side to the photos'
+    views: list[int]  # ids of the cameras in the camera file
+    images: np.ndarray  # ``[v,h,w,3]`` float32
+    ratio: float  # width of a small photo over that of the original
 
     def pinhole(self, focal: float) -> np.ndarray:
-        """Make the usual intrinsics of a focal length in pixels of the small pictures."""
+        """Make intrinsics with one focal length, in pixels of the small photos, and a central principal point."""
         height, width = self.images.shape[1:3]
         return make_pinhole(focal, focal, width / 2, height / 2)
 
     def cameras(self, viewmats: np.ndarray, K: np.ndarray) -> Cameras:
-        """Make cameras of poses ``[c,4,4]`` and intrinsics in pixels of the small pictures."""
+        """Make cameras of poses ``[c,4,4]`` and common intrinsics ``K``, in pixels of the small photos."""
         height, width = self.images.shape[1:3]
         return Cameras(viewmats[self.views], np.tile(K, (len(self.views), 1, 1)), width, height)
 
 
 def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: PhotoArrays) -> CameraFile | None:
-    """Estimate the intrinsics of cameras that have only poses; return cameras and a note, or None if that fails.
+    """Estimate the intrinsics of cameras that have only poses; return the cameras with a note, or None if that fails.
 
-    ``camera_file`` has only poses; ``photos`` are c pictures ``[h,w,3]`` uint8, or empty.
+    ``camera_file`` has only poses. ``photos`` are c photos ``[h,w,3]`` uint8, or empty.
     """
     camera_size = int(camera_file.widths[0]), int(camera_file.heights[0])
     size = photo_size(photos) or camera_size
     if min(size) <= 1:
         return None
     other_poses = other_conventions(camera_file.viewmats, camera_file.convention)
-    readings = [camera_file.viewmats, *(poses.viewmats for poses in other_poses)]
-    K = _intrinsics_of_rays(ply, camera_file, readings, size)
-    what = "the rays of the pixels"
+    conventions = [camera_file.viewmats, *(poses.viewmats for poses in other_poses)]
+    K = _intrinsics_of_rays(ply, camera_file, conventions, size)
+    evidence = "the rays of the pixels"
     if K is None and len(photos):
-        K = _intrinsics_of_colors(ply, readings, photos, size)
-        what = "the photos' colours"
+        K = _intrinsics_of_colors(ply, conventions, photos, size)
+        evidence = "the photos' colours"
     if K is None:
         return None
     share = f"{K[0, 0] / size[0]:.4g}"
@@ -94,14 +94,17 @@ def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: PhotoArra
         Ks=np.tile(K, (count, 1, 1)),
         widths=np.full(count, size[0], np.int64),
         heights=np.full(count, size[1], np.int64),
-        focal=f"no intrinsics were given: a focal length of {share} widths is estimated from {what}",
+        focal=f"no intrinsics were given: a focal length of {share} widths is estimated from {evidence}",
     )
 
 
 def _intrinsics_of_rays(
-    ply: GaussianFile, camera_file: CameraFile, readings: list[np.ndarray], size: Size
+    ply: GaussianFile, camera_file: CameraFile, conventions: list[np.ndarray], size: Size
 ) -> np.ndarray | None:
-    """Solve for intrinsics ``[3,3]``, pixels, under which the rows of a grid lie on their rays."""
+    """Solve for intrinsics ``[3,3]``, pixels, under which the rows of a grid lie on their rays; None if that fails.
+
+    ``conventions`` are the poses ``[c,4,4]`` in each convention, and ``size`` is that of the photos.
+    """
     count, views, names = len(ply.gaussians), len(camera_file), camera_file.names
     for grid in _possible_sizes(ply, size):
         fits: list[tuple[float, tuple[float, ...], int]] = []
@@ -110,7 +113,7 @@ def _intrinsics_of_rays(
                 continue
             for sample in subsample(layout, _GRID_GAUSSIANS).with_views_in(view_orders(names)):
                 pairs = find_correspondences(ply.gaussians.means, ply.valid, sample)
-                solved = (_solve_intrinsics(pairs, viewmats) for viewmats in readings)
+                solved = (_solve_intrinsics(pairs, viewmats) for viewmats in conventions)
                 fits += [(px, values, number) for px, values in solved]
         fits.sort()
         if not fits or fits[0][0] > pixel_limit(grid.width, grid.height):
@@ -120,12 +123,12 @@ def _intrinsics_of_rays(
             fx, fy, cx, cy = values
             x, y = (cx + grid.left) / grid.scale_x, (cy + grid.top) / grid.scale_y
             return make_pinhole(fx / grid.scale_x, fy / grid.scale_y, x, y)
-    free = estimate_cameras(Path(camera_file.path), ply.gaussians, ply.valid, names, size)
-    return None if free is None else free.Ks[0]
+    estimated = estimate_cameras(Path(camera_file.path), ply.gaussians, ply.valid, names, size)  # without the poses
+    return None if estimated is None else estimated.Ks[0]
 
 
 def _possible_sizes(ply: GaussianFile, size: Size) -> Iterator[PhotoTransform]:
-    """Yield the transforms of photos to the sizes that the grid may have: theirs, then those that rows show."""
+    """Yield transforms of photos to each size that the grid may have: their own, then those that the rows show."""
     yield resize_to(size, size)
     shapes = ((layout.width, layout.height) for layout in find_layouts(ply.gaussians, ply.valid))
     for shape in dict.fromkeys(shapes):
@@ -133,7 +136,10 @@ def _possible_sizes(ply: GaussianFile, size: Size) -> Iterator[PhotoTransform]:
 
 
 def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[float, tuple[float, ...]]:
-    """Solve for (largest median distance of a part, (fx, fy, cx, cy)), pixels; inf on failure."""
+    """Solve for intrinsics (fx, fy, cx, cy) in pixels under given poses; also return the error.
+
+    The error comes first. It is the largest median distance of a part of the rows from its pixels, or inf on failure.
+    """
     poses = viewmats[pairs.views]
     camera = transform(poses[:, :3, :3], pairs.points) + poses[:, :3, 3]
     front = camera[:, 2] > 0
@@ -150,15 +156,15 @@ def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[flo
 
 
 def _intrinsics_of_colors(
-    ply: GaussianFile, readings: list[np.ndarray], photos: PhotoArrays, size: Size
+    ply: GaussianFile, conventions: list[np.ndarray], photos: PhotoArrays, size: Size
 ) -> np.ndarray | None:
-    """Search for intrinsics ``[3,3]``, pixels, under which the Gaussians have the photos' colours."""
+    """Search for intrinsics ``[3,3]``, pixels, under which the Gaussians have the photos' colours; None if none do."""
     pictures = _small_pictures(photos, size)
     few = _sample(ply, _FEW_GAUSSIANS)
     focals = [_SHORTEST * max(pictures.images.shape[1:3])]
     while len(focals) < _STEPS:
         focals.append(focals[-1] * _STEP)
-    for viewmats in readings:
+    for viewmats in conventions:
         checks = [_check(few, pictures, viewmats, focal) for focal in focals]
         best = max(range(len(focals)), key=lambda number: checks[number].score)
         if checks[best].ok and not math.isnan(checks[best].color_ratio):
@@ -169,16 +175,15 @@ def _intrinsics_of_colors(
 
 
 def _sample(ply: GaussianFile, count: int) -> Gaussians:
-    """Take about ``count`` finite Gaussians, evenly spread over the file."""
+    """Sample about ``count`` finite Gaussians at equal steps over the file."""
     rows = np.flatnonzero(ply.valid)
     return ply.gaussians[rows[:: max(1, len(rows) // count)]]
 
 
 def _small_pictures(photos: PhotoArrays, size: Size) -> _Pictures:
-    """Reduce the size of a selection of photos."""
+    """Select evenly spaced photos and reduce their size."""
     count = len(photos)
-    places = np.linspace(0, count - 1, min(count, _MAX_VIEWS))
-    views = sorted({round(place) for place in places})
+    views = sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MAX_VIEWS))})
     ratio = min(1.0, _SIDE / max(size))
     width, height = (max(1, round(side * ratio)) for side in size)
     small = resize_to(size, (width, height))
@@ -187,13 +192,13 @@ def _small_pictures(photos: PhotoArrays, size: Size) -> _Pictures:
 
 
 def _check(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, focal: float) -> CameraCheck:
-    """Measure how well the views show the Gaussians with a focal length."""
+    """Check how well the views show the Gaussians with a focal length."""
     valid = np.ones(len(gaussians), bool)
     return check_cameras(gaussians, valid, pictures.cameras(viewmats, pictures.pinhole(focal)), pictures.images)
 
 
 def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, focal: float) -> np.ndarray:
-    """Search for the intrinsics ``[3,3]`` with the smallest colour distance, each in turn, in ever smaller steps."""
+    """Search for the intrinsics ``[3,3]`` with the smallest colour error, entry by entry, in ever smaller steps."""
     points = gaussians.means.astype(np.float64)
     colors = sh0_to_rgb(gaussians.sh0[:, 0]).clip(0, 1)
 
@@ -203,7 +208,7 @@ def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, foc
         def color_error(K: np.ndarray) -> float:
             return _color_error(points[rows], colors[rows], pictures.cameras(viewmats, K), pictures.images)
 
-        steps = sorted(range(-_HALF, _HALF + 1), key=abs)  # where another place is no nearer, it stays
+        steps = sorted(range(-_HALF, _HALF + 1), key=abs)  # 0 first, so that equal errors change nothing
         for _ in range(_ROUNDS):
             before = K
             for change in _CHANGES:
@@ -217,9 +222,10 @@ def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, foc
 
 
 def _color_error(points: np.ndarray, colors: np.ndarray, cameras: Cameras, images: np.ndarray) -> float:
-    """Measure the mean distance of colours ``[n,3]`` from the photos, at most 0.1 for each point and view.
+    """Measure the mean error of colours ``[n,3]`` in the photos, at most 0.1 for each point and view.
 
-    So points that a photo does not show, or shows behind others, count alike wherever they are drawn.
+    Points outside a photo have an error of 0.1. The limit makes hidden points count nearly the same wherever they
+    project to.
     """
     total = 0.0
     for view, image in enumerate(images):
@@ -228,5 +234,5 @@ def _color_error(points: np.ndarray, colors: np.ndarray, cameras: Cameras, image
         inside = (depth > 0) & is_inside(xy, cameras)
         x, y = xy[inside].T - 0.5
         errors = np.abs(colors[inside] - sample_bilinear(image, x, y)).mean(1)
-        total += float(np.minimum(errors, _MOST).sum()) + _MOST * (len(points) - len(errors))
+        total += float(np.minimum(errors, _MAX_ERROR).sum()) + _MAX_ERROR * (len(points) - len(errors))
     return total / (len(points) * len(images))

@@ -1,8 +1,8 @@
-"""Solve for the frame of the Gaussians: poses of their own views, and the similarity that moves cameras there.
+"""Solve for the frame of the Gaussians: the pose of each view, and the similarity that moves the cameras there.
 
-Rows that are pixels show the pose of each view by themselves. A Gaussian lies on the ray of its pixel:
-``(x - c) x d = 0`` with the camera's centre c and the ray's direction d. The Gaussians stay in place; the cameras are
-moved.
+If rows are pixels, they determine the pose of each view, because a Gaussian lies on the ray of its pixel:
+``(x - c) x d = 0`` with the camera's centre c and the ray's direction d. The Gaussians stay in place, and the cameras
+are moved.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, sol
 from gsmerge.types import Cameras
 
 _ROUNDS = 4  # of reweighted least squares
-_MAX_POINTS = 2000  # that a camera's pose is solved from
-_SAME_TURN = 0.01  # of rotation matrices that differ by errors alone
-_NEAR_TURN = 0.2  # by which the rotation that own poses show may be off a usual one
-_MIN_AGREEMENT = 0.9  # smallest singular value of a mean rotation: rotations that agree have a mean that is nearly one
+_MAX_POINTS = 2000  # points that a camera's pose is solved from
+_SAME_ROTATION = 0.01  # largest difference of entries of rotation matrices that count as equal
+_NEAR_ROTATION = 0.2  # largest difference of entries between an exporter's rotation and the one that own poses show
+_MIN_AGREEMENT = 0.9  # smallest singular value of a mean rotation; it is near 1 if the rotations agree
 _SMALL_ROTATION, _SMALL_SCALE = 10.0, 0.05  # degrees, and natural logarithm
 _HALF = np.sqrt(0.5)
-# As the pixelSplat family turns its world: axes swapped, then an eighth of a turn about the last one.
+# Rotation of the world by the pixelSplat family: axes swapped, then an eighth of a turn about the last axis
 UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
-_VIEWER = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])  # as Splatter Image's demo turns its world
+_VIEWER = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])  # rotation of the world by Splatter Image's demo
 
 
 def scale_by(scale: float, note: str = "") -> Similarity:
-    """Return the similarity that only changes the unit."""
+    """Return the similarity that only scales."""
     text = f"positions scaled by {scale:.4g}{note}"
     return Similarity(np.eye(3), scale, np.zeros(3), text, "scaled")
 
 
 def _usual_rotations(cameras: Cameras) -> tuple[tuple[np.ndarray, str, str], ...]:
-    """Return the rotations of exporters, their description and their kind."""
+    """Return the rotations of exporters, each with its description and its kind."""
     first, middle = cameras.viewmats[0, :3, :3], cameras.viewmats[len(cameras) // 2, :3, :3]
     return (
         (np.eye(3), "", ""),
@@ -49,9 +49,9 @@ def _usual_rotations(cameras: Cameras) -> tuple[tuple[np.ndarray, str, str], ...
 
 
 def usual_frames(cameras: Cameras, scale: float | None = None) -> list[Similarity]:
-    """List the frames of exporters that need no solving, the frame of the cameras first.
+    """List the frames of exporters in which nothing has to be solved for, the frame of the cameras first.
 
-    ``scale``: size of the Gaussians' world in units of the cameras', if known.
+    ``scale`` is the scale of the Gaussians' world over that of the cameras, if known.
     """
     frames = [IDENTITY if scale is None else scale_by(scale, ", as given")]
     for rotation, name, kind in _usual_rotations(cameras)[1:]:
@@ -60,7 +60,7 @@ def usual_frames(cameras: Cameras, scale: float | None = None) -> list[Similarit
 
 
 def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Similarity]:
-    """List the usual frames, then those that viewers ask for, and that of the first camera.
+    """List the usual frames, the frames of viewers, and the frame of the first camera.
 
     The frame of the cameras comes first, that of the first camera last.
     """
@@ -77,17 +77,17 @@ def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Simila
 def solved_frames(
     pairs: Correspondences, cameras: Cameras, own: Mapping[int, np.ndarray], scale: float | None = None
 ) -> Iterator[tuple[int, Similarity]]:
-    """Yield the frames that own poses of views and ``pairs`` show, the simple ones first; none where views disagree.
+    """Yield the frames that fit the ``pairs``, simple frames first; none if the views disagree on the rotation.
 
-    They are a usual rotation with a scale, or with scale and shift; then any rotation. ``own``: poses ``[4,4]`` of
-    views in the frame of the Gaussians. Each frame comes with the effort, see :class:`Reading`.
+    The frames have an exporter's rotation with a scale, then with scale and shift, then any rotation. ``own`` are poses
+    ``[4,4]`` of views in the frame of the Gaussians. Each frame comes with its effort, see :class:`ScoredLayout`.
     """
-    free = mean_rotation(own, cameras.viewmats)
-    if free is None:
+    mean = mean_rotation(own, cameras.viewmats)
+    if mean is None:
         return
     rays = ray_directions(pairs, cameras)
     for rotation, name, kind in _usual_rotations(cameras):
-        if np.abs(rotation - free).max() > _NEAR_TURN:
+        if np.abs(rotation - mean).max() > _NEAR_ROTATION:
             continue
         for shifted in (False, True) if scale is None else (True,):
             frame = solve_frame(pairs.points, rays, rotation, shifted=shifted)
@@ -95,24 +95,27 @@ def solved_frames(
                 text = f"positions scaled by {frame.scale:.4g}" + (" and shifted" if shifted else "")
                 text = f"{name}, {text}" if name else text
                 yield 1, replace(frame, description=text, kind=kind or ("shifted" if shifted else "scaled"))
-    frame = solve_frame(pairs.points, rays, free, shifted=True)
-    if frame is None and len(own) == 1:  # which has no scale
+    frame = solve_frame(pairs.points, rays, mean, shifted=True)
+    if frame is None and len(own) == 1:  # a single view has no scale
         ((view, pose),) = own.items()
-        shift = camera_centres(pose[None])[0] - matmul(free, camera_centres(cameras.viewmats)[view])
-        frame = Similarity(free, 1.0, shift)
+        shift = camera_centres(pose[None])[0] - matmul(mean, camera_centres(cameras.viewmats)[view])
+        frame = Similarity(mean, 1.0, shift)
     if frame is not None:
         angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
         if angle < _SMALL_ROTATION and abs(log(frame.scale)) < _SMALL_SCALE:
-            return  # no exporter does so: the cameras are inexact, and a rotation hides it
-        turned = (matmul(UPRIGHT, viewmat[:3, :3]) for viewmat in cameras.viewmats)
-        upright = any(np.abs(rotation - free).max() < _SAME_TURN for rotation in turned)
-        name = "rotated upright" if upright else f"rotated by {angle:.1f} degrees"
+            return  # no exporter rotates so little: the cameras are inexact, and a rotation would hide that
+        upright_rotations = (matmul(UPRIGHT, viewmat[:3, :3]) for viewmat in cameras.viewmats)
+        is_upright = any(np.abs(rotation - mean).max() < _SAME_ROTATION for rotation in upright_rotations)
+        name = "rotated upright" if is_upright else f"rotated by {angle:.1f} degrees"
         text = f"{name}, positions scaled by {frame.scale:.4g} and shifted"
-        yield 2, replace(frame, description=text, kind="upright" if upright else "other")
+        yield 2, replace(frame, description=text, kind="upright" if is_upright else "other")
 
 
 def mean_rotation(own: Mapping[int, np.ndarray], viewmats: np.ndarray) -> np.ndarray | None:
-    """Average the rotations between the frames of two poses of each view; None where the views disagree."""
+    """Average over views the rotation from the frame of ``viewmats`` to that of ``own``; None if the views disagree.
+
+    ``viewmats [c,4,4]`` and ``own`` are poses of the same views in two frames.
+    """
     if not own:
         return None
     mean = np.mean([matmul(pose[:3, :3].T, viewmats[view, :3, :3]) for view, pose in own.items()], 0)
@@ -121,7 +124,7 @@ def mean_rotation(own: Mapping[int, np.ndarray], viewmats: np.ndarray) -> np.nda
 
 
 def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Compute unit directions ``[t,3]`` and origins ``[t,3]`` of the pixels' rays in the cameras' world."""
+    """Compute unit directions ``[t,3]`` and origins ``[t,3]`` of the rays of pixels in the world of the cameras."""
     ones = np.ones((len(pairs.pixels), 1))
     inverse = invert(cameras.Ks)[pairs.views]
     local = transform(inverse, np.concatenate([pairs.pixels, ones], 1))
@@ -132,9 +135,9 @@ def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray
 def solve_frame(
     points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
 ) -> Similarity | None:
-    """Solve robustly for scale and shift that bring rotated points nearest to their rays.
+    """Solve robustly for the scale and shift that bring rotated and moved rays nearest to their points ``[t,3]``.
 
-    The scale is None if it is not positive.
+    ``rotation`` is given. Without ``shifted`` only the scale is solved for. None if the scale is not positive.
     """
     rays, centres = (matmul(part, rotation.T) for part in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
@@ -157,13 +160,13 @@ def solve_frame(
 
 
 def own_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
-    """Solve for the pose ``[4,4]`` of each view from only its own pixels; leave out views where that fails."""
+    """Solve for the pose ``[4,4]`` of each view from its own pixels only; leave out views where that fails."""
     poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in np.unique(pairs.views))
     return {view: pose for view, pose in poses if pose is not None}
 
 
 def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray | None:
-    """Solve for one view's world-to-camera matrix ``[4,4]`` in the frame of the Gaussians from only its own pixels."""
+    """Solve for the world-to-camera matrix ``[4,4]`` of a view from its own pixels; None if that fails."""
     rows = np.flatnonzero(pairs.views == view)
     rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
     if len(rows) < 6:

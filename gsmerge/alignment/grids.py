@@ -1,4 +1,4 @@
-"""Find the cameras and photos of a size that the grid of the rows may have: one that files name, or that rows show."""
+"""Bring cameras and photos to each size that the grid of the rows may have: sizes that files give or rows show."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment.cameras import Poses, describe_reading
+from gsmerge.alignment.cameras import Poses, describe_other_convention
 from gsmerge.alignment.layouts import TRIMS, da3_box
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
@@ -19,13 +19,13 @@ from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
 from gsmerge.types import Cameras
 
-SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
-SQUARE = 256  # side of the pictures of pixelSplat and its relatives, pixels
-_ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
-_STRETCHED, _MAX_STRETCH = 16, 0.15  # multiples of its sides, to which ReSplat stretches photos, and by how much
-_MIN_KEPT = 0.5  # of a photo's area, when it is cropped
-_NEAR_SIZE = 0.05  # of the longer side, by which cameras' sizes may differ that are no more than assumed
-_MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
+SIDES = (504, 518)  # pixels to which Depth Anything 3 and others resize the longer or the shorter side
+SQUARE = 256  # side of the images of pixelSplat and its relatives, pixels
+_MULTIPLES = (8, PATCH)  # if photos are cropped, both sides of the grid are multiples of one of these
+_STRETCHED, _MAX_STRETCH = 16, 0.15  # ReSplat stretches photos to multiples of 16 pixels, and by at most 15 %
+_MIN_CROP = 0.5  # smallest share of a photo's area that is left after cropping
+_NEAR_SIZE = 0.05  # largest difference, over the longer side, between assumed camera sizes and photo sizes
+_MAX_ENLARGED = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Grid:
     """The cameras and the photo transform for one size of the pixel grid."""
 
     camera_file: CameraFile  # the cameras as they are read, in one convention of the poses
-    cameras: Cameras  # the same at the grid's size
-    transform: PhotoTransform | None  # what is done to the photos, if anything
-    notes: tuple[str, ...]  # what it is, for people
-    moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty where none was
-    given: np.ndarray | None = None  # ``[c,4,4]`` poses that the photos confirm, to which Gaussians are to be moved
+    cameras: Cameras  # the same cameras at the size of the grid
+    transform: PhotoTransform | None  # applied to the photos; None: nothing
+    notes: tuple[str, ...]  # notes for the user, one sentence each
+    moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
+    given: np.ndarray | None = None  # ``[c,4,4]`` given poses that the photos confirm; Gaussians are to be moved there
 
     @property
     def size(self) -> Size:
@@ -47,11 +47,11 @@ class Grid:
 
 @dataclass(frozen=True)
 class Place:
-    """Cameras that show Gaussians in their place: those of a grid, moved into a frame."""
+    """Cameras that show Gaussians in place: the cameras of a grid, moved into the frame of the Gaussians."""
 
     grid: Grid
     frame: Similarity
-    shown_by: str = ""  # what shows the frame, for people; empty for one that a file names
+    shown_by: str = ""  # evidence for the frame, in words; empty for a frame that a file gives
 
     @property
     def cameras(self) -> Cameras:
@@ -59,36 +59,39 @@ class Place:
         return self.grid.cameras if self.frame is IDENTITY else self.frame.move(self.grid.cameras)
 
     def notes(self, usual: Convention) -> list[str]:
-        """List what was adapted, for people; ``usual``: the convention of the poses' format."""
+        """List notes on what was adapted; ``usual`` is the convention of the poses' format."""
         notes, convention = [*self.grid.notes], self.grid.camera_file.convention
         if convention != usual:
-            notes.append(f"{describe_reading(convention, usual)}: read so")
+            notes.append(f"{describe_other_convention(convention, usual)}: read so")
         if self.frame is not IDENTITY:
-            why = f", as the {self.shown_by} show" if self.shown_by else ""
-            notes.append(f"the cameras are {self.frame.description}{why}")
+            evidence = f", as the {self.shown_by} show" if self.shown_by else ""
+            notes.append(f"the cameras are {self.frame.description}{evidence}")
         return notes
 
 
-def read_as(grid: Grid, poses: Poses) -> Grid:
-    """Return a grid with the poses of its cameras read in another convention."""
+def with_poses(grid: Grid, poses: Poses) -> Grid:
+    """Return a grid with the poses of its cameras in another convention."""
     file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
     return replace(grid, camera_file=file, cameras=replace(grid.cameras, viewmats=poses.viewmats))
 
 
-def with_photo_size(camera_file: CameraFile, size: Size | None, most: float = 1) -> CameraFile:
-    """Return the cameras with the photos' size if theirs is up to ``most`` pixels off, as twice a principal point is.
+def with_photo_size(camera_file: CameraFile, size: Size | None, tolerance: float = 1) -> CameraFile:
+    """Give cameras the size of the photos if theirs differs by up to ``tolerance`` pixels.
 
-    The same cameras where it is not.
+    Such a size may have been computed as twice the principal point. The same cameras are returned otherwise.
     """
     stored = sizes_of(camera_file)
-    if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= most:
+    if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= tolerance:
         return camera_file
     widths, heights = (np.full_like(camera_file.widths, side) for side in size)
     return replace(camera_file, widths=widths, heights=heights)
 
 
 def photo_grid(camera_file: CameraFile, size: Size | None) -> Grid:
-    """Return the grid of the photos' size, or of the cameras' size without photos; SceneError if the two disagree."""
+    """Return the grid of the photos' size, or of the cameras' size without photos.
+
+    Raises SceneError if the shapes of cameras and photos differ.
+    """
     if size is None:
         return Grid(camera_file, to_cameras(camera_file), None, ())
     if camera_file.photo_map is not None:
@@ -108,7 +111,10 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> Grid:
 
 
 def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform: PhotoTransform) -> Grid:
-    """Return the grid of photos that were resized or cropped by a known transform; ``size``: in memory."""
+    """Return the grid of photos that a known ``transform`` of ``file_size`` resizes or crops.
+
+    ``size`` is the size of the photos in memory, which may be reduced from ``file_size``.
+    """
     x, y = (whole / part for whole, part in zip(file_size, size, strict=True))
     transform = replace(transform, scale_x=x * transform.scale_x, scale_y=y * transform.scale_y)
     note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
@@ -117,7 +123,7 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
 
 
 def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
-    """Return whether oblong pixels become square at the size of the photos, which means that a model stretched them."""
+    """Return True if oblong pixels become square at the size of the photos: the model has stretched the photos."""
     if camera_file.focal is None:
         return False
     focals = camera_file.Ks[:, (0, 1), (0, 1)]
@@ -127,9 +133,9 @@ def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
 
 
 def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
-    """List the grids of photos resized to the size of the cameras, or of cameras cropped as the photos were.
+    """List the grids of photos brought to the size of the cameras, or of cameras cropped to the size of the photos.
 
-    ``size``: size of the photos. Empty without photos, and where both have one size.
+    ``size`` is the size of the photos. Empty without photos, and if cameras and photos have the same size.
     """
     sizes = sizes_of(camera_file)
     if size is None or len(sizes) != 1 or sizes[0] == size or camera_file.photo_map is not None:
@@ -138,7 +144,7 @@ def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
     cameras = to_cameras(camera_file, camera_size)
     for transform in (resize_to(size, camera_size), resize_and_crop(size, camera_size)):
         if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
-            continue  # previews: a fit to them would blur the Gaussians
+            continue  # the photos are previews, and a fit to them would blur the Gaussians
         note = f"photos of {size[0]} x {size[1]} are {transform.description}, the cameras' and the Gaussian grid's size"
         grids.append(Grid(camera_file, cameras, transform, (note,)))
     if not same_shape(camera_size, size):
@@ -151,9 +157,9 @@ def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
 def grids_of(
     camera_file: CameraFile, size: Size | None, transforms: Callable[[Size], list[PhotoTransform]]
 ) -> list[Grid]:
-    """List the grids to which ``transforms`` bring the photos, or without photos the cameras.
+    """List the grids to which ``transforms(size)`` bring the photos, or without photos the cameras.
 
-    ``size``: size of the photos. Empty where cameras have several sizes, or another shape than the photos.
+    ``size`` is the size of the photos. Empty if cameras have several sizes, or another shape than the photos.
     """
     sizes = sizes_of(camera_file)
     base = size or (sizes[0] if len(sizes) == 1 else None)
@@ -161,10 +167,10 @@ def grids_of(
         return []
     near = with_photo_size(camera_file, base, _NEAR_SIZE * max(base))
     files = [camera_file] + [near] * (near is not camera_file)
-    what = "photos and cameras" if size is not None else "cameras"
+    subject = "photos and cameras" if size is not None else "cameras"
     grids: list[Grid] = []
     for transform in transforms(base):
-        note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
+        note = f"{subject} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
         grids += [Grid(file, transform.cameras(to_cameras(file, base)), transform, (note,)) for file in files]
         if not sizes and transform.crops:
             cameras = to_cameras(camera_file, (transform.width, transform.height))
@@ -173,18 +179,18 @@ def grids_of(
 
 
 def shown_sizes(size: Size, shape: Size) -> list[PhotoTransform]:
-    """List the transforms that shrink photos to grids of which rows of a ``shape`` are all pixels but for borders."""
+    """List the transforms that shrink photos to a grid that has the ``shape`` of the rows without its borders."""
     transforms = []
     for trim in (0, *TRIMS):
         to = shape[0] + 2 * trim, shape[1] + 2 * trim
         if to == size or to[0] > size[0] or to[1] > size[1]:
             continue
         aspect = to[0] * size[1] / (to[1] * size[0])
-        is_round = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _ROUND)
-        stretched = abs(aspect - 1) <= _MAX_STRETCH and to[0] % _STRETCHED == to[1] % _STRETCHED == 0
-        cropped = min(aspect, 1 / aspect) >= _MIN_KEPT and is_round
-        transforms += [resize_to(size, to)] * (abs(aspect - 1) <= ASPECT_TOLERANCE or (cropped and stretched))
-        transforms += [resize_and_crop(size, to)] * cropped
+        is_usual = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _MULTIPLES)
+        may_stretch = abs(aspect - 1) <= _MAX_STRETCH and to[0] % _STRETCHED == to[1] % _STRETCHED == 0
+        may_crop = min(aspect, 1 / aspect) >= _MIN_CROP and is_usual
+        transforms += [resize_to(size, to)] * (abs(aspect - 1) <= ASPECT_TOLERANCE or (may_crop and may_stretch))
+        transforms += [resize_and_crop(size, to)] * may_crop
     for transform in (*(resize_to(size, half) for half in _half_sizes(size)), *patch_grids(size)):
         to = transform.width, transform.height
         transforms += [transform] * (da3_box(*to).pixels(*to).shape == shape[::-1])
@@ -192,23 +198,23 @@ def shown_sizes(size: Size, shape: Size) -> list[PhotoTransform]:
 
 
 def network_sizes(size: Size) -> list[PhotoTransform]:
-    """List the transforms of networks to grids that rows may be of which lack pixels."""
+    """List the transforms of networks to grids whose rows may lack some pixels."""
     return [*patch_grids(size), *(resize_to(size, half) for half in _half_sizes(size)), *square_sizes(size)]
 
 
 def square_sizes(size: Size) -> list[PhotoTransform]:
-    """List the transform to the square to which pixelSplat and similar models crop photos, where that is smaller."""
+    """List the transform that crops photos to the square of pixelSplat and similar models; empty for smaller photos."""
     square = SQUARE, SQUARE
     return [resize_and_crop(size, square)] if min(size) >= SQUARE and size != square else []
 
 
 def _half_sizes(size: Size) -> Iterator[Size]:
-    """Yield the sizes at which Lyra 2 writes Gaussians: half the photos', or half of these as multiples of 14."""
+    """Yield the sizes at which Lyra 2 writes Gaussians: half of each side, maybe rounded to a multiple of 14 first."""
     yield from product(*({side // 2, PATCH * round(side / PATCH) // 2} for side in size))
 
 
 def patch_grids(size: Size) -> list[PhotoTransform]:
-    """List the transforms of networks that take multiples of 14: each side rounded, or cropped, to a multiple."""
+    """List the transforms of networks that take multiples of 14 pixels: each side is rounded, or cropped."""
     transforms = []
     for side in SIDES:
         for scale in (side / max(size), side / min(size)):
@@ -221,7 +227,7 @@ def patch_grids(size: Size) -> list[PhotoTransform]:
 
 
 def small_photos_error(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
-    """Return the error for photos smaller than a pixel grid of the cameras' size; None for other photos."""
+    """Return the error for photos of another size than a pixel grid of the cameras' size; None for other photos."""
     grid_size = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
     if size is None or grid_size is None or grid_size == size:
         return None

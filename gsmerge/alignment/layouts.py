@@ -1,4 +1,4 @@
-"""Lay rows out as pixels: the layouts that a number of rows allows, and those of rows that lack pixels."""
+"""Lay out rows as pixels: list the layouts that have a given number of rows, and make layouts of incomplete grids."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from gsmerge.io.image_names import natural_key
 
 MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
 ESTIMATED = "estimated from the grid"  # source of cameras
-TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every side
-_MAX_TRIM = 0.25  # of the shorter side, cut off at every side
+TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every border
+_MAX_TRIM = 0.25  # largest trim at every border, over the shorter side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
-_FEW_ROWS = 0.01  # of those of the part that has the most: none of its own
-_ORDERED = 0.99  # share of the rows that come after the one before them
-DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
+_FEW_ROWS = 0.01  # parts with a smaller share of the rows of the largest part count as empty
+_ORDERED = 0.99  # share of consecutive rows that must be in ascending order of pixels
+DEPTH_SHARE = 0.9  # share of each view's pixels that Depth Anything 3 exports, the nearest ones
 
 
 @dataclass(frozen=True)
 class Layout:
     """The pixel of each row, part by part; a part is one view, or one layer of a view."""
 
-    description: str  # what it is, for people
-    kind: str  # "full", "trim", "box", "box+depth" or "pruned": which pixels there are
-    order: str  # in which order the rows are
+    description: str  # in words, for messages
+    kind: str  # "full", "trim", "box", "box+depth" or "pruned": which pixels have rows
+    order: str  # order of the rows: "view-major", "view-fastest", "column-major", "layer-major" or "unordered"
     width: int  # of the grid, pixels
     height: int
     views: tuple[int, ...]  # the camera of each part
-    rows: tuple[np.ndarray, ...]  # the rows of each part, of any shape: not a copy where a stride will do
+    rows: tuple[np.ndarray, ...]  # the rows of each part, of any shape, so that strided views need no copy
     pixels: tuple[np.ndarray, ...]  # ``[p]`` the pixel ``y·W + x`` of each of these rows
     per_pixel: int = 1  # Gaussians per pixel; above 1 each layer is a part
 
     def with_views_in(self, orders: Iterable[Sequence[int]]) -> Iterator[Layout]:
-        """Yield copies of the layout with the views permuted by each of the ``orders``."""
-        labellings = dict.fromkeys(tuple(order[view] for view in self.views) for order in orders)
-        return (replace(self, views=labelling) for labelling in labellings)
+        """Yield copies of the layout with the views permuted by each of ``orders``, without duplicates."""
+        permuted = dict.fromkeys(tuple(order[view] for view in self.views) for order in orders)
+        return (replace(self, views=views) for views in permuted)
 
     def select(self, view: int) -> Layout:
         """Return the layout of one view, with all its layers."""
@@ -47,7 +47,7 @@ class Layout:
         return replace(self, views=(view,) * len(ids), rows=rows, pixels=pixels)
 
     def without_empty_parts(self) -> Layout:
-        """Return the layout of the parts that have rows, but for a few."""
+        """Return the layout without parts that have no or few rows."""
         least = _FEW_ROWS * max(map(len, self.rows))
         ids = [i for i, rows in enumerate(self.rows) if len(rows) >= least]
         rows, pixels = (tuple(arrays[i] for i in ids) for arrays in (self.rows, self.pixels))
@@ -55,7 +55,7 @@ class Layout:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the rows are the full grid in order: nothing moves, nothing is missing."""
+        """True if the rows are all pixels in order."""
         return self.kind == "full" and self.order == "view-major" and self.per_pixel == 1
 
     def pixel_ids(self, count: int) -> np.ndarray:
@@ -70,24 +70,24 @@ class Layout:
 
 @dataclass(frozen=True)
 class KeptBox:
-    """The kept part of a view: rows ``top`` to ``height - top``, columns ``left`` to ``width - left``."""
+    """The exported pixels of a view: all but ``top`` lines above and below, and ``left`` columns on each side."""
 
-    kind: str
-    description: str
+    kind: str  # as in Layout
+    description: str  # in words, for messages
     top: int
     left: int
 
     def pixels(self, width: int, height: int) -> np.ndarray:
-        """Return the pixel indices inside the box, row by row."""
+        """Return the pixels ``y·W + x`` inside the box, as an array of its lines and columns."""
         grid = np.arange(width * height, dtype=np.int64).reshape(height, width)
         return grid[self.top : height - self.top, self.left : width - self.left]
 
 
 def boxes(width: int, height: int) -> Iterator[KeptBox]:
-    """Yield the boxes of pixels that exporters may keep, the likely ones first.
+    """Yield the boxes of pixels that exporters may keep, likely boxes first.
 
-    They are the whole picture; without 8 pixels, or 8/256 of the side as Depth Anything 3, at each border; and without
-    any other border.
+    First comes the whole picture. Boxes without 8 pixels at each border, and without 8/256 of the side as by Depth
+    Anything 3, follow. Boxes with any other border come last.
     """
     yield KeptBox("full", "every pixel", 0, 0)
     usual, side = TRIMS[0], min(width, height)
@@ -111,12 +111,12 @@ def da3_box(width: int, height: int) -> KeptBox:
 
 
 def da3_trim(side: int) -> int:
-    """Return the pixels that Depth Anything 3 cuts off at both ends of a side."""
+    """Return the number of pixels that Depth Anything 3 cuts off at both ends of a side."""
     return int(8 / 256 * side)
 
 
 def da3_borders(side: int) -> list[int]:
-    """List the pixels that Depth Anything 3 may have cut off at both ends of what is left of a side."""
+    """List the numbers of pixels that Depth Anything 3 may have cut off at both ends if ``side`` pixels are left."""
     return [border for border in range(side) if da3_trim(side + 2 * border) == border]
 
 
@@ -131,7 +131,7 @@ def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:
     return [tuple(range(len(names))), _order_names(tuple(names))]
 
 
-@lru_cache(maxsize=4)  # every layout of a file is tried in them
+@lru_cache(maxsize=4)  # called for every layout of a file
 def _order_names(names: tuple[str, ...]) -> tuple[int, ...]:
     return tuple(sorted(range(len(names)), key=lambda view: natural_key(names[view])))
 
@@ -149,7 +149,7 @@ def plain_layout(views: int, width: int, height: int) -> Layout:
 def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:
     """Yield the layouts with exactly ``count`` rows and at most ``views`` views.
 
-    The cameras of the parts are a first guess: in order, or every n-th of them.
+    The cameras of the parts are a first guess: every n-th camera, or the first ones.
     """
     for box in boxes(width, height):
         for per_pixel in PER_PIXEL:
@@ -161,7 +161,7 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
 
 
 def dropped_layout(pixel_ids: np.ndarray, views: int, width: int, height: int) -> Layout:
-    """Return the layout of rows by their pixels ``[n]``, -1 for none; some pixels may have no row."""
+    """Make the layout of rows from their pixels ``(view·H + y)·W + x`` ``[n]``, -1 for none; pixels may have no row."""
     area = width * height
     parts = [np.flatnonzero(pixel_ids // area == view) for view in range(views)]
     placed = pixel_ids[pixel_ids >= 0]
@@ -172,35 +172,36 @@ def dropped_layout(pixel_ids: np.ndarray, views: int, width: int, height: int) -
 
 
 def move_layout(layout: Layout, width: int, height: int, left: int, top: int) -> Layout:
-    """Move a layout into a grid of another size, so that its first pixel comes to (left, top)."""
+    """Move a layout into a grid of another size, so that its first pixel moves to (left, top)."""
     places = (np.divmod(pixels, layout.width) for pixels in layout.pixels)
     return replace(layout, width=width, height=height, pixels=tuple((y + top) * width + x + left for y, x in places))
 
 
 def full_layouts(views: int, per_pixel: int, width: int, height: int) -> Iterator[Layout]:
-    """Yield the layouts of every pixel of all ``views``."""
+    """Yield the layouts of all pixels of all ``views`` in each order."""
     whole = next(iter(boxes(width, height)))
     return _orders(views * per_pixel * width * height, whole, per_pixel, tuple(range(views)), width, height)
 
 
 def _row_type(count: int) -> type[np.signedinteger[Any]]:
-    """Return the smallest integer type for ``count`` rows, since there may be hundreds of millions."""
+    """Return the smaller integer type that can number ``count`` rows; there may be hundreds of millions."""
     return np.int32 if count <= np.iinfo(np.int32).max else np.int64
 
 
 def _orders(
     count: int, box: KeptBox, per_pixel: int, views: tuple[int, ...], width: int, height: int
 ) -> Iterator[Layout]:
+    """Yield the layouts of ``count`` rows in each order; the rows are the pixels of a box in ``views``."""
     index, grid = np.arange(count, dtype=_row_type(count)), box.pixels(width, height)
     rows, columns, num_views = *grid.shape, len(views)
-    arranged = {
+    rows_by_order = {  # each [view,layer,line,column]
         "view-major": index.reshape(num_views, rows, columns, per_pixel).transpose(0, 3, 1, 2),
         "view-fastest": index.reshape(rows, columns, per_pixel, num_views).transpose(3, 2, 0, 1),
         "column-major": index.reshape(num_views, columns, rows, per_pixel).transpose(0, 3, 2, 1),
         "layer-major": index.reshape(per_pixel, num_views, rows, columns).transpose(1, 0, 2, 3),
     }
     layers = f", {per_pixel} Gaussians per pixel" if per_pixel > 1 else ""
-    for order, ids in arranged.items():
+    for order, ids in rows_by_order.items():
         if (order == "layer-major" and per_pixel == 1) or (order == "view-fastest" and num_views == 1):
             continue
         yield Layout(
@@ -217,33 +218,33 @@ def _orders(
 
 
 def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
-    """List the layouts that Depth Anything 3 may have made by its depth maps: border, nearest 90 %, every n-th view.
+    """List the layout that Depth Anything 3 made with its depth maps, if it has ``count`` rows.
 
-    Only the order of the values of ``depths [v,h,w]`` matters, so their scale does not. Empty if no choice of views has
-    ``count`` pixels.
+    Depth Anything 3 cuts off a border, exports the nearest 90 % of each view, and may take every n-th view only. Only
+    the order of the values of ``depths [v,h,w]`` matters, not their scale.
     """
     views, height, width = depths.shape
     inside = da3_box(width, height).pixels(width, height)
-    # the threshold is the interpolated 90 % quantile of all the view's depths: the lower of the two around it decides
+    # the threshold is the interpolated 90 % quantile of the view's depths, so the lower of its two neighbours decides
     rank = int(DEPTH_SHARE * (width * height - 1))
-    kept = []
+    near_pixels = []
     for depth in depths:
         mask = depth <= np.partition(depth.reshape(-1), rank)[rank]
-        kept.append(inside[mask.reshape(-1)[inside]])
+        near_pixels.append(inside[mask.reshape(-1)[inside]])
     for step, chosen in enumerate(every_nth(views), 1):
-        pixels = tuple(kept[view] for view in chosen)
+        pixels = tuple(near_pixels[view] for view in chosen)
         ends = np.cumsum([len(view_pixels) for view_pixels in pixels])
         if ends[-1] == count:
             border = da3_box(width, height).description.removesuffix(" at every border")
-            every = "" if step == 1 else f", every {step}. view"
-            description = f"{border}, nearest 90 % of each view{every}, view-major"
+            step_text = "" if step == 1 else f", every {step}. view"
+            description = f"{border}, nearest 90 % of each view{step_text}, view-major"
             rows = tuple(np.split(np.arange(count, dtype=np.int64), ends[:-1]))
             return [Layout(description, "box+depth", "view-major", width, height, chosen, rows, pixels)]
     return []
 
 
 def subsample(layout: Layout, per_part: int) -> Layout:
-    """Thin a layout to about ``per_part`` rows of each part, spread over all columns and rows."""
+    """Thin a layout to about ``per_part`` rows of each part, spread over all columns and lines."""
     rows, pixels = [], []
     for part_rows, part_pixels in zip(layout.rows, layout.pixels, strict=True):
         chosen = np.arange(0, part_rows.size, spread_step(-(-part_rows.size // per_part), layout.width))

@@ -1,7 +1,7 @@
-"""Match the views of rows with the cameras of a file: which of them each is, and how their world lies.
+"""Match the views of a layout with the cameras of a file, and find the frame of the cameras.
 
-Rows in the right place show their pixels to some camera, and the pose of each view. One similarity moves the file's
-cameras to these poses, in the right convention and order alone.
+In the right layout some projective camera shows the rows of a view in their pixels, and the pose of each view can be
+solved for. If convention and order of the file's cameras are right, one similarity moves all of them to these poses.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 
 from gsmerge.alignment.cameras import other_conventions
 from gsmerge.alignment.frames import own_poses, solved_frames, usual_frames
-from gsmerge.alignment.grids import Grid, read_as
-from gsmerge.alignment.judge import GridReading
+from gsmerge.alignment.grids import Grid, with_poses
+from gsmerge.alignment.judge import Candidate
 from gsmerge.alignment.layouts import Layout, every_nth, some_views, subsample, view_orders
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
@@ -26,7 +26,7 @@ from gsmerge.alignment.score import (
     SAMPLE_GAUSSIANS,
     AlignmentInput,
     Correspondences,
-    Reading,
+    ScoredLayout,
     is_as_near,
     is_clearly_nearer,
     pixel_limit,
@@ -39,24 +39,25 @@ from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import NO_IMAGES, PhotoArrays, Size, as_floats, photo_size
 from gsmerge.types import Cameras
 
-# pixels from which no camera shows the rows of a layout: times the limit, and times the distance of the nearest layout
-_SHOWN_LIMITS, _AS_SHOWN = 2.0, 3.0
-_MOST_STEPS = 64  # selections of every n-th camera that are tried, which leaves out some only of hundreds of cameras
-_SHOWN_GAUSSIANS = 200  # Gaussians of a view that it is judged by
+# A layout is dropped if its error under projective cameras exceeds that many limits, or that many times the error of
+# the best layout
+_MAX_LIMITS, _MAX_RATIO = 2.0, 3.0
+_MAX_SELECTIONS = 64  # selections of every n-th camera that are tried; hundreds of cameras have more
+_PROJECTED_GAUSSIANS = 200  # Gaussians of a view that the projective camera is solved from
 
-GridLayout = tuple[Grid, Layout]  # a layout of the rows in a grid of its size
+GridLayout = tuple[Grid, Layout]  # a layout of the rows, and the grid of its size
 
 
 @dataclass(frozen=True)
 class RowSource:
-    """The Gaussians, the cameras, the photos and the known facts about the rows."""
+    """The Gaussians, the cameras and the photos of a scene, and hints about the rows; see :func:`align`."""
 
     ply: GaussianFile
     camera_file: CameraFile
     photos: PhotoArrays
-    order: str
-    scale: float | None
-    depths: Callable[[], np.ndarray | None]
+    order: str  # hint on the order of the rows; "auto": unknown
+    scale: float | None  # hint on the scale of the Gaussians' world over that of the cameras
+    depths: Callable[[], np.ndarray | None]  # reads the depth maps ``[c,h,w]`` next to the cameras
 
     @property
     def size(self) -> Size | None:
@@ -69,61 +70,65 @@ class RowSource:
         return as_floats(self.photos)
 
     def inputs(self, grid: Grid, *, photos: bool = True) -> AlignmentInput:
-        """Bring rows, cameras and photos to the size of a grid; without photos if only positions matter."""
+        """Return rows, cameras and photos at the size of a grid; without ``photos`` if only positions matter."""
         images = NO_IMAGES
         if photos:
             images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
         return AlignmentInput(self.ply.gaussians, self.ply.valid, grid.cameras, images, self.order, self.scale)
 
     def may_be(self, order: str) -> bool:
-        """Return whether rows may be in an order."""
+        """Return True if the hint allows an order of the rows."""
         return self.order in ("auto", order)
 
     def orders(self, grid: Grid) -> list[tuple[int, ...]]:
-        """List the orders that the views may be in: the file's, and that of the names.
+        """List the orders that the views may be in: that of the file, and that of the names.
 
-        Orders that only exchange views of equal poses and photos are all right, and left out.
+        An order that only exchanges views with equal poses and photos is equivalent, and replaced by that of the file.
         """
         first, *others = view_orders(self.camera_file.names)
         cameras, photos = grid.cameras, self.photos
 
-        def same(a: int, b: int) -> bool:
+        def are_equal(a: int, b: int) -> bool:
             pairs = [(cameras.viewmats[a, :3], cameras.viewmats[b, :3]), (cameras.Ks[a], cameras.Ks[b])]
             pairs += [(photos[a], photos[b])] if len(photos) else []
             return all(np.array_equal(one, other) for one, other in pairs)
 
-        alike = (all(a == b or same(a, b) for a, b in zip(first, other, strict=True)) for other in others)
-        return [first, *(first if skip else other for skip, other in zip(alike, others, strict=True))]
+        equivalent = (all(a == b or are_equal(a, b) for a, b in zip(first, other, strict=True)) for other in others)
+        return [first, *(first if skip else other for skip, other in zip(equivalent, others, strict=True))]
 
 
-def match_views(source: RowSource, places: Sequence[GridLayout]) -> list[GridReading]:
-    """Fit views to the file's cameras in the places in which rows show pixels; in other conventions if none fits."""
-    errors = [_projective_error(source, *place) for place in places]
-    far = _AS_SHOWN * max(min(errors, default=0.0), AS_NEAR_PX)
-    shown = [place for place, error in zip(places, errors, strict=True) if error <= far and math.isfinite(error)]
-    candidates = [candidate for place in shown for candidate in _fit_views(source, *place)]
+def match_views(source: RowSource, grid_layouts: Sequence[GridLayout]) -> list[Candidate]:
+    """Match the views of each layout with the file's cameras; list the candidates that fit.
+
+    Layouts whose rows no projective camera shows in their pixels are left out. Other pose conventions are tried only if
+    no layout fits in the file's own.
+    """
+    errors = [_projective_error(source, *each) for each in grid_layouts]
+    limit = _MAX_RATIO * max(min(errors, default=0.0), AS_NEAR_PX)
+    shown = [each for each, error in zip(grid_layouts, errors, strict=True) if error <= limit and math.isfinite(error)]
+    candidates = [candidate for each in shown for candidate in _match_layout(source, *each)]
     for grid, layout in shown if not candidates else ():
-        candidates += [each for other in other_grids(source, grid) for each in _fit_views(source, other, layout)]
+        candidates += [each for other in other_grids(source, grid) for each in _match_layout(source, other, layout)]
     return candidates
 
 
 def other_grids(source: RowSource, grid: Grid) -> Iterator[Grid]:
-    """Return a grid with its poses read in each other convention."""
+    """Return a grid with its poses in each other convention."""
     poses = other_conventions(source.camera_file.viewmats, source.camera_file.convention)
-    return (read_as(grid, each) for each in poses)
+    return (with_poses(grid, each) for each in poses)
 
 
 def _projective_error(source: RowSource, grid: Grid, layout: Layout) -> float:
-    """Measure how far rows are from their pixels under a camera of any pose and lens; inf where none shows them.
+    """Measure how far rows are from their pixels under the best projective camera, pixels; inf beyond the limit.
 
-    Of the first, the middle and the last view, one that a camera shows counts.
+    The first, the middle and the last view are tried until one is within the limit.
     """
-    limit = _SHOWN_LIMITS * pixel_limit(*grid.size)
+    limit = _MAX_LIMITS * pixel_limit(*grid.size)
     inputs = source.inputs(grid, photos=False)
     for view in some_views(layout):
-        some = subsample(layout.select(view), _SHOWN_GAUSSIANS)
-        pairs = inputs.pairs(some)
-        if 2 * len(pairs.rows) < sum(map(len, some.rows)):  # a few lie in their pixels by chance
+        sample = subsample(layout.select(view), _PROJECTED_GAUSSIANS)
+        pairs = inputs.pairs(sample)
+        if 2 * len(pairs.rows) < sum(map(len, sample.rows)):  # most rows are not finite; the rest may fit by chance
             continue
         error = projective_error(pairs.points, pairs.pixels)
         if error <= limit:
@@ -131,56 +136,63 @@ def _projective_error(source: RowSource, grid: Grid, layout: Layout) -> float:
     return math.inf
 
 
-def _fit_views(source: RowSource, grid: Grid, layout: Layout) -> list[GridReading]:
-    """Fit the views of a layout to the file's cameras, in each likely order and in that of the nearest poses."""
+def _match_layout(source: RowSource, grid: Grid, layout: Layout) -> list[Candidate]:
+    """Match the views of a layout with the file's cameras; list the candidates that fit.
+
+    Views are matched in each likely order of the cameras, and with the cameras nearest to their own poses.
+    """
     inputs = source.inputs(grid, photos=False)
     pairs = inputs.pairs(sample_layout(layout, QUICK_GAUSSIANS))
-    numbers, parts = np.unique(layout.views, return_inverse=True)  # of the views; the view of each part
+    numbers, parts = np.unique(layout.views, return_inverse=True)  # numbers of the views; the view of each part
     count, pairs = len(numbers), replace(pairs, views=parts[pairs.parts])
 
     @cache
-    def solve(Ks: bytes) -> dict[int, np.ndarray]:
+    def solve_poses(Ks: bytes) -> dict[int, np.ndarray]:
         return own_poses(pairs, np.frombuffer(Ks).reshape(-1, 3, 3))
 
-    def find_own(cameras: Sequence[int]) -> dict[int, np.ndarray]:
-        return solve(grid.cameras.Ks[list(cameras)].astype(np.float64).tobytes())
+    def own_poses_with(cameras: Sequence[int]) -> dict[int, np.ndarray]:
+        return solve_poses(grid.cameras.Ks[list(cameras)].astype(np.float64).tobytes())
 
-    def read_as(cameras: Sequence[int]) -> GridReading:
-        own = {cameras[view]: pose for view, pose in find_own(cameras).items()}
+    def make_candidate(cameras: Sequence[int]) -> Candidate:
+        own = {cameras[view]: pose for view, pose in own_poses_with(cameras).items()}
         views = np.array(cameras)
-        labelled = replace(layout, views=tuple(views[parts].tolist()))
-        return GridReading(grid, read_views(inputs, labelled, replace(pairs, views=views[pairs.views]), own))
+        matched = replace(layout, views=tuple(views[parts].tolist()))
+        return Candidate(grid, score_views(inputs, matched, replace(pairs, views=views[pairs.views]), own))
 
-    some = [ids for ids in every_nth(len(grid.cameras)) if len(ids) == count]
-    some = [*some[:: max(1, -(-len(some) // _MOST_STEPS))], tuple(range(count))]
-    orders = dict.fromkeys(tuple(order[view] for view in ids) for ids in some for order in source.orders(grid))
-    candidates = [read_as(order) for order in orders]
-    nearest = _nearest_cameras(find_own(next(iter(orders))), count, grid.cameras)
+    selections = [ids for ids in every_nth(len(grid.cameras)) if len(ids) == count]
+    selections = [*selections[:: max(1, -(-len(selections) // _MAX_SELECTIONS))], tuple(range(count))]
+    orders = dict.fromkeys(tuple(order[view] for view in ids) for ids in selections for order in source.orders(grid))
+    candidates = [make_candidate(order) for order in orders]
+    nearest = _nearest_cameras(own_poses_with(next(iter(orders))), count, grid.cameras)
     if nearest is not None and nearest not in orders and source.scale is None:
-        other = read_as(nearest)
+        other = make_candidate(nearest)
         same_axes = ("same", "scaled", "shifted") if count > 1 else ("same",)  # one view fits any camera
-        candidates += [other] if other.reading.frame.kind in same_axes else []
-    return [each for each in candidates if each.reading.alignment.ok]
+        candidates += [other] if other.scored.frame.kind in same_axes else []
+    return [each for each in candidates if each.scored.alignment.ok]
 
 
 def _nearest_cameras(own: Mapping[int, np.ndarray], count: int, cameras: Cameras) -> tuple[int, ...] | None:
-    """Find the cameras nearest to the poses of ``count`` views, in units of their spread; None where two have one."""
+    """Find the camera nearest to the ``own`` pose ``[4,4]`` of each of ``count`` views.
+
+    Distances are relative to the spread of the cameras, and differences of rotation matrices are added. None if a pose
+    is missing, or if two views have the same nearest camera.
+    """
     if len(own) < count:
         return None
     viewmats, centres = np.stack([own[view] for view in range(count)]), cameras.centres
     unit = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
-    turned = np.abs(viewmats[:, None, :3, :3] - cameras.viewmats[:, :3, :3]).max((2, 3))
-    away = np.linalg.norm(camera_centres(viewmats)[:, None] - centres, axis=2) / unit
-    nearest = (turned + away).argmin(1).tolist()
+    rotation_errors = np.abs(viewmats[:, None, :3, :3] - cameras.viewmats[:, :3, :3]).max((2, 3))
+    distances = np.linalg.norm(camera_centres(viewmats)[:, None] - centres, axis=2) / unit
+    nearest = (rotation_errors + distances).argmin(1).tolist()
     return tuple(nearest) if len(set(nearest)) == count else None
 
 
-def read_views(
+def score_views(
     inputs: AlignmentInput, layout: Layout, pairs: Correspondences, own: Mapping[int, np.ndarray]
-) -> Reading:
-    """Score a layout in the simplest frame in which the cameras are about as near as the views' ``own`` poses.
+) -> ScoredLayout:
+    """Score a layout in the simplest frame in which the cameras fit about as well as the views' ``own`` poses.
 
-    ``pairs`` are a sample of the rows, and ``own`` poses ``[4,4]`` by view.
+    ``pairs`` are a sample of the rows, and ``own`` are poses ``[4,4]`` by view.
     """
     cameras, viewmats = inputs.cameras, inputs.cameras.viewmats.astype(np.float64)
     for view, pose in own.items():
@@ -188,31 +200,29 @@ def read_views(
     bound = score_layout(replace(inputs, cameras=replace(cameras, viewmats=viewmats)), layout, IDENTITY, pairs)
     least = bound.alignment
     if not least.ok and set(own) >= set(layout.views):
-        return bound  # nothing is nearer than poses of their own
+        return bound  # no frame can be nearer than own poses
     frames = chain(
         ((0, frame) for frame in usual_frames(cameras, inputs.scale)), solved_frames(pairs, cameras, own, inputs.scale)
     )
-    readings: list[Reading] = []
+    fitting: list[ScoredLayout] = []
     for effort, frame in frames:
-        reading = replace(score_layout(inputs, layout, frame, pairs), effort=effort)
-        measured = reading.alignment
-        if effort == 2 and readings:
+        scored = replace(score_layout(inputs, layout, frame, pairs), effort=effort)
+        measured = scored.alignment
+        if effort == 2 and fitting:
             break
         if measured.ok and is_as_near(measured.worst_px, least.worst_px):
-            return reading
+            return scored
         is_solved = effort > 0 and inputs.scale is None
         if measured.ok and not (is_solved and is_clearly_nearer(least.middle_px, measured.middle_px)):
-            readings.append(reading)  # otherwise cameras are wrong
-    lowest = min((reading.alignment.worst_px for reading in readings), default=math.inf)
-    near = (reading for reading in readings if is_as_near(reading.alignment.worst_px, lowest))
+            fitting.append(scored)  # a solved frame far behind own poses is left out: its cameras are wrong
+    lowest = min((scored.alignment.worst_px for scored in fitting), default=math.inf)
+    near = (scored for scored in fitting if is_as_near(scored.alignment.worst_px, lowest))
     return next(near, replace(bound, alignment=replace(least, ok=False)))
 
 
-def refine(source: RowSource, candidate: GridReading) -> GridReading:
-    """Score a fit again, with its frame solved again, on more Gaussians."""
-    inputs = source.inputs(candidate.grid, photos=False)
-    pairs = inputs.pairs(sample_layout(candidate.reading.layout, SAMPLE_GAUSSIANS))
-    return replace(
-        candidate,
-        reading=read_views(inputs, candidate.reading.layout, pairs, own_poses(pairs, candidate.grid.cameras.Ks)),
-    )
+def rescore(source: RowSource, candidate: Candidate) -> Candidate:
+    """Solve for the frame of a candidate again and score it again, on more Gaussians."""
+    inputs, layout = source.inputs(candidate.grid, photos=False), candidate.scored.layout
+    pairs = inputs.pairs(sample_layout(layout, SAMPLE_GAUSSIANS))
+    own = own_poses(pairs, candidate.grid.cameras.Ks)
+    return replace(candidate, scored=score_views(inputs, layout, pairs, own))

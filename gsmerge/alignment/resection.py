@@ -1,4 +1,4 @@
-"""Solve for the poses of cameras, and for their intrinsics, from points and the pixels that show them."""
+"""Solve for the poses and intrinsics of cameras from points and their pixels."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from gsmerge.kernels import reproject
 from gsmerge.kernels.matrices import eigh, matmul, solve
 
 DAMPING = Damping(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
-MAX_STRETCH = 0.5  # of the focal length, in a step
-ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4  # numbers of the intrinsics: fx = fy; fx, fy; fx, fy, cx, cy
-_Fit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]  # intrinsics, poses, equations
-MIN_POINTS = 24  # fewer fit any camera
-_FLAT = 1e-10  # of the largest second moment: an axis along which points do not differ
+MAX_STRETCH = 0.5  # largest relative change of a focal length in one step
+ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4  # numbers of free intrinsics: fx = fy; fx, fy; fx, fy, cx, cy
+_Fit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]  # intrinsics, poses, normal equations
+MIN_POINTS = 24  # with fewer points almost any projective camera fits
+_FLAT = 1e-10  # second moment of an axis, over the largest one, below which points lie in a plane across the axis
 _PROJECTIVE_ROUNDS = 8  # of reweighted least squares
-_SMALLEST_ERROR = 1e-6  # of the pixels' spread
+_SMALLEST_ERROR = 1e-6  # over the spread of the pixels
 
 
 def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
     """Solve for the pose ``[4,4]``, world to camera, that shows points ``[n,3]`` at ``pixels [n,2]``; None if it fails.
 
-    Uses SQPnP (Terzakis and Lourakis 2020), which is close to the optimum. Needs at least three points, which should
-    lie near zero.
+    The solution of SQPnP (Terzakis and Lourakis 2020) is close to the optimum. At least three points are needed, and
+    they should lie near the origin.
     """
     try:
         solved, rotation, shift = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
-    except cv2.error:  # points in one place
+    except cv2.error:  # all points coincide
         return None
     return motion_matrices(np.concatenate([rotation, shift]).T)[0] if solved else None
 
@@ -47,17 +47,17 @@ def refine_poses(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine poses by least squares so that points ``[n,3]`` of each view project to their ``pixels [n,2]``.
 
-    Also solves for common intrinsics of the views, as many as ``free`` says: ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS.
+    Also solves for ``free`` intrinsics that are common to the views: none, ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS.
     Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the points do not determine
     them.
     """
 
-    def fit(near_K: np.ndarray, near: np.ndarray) -> _Fit:
-        return near_K, near, _linearise(points, pixels, near_K, near, free)
+    def fit(new_K: np.ndarray, new_poses: np.ndarray) -> _Fit:
+        return new_K, new_poses, _linearise(points, pixels, new_K, new_poses, free)
 
     def step(state: _Fit, damping: float) -> _Fit:
         current_K, current_poses, (curvature, slope, _) = state
-        with np.errstate(all="ignore"):  # a step beyond all numbers has no less error
+        with np.errstate(all="ignore"):  # an overflowing step does not reduce the error, so it is rejected
             change, motions = _step(curvature, slope, damping)
             return fit(_change_intrinsics(current_K, change), matmul(motion_matrices(motions), current_poses))
 
@@ -78,7 +78,7 @@ def _linearise(
         jacobian, residual = np.empty((2 * len(points[view]), size)), np.empty(2 * len(points[view]))
         values = (np.ascontiguousarray(array, np.float64) for array in (points[view], pixels[view], K, pose))
         reproject.linearise(*values, jacobian, residual)
-        with np.errstate(all="ignore"):  # points in the camera's plane
+        with np.errstate(all="ignore"):  # points in the plane of the camera overflow
             curvature[view], slope[view] = matmul(jacobian.T, jacobian), matmul(jacobian.T, residual)
             error += float((residual * residual).sum())
     return curvature, slope, error
@@ -88,12 +88,13 @@ def _step(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.
     """Return changes ``[f]`` of the common intrinsics and motions ``[v,6]`` of the cameras."""
     size = curvature.shape[1]
     damped = curvature + damping * np.eye(size) * curvature
-    down, across = slope[:, :6, None], damped[:, :6, 6:]
+    pose_slope, mixed = slope[:, :6, None], damped[:, :6, 6:]
     if size == 6:
-        return np.empty(0), -solve(damped, down)[..., 0]
-    solved = solve(damped[:, :6, :6], np.concatenate([down, across], 2))  # the cameras' unknowns are eliminated
+        return np.empty(0), -solve(damped, pose_slope)[..., 0]
+    # the Schur complement eliminates the poses
+    solved = solve(damped[:, :6, :6], np.concatenate([pose_slope, mixed], 2))
     whole = np.concatenate([slope[:, 6:, None], damped[:, 6:, 6:]], 2)
-    reduced = (whole - matmul(across.swapaxes(1, 2), solved)).sum(0)
+    reduced = (whole - matmul(mixed.swapaxes(1, 2), solved)).sum(0)
     change = -solve(reduced[:, 1:], reduced[:, 0])
     change[:TWO_FOCALS] = change[:TWO_FOCALS].clip(-MAX_STRETCH, MAX_STRETCH)
     return change, -solved[..., 0] - matmul(solved[..., 1:], change)
@@ -111,16 +112,16 @@ def _change_intrinsics(K: np.ndarray, change: np.ndarray) -> np.ndarray:
 def focal_uncertainty(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], Ks: np.ndarray, poses: np.ndarray
 ) -> float:
-    """Estimate the relative standard error of a focal length for pixel errors of one; inf for points in a plane.
+    """Estimate the relative standard error of one focal length for all views, if pixels have an error of 1.
 
-    ``points [n,3]`` and ``pixels [n,2]`` are given for each view. The error is that of one focal length for all views.
+    ``points [n,3]`` and ``pixels [n,2]`` are given for each view. The result is inf for points in a plane.
     """
     weight = 0.0
     for p, q, K, pose in zip(points, pixels, Ks, poses, strict=True):
         (curvature,), _, _ = _linearise([p], [q], K, pose[None], ONE_FOCAL)
         try:
             explained = matmul(curvature[6, :6], solve(curvature[:6, :6], curvature[:6, 6]))
-        except np.linalg.LinAlgError:  # points in one place
+        except np.linalg.LinAlgError:  # all points coincide
             continue
         weight += float(curvature[6, 6] - explained)
     return 1 / math.sqrt(weight) if weight > 0 else math.inf
@@ -129,7 +130,7 @@ def focal_uncertainty(
 def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
     """Measure the median distance of points ``[n,3]`` from ``pixels [n,2]`` under the best projective camera, pixels.
 
-    0 if there are too few points to decide.
+    Returns 0 if there are too few points to decide.
     """
     return 0.0 if len(points) < MIN_POINTS else projective_camera(points, pixels)[1]
 
@@ -137,28 +138,28 @@ def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
 def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, float]:
     """Solve for the projective camera ``[3,4]`` that shows points ``[n,3]`` nearest to their ``pixels [n,2]``.
 
-    Any matrix is one. It is solved by the direct linear transform with reweighting (Hartley and Zisserman 2004, section
-    7.1). Also returns the median distance from the pixels.
+    A projective camera is any ``[3,4]`` matrix. It is solved by the direct linear transform with reweighting (Hartley
+    and Zisserman 2004, section 7.1). Also returns the median distance from the pixels.
     """
     middle = np.median(points, 0)
     unit = float(np.median(np.abs(points - middle))) or 1.0
-    near = np.concatenate([(points - middle) / unit, np.ones((len(points), 1))], 1)
-    near /= np.linalg.norm(near, axis=1, keepdims=True)
-    values, axes = eigh(matmul(near.T, near))
-    used = values > _FLAT * values[-1]  # of points in a plane or in a line, other axes say nothing
+    homogeneous = np.concatenate([(points - middle) / unit, np.ones((len(points), 1))], 1)
+    homogeneous /= np.linalg.norm(homogeneous, axis=1, keepdims=True)
+    values, axes = eigh(matmul(homogeneous.T, homogeneous))
+    used = values > _FLAT * values[-1]  # points in a plane or on a line do not determine the other axes
     basis = axes[:, used] / np.sqrt(values[used])
-    near = matmul(near, basis)
+    local = matmul(homogeneous, basis)
     centre, size = pixels.mean(0), float(pixels.std()) or 1.0
     wanted = (pixels - centre) / size
-    zero = np.zeros_like(near)
-    across = np.concatenate([near, zero, -wanted[:, :1] * near], 1)
-    down = np.concatenate([zero, near, -wanted[:, 1:] * near], 1)
+    zero = np.zeros_like(local)
+    across = np.concatenate([local, zero, -wanted[:, :1] * local], 1)
+    down = np.concatenate([zero, local, -wanted[:, 1:] * local], 1)
     weights = np.ones(len(points))
-    camera, error = np.zeros((3, near.shape[1])), np.full(len(points), np.inf)
+    camera, error = np.zeros((3, local.shape[1])), np.full(len(points), np.inf)
     for _ in range(_PROJECTIVE_ROUNDS):
         heavy = np.concatenate([across * weights[:, None], down * weights[:, None]])
         camera = eigh(matmul(heavy.T, heavy))[1][:, 0].reshape(3, -1)
-        places = matmul(near, camera.T)
+        places = matmul(local, camera.T)
         with np.errstate(all="ignore"):
             error = np.linalg.norm(places[:, :2] / places[:, 2:] - wanted, axis=1)
             error = np.where(np.isfinite(error), error, np.inf)

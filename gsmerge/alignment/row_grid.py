@@ -1,7 +1,8 @@
 """Find the grid of a file's rows from the rows alone: the period of its lines, and where views begin.
 
-Steps from pixel to pixel are alike in neighbouring lines, so those from row to row repeat after a line. Lines belong to
-one view as long as a projective camera shows them in their pixels: any camera does, whatever its pose and focal length.
+Steps between neighbouring pixels are similar in neighbouring lines, so the steps between rows repeat after one line.
+This gives the length of a line. Lines belong to one view as long as one projective camera shows them in their pixels,
+of any pose and focal length.
 """
 
 from __future__ import annotations
@@ -18,24 +19,24 @@ from gsmerge.alignment.score import find_correspondences, is_as_near, pixel_limi
 from gsmerge.types import Gaussians
 
 _MIN_SIDE = 16  # pixels of a grid
-_MAX_FASTEST = 512  # rows from a pixel to the next, at most: its views and layers, where those are side by side
-_STEPS = 2000  # steps over as many rows that are measured
-_AS_SHORT = 1.5  # times the shortest median step
-_SEGMENT, _SEGMENTS = 1 << 17, 8  # rows whose steps are compared with each other, and how many such parts
-_MAX_STEP = 8.0  # times the median; longer steps, at the edges of things, count as that
-_MIN_PEAK = 8.0  # times the median correlation of steps: a period
-_SHARE = 0.25  # of the highest peak: lines that repeat less than views do
-_PERIODS = 6  # that are tried
-_SAMPLE_GAUSSIANS = 200  # of a view that are looked at
-_LEAST_GAUSSIANS, _MOST_GAUSSIANS = 60, 10_000  # that a calibration is solved from: of a view, of all views
-_PLACES = tuple(number * 0.6180339887498949 % 1 for number in range(9))  # in the file, of views that are looked at
-_RECURRENCE = 0.7548776662466927, 0.5698402909980532  # powers of the plastic number's inverse
+_MAX_FASTEST = 512  # most rows from one pixel to the next, if the views and layers of a pixel follow each other
+_STEPS = 2000  # steps that are measured for each distance in rows
+_AS_SHORT = 1.5  # steps between neighbouring pixels have at most that many times the shortest median length
+_SEGMENT, _SEGMENTS = 1 << 17, 8  # rows of a part of the file whose steps are correlated, and number of parts
+_MAX_STEP = 8.0  # times the median; longer steps, at the edges of things, are clipped
+_MIN_PEAK = 8.0  # times the median correlation of steps; a period has a higher peak
+_SHARE = 0.25  # of the highest peak; periods of lines may have lower peaks than periods of views
+_MAX_PERIODS = 6  # that are tried
+_SAMPLE_GAUSSIANS = 200  # of a view that a projective camera is solved from
+_MIN_GAUSSIANS, _MAX_GAUSSIANS = 60, 10_000  # that a calibration is solved from: least of a view, most of all views
+_PLACES = tuple(number * 0.6180339887498949 % 1 for number in range(9))  # of the sampled views, as shares of the file
+_RECURRENCE = 0.7548776662466927, 0.5698402909980532  # powers of the inverse of the plastic number
 
 _Size = tuple[int, int, int]  # rows from pixel to pixel, pixels of a line, lines of a view
 
 
 def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibration] | None:
-    """Find the grid whose pixels are the rows, and the cameras of its views; None if there is no such grid.
+    """Find the grid whose pixels are the rows, and the cameras of its views; None if the rows form no grid.
 
     ``valid [n]`` bool. Pixels that an exporter trimmed are not part of the grid.
     """
@@ -47,12 +48,12 @@ def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibrat
 
 
 def find_layouts(gaussians: Gaussians, valid: np.ndarray) -> list[Layout]:
-    """Find the layouts of the grid whose pixels are the rows, some of which may be the same under other names."""
+    """Find the layouts of the grid whose pixels are the rows; the order of views and layers may remain ambiguous."""
     return next(filter(None, map(list, _shown_layouts(gaussians, valid))), [])
 
 
 def _shown_layouts(gaussians: Gaussians, valid: np.ndarray) -> Iterator[Iterator[Layout]]:
-    """Yield the layouts in which projective cameras show the rows in their pixels, line by line, then by columns."""
+    """Yield the layouts in which projective cameras show the rows in their pixels: line by line, then by columns."""
     size = _find_size(gaussians, valid)
     if size is None:
         return
@@ -64,10 +65,10 @@ def _shown_layouts(gaussians: Gaussians, valid: np.ndarray) -> Iterator[Iterator
 def _calibrate_layouts(
     means: np.ndarray, valid: np.ndarray, layouts: Iterable[Layout]
 ) -> list[tuple[Layout, Calibration]]:
-    """Calibrate the cameras of layouts; leave out layouts whose pixels do not match the rows."""
+    """Calibrate the cameras of each layout; leave out layouts that fit no cameras."""
     fits = []
     for layout in layouts:
-        samples = max(_LEAST_GAUSSIANS, min(_MOST_GAUSSIANS // len(layout.views), _MOST_GAUSSIANS // 10))
+        samples = max(_MIN_GAUSSIANS, min(_MAX_GAUSSIANS // len(layout.views), _MAX_GAUSSIANS // 10))
         pairs = find_correspondences(means, valid, _thin(layout, samples))
         calibration = calibrate(pairs, layout.width, layout.height)
         fits += [] if calibration is None else [(layout, calibration)]
@@ -75,7 +76,7 @@ def _calibrate_layouts(
 
 
 def _shows_pixels(means: np.ndarray, valid: np.ndarray, layout: Layout) -> bool:
-    """Return whether projective cameras show the rows of the first, the middle and the last view in their pixels."""
+    """Return True if projective cameras show the rows of the first, the middle and the last view in their pixels."""
     for view in some_views(layout):
         pairs = find_correspondences(means, valid, _thin(layout.select(view), _SAMPLE_GAUSSIANS))
         if not projective_error(pairs.points, pairs.pixels) <= pixel_limit(layout.width, layout.height):
@@ -84,7 +85,7 @@ def _shows_pixels(means: np.ndarray, valid: np.ndarray, layout: Layout) -> bool:
 
 
 def _thin(layout: Layout, samples: int) -> Layout:
-    """Thin a layout of every pixel to some pixels of each part."""
+    """Thin a layout of all pixels to about ``samples`` pixels of each part."""
     chosen = _spread(samples, layout.width, layout.height)
     rows = tuple(part_rows.flat[chosen] for part_rows in layout.rows)
     return replace(layout, rows=rows, pixels=(chosen,) * len(rows))
@@ -98,7 +99,7 @@ def _spread(count: int, width: int, height: int) -> np.ndarray:
 
 
 def _layouts(count: int, width: int, height: int, by_column: bool) -> Iterator[Layout]:
-    """Yield the layouts of grids of a size without borders."""
+    """Yield the layouts of ``count`` rows as all pixels of views of one size, line by line or ``by_column``."""
     num_parts = count // (width * height)
     for per_pixel in PER_PIXEL:
         if num_parts % per_pixel == 0:
@@ -121,10 +122,10 @@ def _find_size(gaussians: Gaussians, valid: np.ndarray) -> _Size | None:
 
 
 def _find_height(means: np.ndarray, valid: np.ndarray, step: int, width: int) -> list[tuple[float, _Size]]:
-    """Find the largest number of lines that a projective camera shows in their pixels, in every view.
+    """Find the largest height of views so that a projective camera shows each sampled view in its pixels.
 
-    Also returns the distance of the rows from their pixels: with every other pixel of a line it would be as small, not
-    smaller.
+    Returns at most one size, with a score that is lower for better sizes. The score is the largest error times
+    ``step``. The factor keeps a grid of every other pixel from winning, whose errors are smaller in its wider pixels.
     """
     lines = len(means) // (step * width)
     for views in _divisors(lines):
@@ -152,7 +153,7 @@ def _divisors(number: int) -> list[int]:
 
 
 def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[int]]:
-    """Find the step in rows between neighbouring pixels, and the periods of the rows, which divide their number."""
+    """Find the step in rows between neighbouring pixels, and the periods of steps, which divide the number of rows."""
     means, count = gaussians.means, len(gaussians)
     lags = np.arange(1, min(_MAX_FASTEST, count // _MIN_SIDE**2) + 1)
     if not len(lags):
@@ -170,18 +171,19 @@ def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[in
     for place in places:
         for values in (*means.T, gaussians.sh0[:, 0, 1]):
             power += _power(values[place : place + segment + fastest], fastest)
-    alike = np.fft.irfft(power)[:segment] / np.arange(segment, 0, -1)  # steps that are so many rows apart
-    alike = alike[: segment // 2 + fastest]
-    peaks = np.zeros(len(alike))
-    peaks[fastest:-fastest] = alike[fastest:-fastest] - (alike[: -2 * fastest] + alike[2 * fastest :]) / 2
+    correlation = np.fft.irfft(power)[:segment] / np.arange(segment, 0, -1)  # of steps, by their distance in rows
+    correlation = correlation[: segment // 2 + fastest]
+    peaks = np.zeros(len(correlation))
+    beside = (correlation[: -2 * fastest] + correlation[2 * fastest :]) / 2
+    peaks[fastest:-fastest] = correlation[fastest:-fastest] - beside
     likely = [lag for lag in _divisors(count) if _MIN_SIDE <= lag < len(peaks)]
     lowest = _MIN_PEAK * float(np.median(np.abs(peaks)))
     lowest = max([lowest, *(_SHARE * peaks[lag] for lag in likely)])
-    return fastest, [lag for lag in likely if peaks[lag] >= lowest > 0][:_PERIODS]
+    return fastest, [lag for lag in likely if peaks[lag] >= lowest > 0][:_MAX_PERIODS]
 
 
 def _power(values: np.ndarray, lag: int) -> np.ndarray:
-    """Compute the power spectrum, as shares of its sum, of differences over ``lag`` rows; ``values [n]`` may be NaN."""
+    """Compute the normalised power spectrum of differences over ``lag`` rows; ``values [n]`` may be NaN."""
     values = values.astype(np.float64)
     with np.errstate(invalid="ignore"):
         steps = np.nan_to_num(values[lag:] - values[:-lag], posinf=0.0, neginf=0.0)
@@ -193,6 +195,6 @@ def _power(values: np.ndarray, lag: int) -> np.ndarray:
 
 
 def _median(values: np.ndarray) -> float:
-    """Return the median of the values that are not NaN; 0 without any."""
+    """Return the median of the finite values; 0 if there is none."""
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else 0.0

@@ -1,4 +1,4 @@
-"""Score how near Gaussians project to their pixels, and how near their colours are to the photos'."""
+"""Measure how near Gaussians project to their pixels, and how near their colours are to those of the photos."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from gsmerge.kernels import reproject
 from gsmerge.runtime.memory import free_pages, gather
 from gsmerge.types import Cameras, Gaussians, Scene
 
-MARGIN = 2.0  # by which the best reading must beat the next one
-SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
-# Medians of some 400 pixels differ by chance: 1.15 is three standard errors of their ratio, each 0.72 / sqrt(n) of a
-# median distance in a plane. The pixels are those by which files round cameras.
+MARGIN = 2.0  # factor by which the best alternative must beat the next one
+SHUFFLED_MARGIN = 5.0  # factor by which it must beat shuffled pixels
+# Medians of some 400 distances differ by chance: 1.15 is three standard errors of their ratio, since the standard error
+# of a median distance in a plane is 0.72 / sqrt(n) of it. The pixels are the error of cameras that files round
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
-RANDOM_SHARE = 0.85  # of the colours' distance from shuffled pixels: as good as random
-SAME_COLORS = 0.01  # mean distance of colours from shuffled pixels below which photos say nothing
-QUICK_GAUSSIANS, SAMPLE_GAUSSIANS, MIN_SAMPLE_GAUSSIANS = 1500, 6000, 60  # Gaussians of a score; per view at least
+RANDOM_SHARE = 0.85  # colour error over that of shuffled pixels, above which colours agree no better than at random
+SAME_COLORS = 0.01  # colour error of shuffled pixels below which colours vary too little to decide
+QUICK_GAUSSIANS, SAMPLE_GAUSSIANS = 1500, 6000  # Gaussians of a quick score, and of a score
+MIN_SAMPLE_GAUSSIANS = 60  # of each part
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
-MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond
+MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some of them a little beyond
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,9 @@ class Correspondences:
 
     points: np.ndarray  # ``[t,3]`` float64 means
     pixels: np.ndarray  # ``[t,2]`` pixel centres (x, y)
-    views: np.ndarray  # ``[t]`` rows of the camera arrays
-    parts: np.ndarray  # ``[t]`` what wrote them, in order: a view, or one layer of it
-    rows: np.ndarray  # ``[t]`` of the file
+    views: np.ndarray  # ``[t]`` ids of the cameras
+    parts: np.ndarray  # ``[t]`` the part of the layout, a view or one layer of it; ascending
+    rows: np.ndarray  # ``[t]`` rows of the file
 
     def select(self, index: np.ndarray) -> Correspondences:
         """Select rows by a mask or indices."""
@@ -61,8 +62,8 @@ class AlignmentInput:
     valid: np.ndarray  # ``[n]`` bool
     cameras: Cameras  # all c cameras at the grid's size, in their own world
     images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
-    order: str = "auto"  # the order of the rows where it is given, otherwise "auto"
-    scale: float | None = None  # size of the Gaussians' world in units of the cameras', where it is given
+    order: str = "auto"  # the order of the rows if it is given, otherwise "auto"
+    scale: float | None = None  # scale of the Gaussians' world over that of the cameras, if it is given
 
     def pairs(self, layout: Layout) -> Correspondences:
         """Return the valid rows of a layout with their pixels and views."""
@@ -82,15 +83,14 @@ def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -
 
 @dataclass(frozen=True)
 class Alignment:
-    """How near Gaussians project to their pixels, in each view, or in each part of the rows."""
+    """Distance of projected Gaussians from their pixels, in each view, or in each part of the rows."""
 
-    # median distance from the pixel centre, pixels; inf where most are behind the camera, NaN where a view has no
-    # finite Gaussian
+    # median distance from the pixel centre, pixels; inf if most Gaussians are behind the camera, NaN if none is finite
     median_px: tuple[float, ...]
     share_in_front: float  # share of all checked Gaussians with positive depth in their own view
     share_within_1px: float  # share of all checked Gaussians at most one pixel from their pixel's centre
     limit_px: float  # largest median that counts as aligned
-    ok: bool  # whether every view's median is below the limit and most Gaussians are in front
+    ok: bool  # True if every view's median is below the limit and most Gaussians are in front
 
     @property
     def middle_px(self) -> float:
@@ -104,32 +104,32 @@ class Alignment:
 
 
 @dataclass(frozen=True)
-class Reading:
-    """One assumption about which pixel each row belongs to, and how well it fits."""
+class ScoredLayout:
+    """A layout of the rows in a frame, and how well it fits."""
 
-    layout: Layout  # which row belongs to which pixel
+    layout: Layout  # the assumed pixel of each row
     frame: Similarity  # from the frame of the cameras to that of the Gaussians
-    alignment: Alignment  # how near the Gaussians of each part project to their pixels
-    effort: int = 0  # 0: the frame is a usual one; 1: its scale or shift was solved for; 2: its rotation as well
+    alignment: Alignment  # distance of the Gaussians of each part from their pixels
+    effort: int = 0  # 0: the frame is an exporter's; 1: its scale or shift was solved for; 2: its rotation as well
 
     @property
     def description(self) -> str:
-        """Description of the reading in words."""
+        """Description of layout and frame in words."""
         return ", ".join(part for part in (self.layout.description, self.frame.description) if part)
 
 
 def is_as_near(px: float, least: float) -> bool:
-    """Return whether a median distance, pixels, is larger than the least one by no more than chance and rounding."""
+    """Return True if a median distance, pixels, exceeds the least one by no more than chance and rounding."""
     return px <= max(AS_NEAR * least, least + AS_NEAR_PX)
 
 
 def is_clearly_nearer(px: float, other_px: float) -> bool:
-    """Return whether a median distance, pixels, stands out against that of another explanation."""
+    """Return True if a median distance, pixels, is clearly smaller than that of another layout or frame."""
     return other_px >= MARGIN * max(px, AS_NEAR_PX)
 
 
 def pixel_limit(width: int, height: int) -> float:
-    """Return the largest median distance, pixels, at which Gaussians still count as belonging to their pixels."""
+    """Return the largest median distance, pixels, at which Gaussians count as lying in their pixels."""
     return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
 
 
@@ -140,28 +140,28 @@ def sample_layout(layout: Layout, samples: int = SAMPLE_GAUSSIANS) -> Layout:
 
 def score_layout(
     inputs: AlignmentInput, layout: Layout, frame: Similarity, pairs: Correspondences | None = None
-) -> Reading:
+) -> ScoredLayout:
     """Score how well a layout fits in a frame, on a sample of its rows or on the given ``pairs``."""
     if pairs is None:
         pairs = inputs.pairs(sample_layout(layout))
-    return Reading(layout, frame, check_pairs(pairs, frame.move(inputs.cameras), len(layout.views)))
+    return ScoredLayout(layout, frame, check_pairs(pairs, frame.move(inputs.cameras), len(layout.views)))
 
 
-def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]:
-    """Measure median distance (pixels) and mean colour distance with pixels shuffled in each part, for comparison."""
+def score_shuffled(inputs: AlignmentInput, best: ScoredLayout) -> tuple[float, float]:
+    """Measure the median distance in pixels and the mean colour error after shuffling the pixels in each part."""
     rng, layout = np.random.default_rng(0), sample_layout(best.layout)
     pairs = inputs.pairs(replace(layout, pixels=tuple(rng.permutation(pixels) for pixels in layout.pixels)))
     errors = pixel_errors(pairs, best.frame.move(inputs.cameras))
     return median(errors), _color_distance(inputs, pairs)
 
 
-def beats_shuffled(reading: Reading, shuffled_px: float) -> bool:
-    """Return whether a reading is near enough to its pixels, and far nearer than to shuffled pixels."""
-    return reading.alignment.ok and shuffled_px >= SHUFFLED_MARGIN * max(reading.alignment.worst_px, AS_NEAR_PX)
+def beats_shuffled(scored: ScoredLayout, shuffled_px: float) -> bool:
+    """Return True if a layout is near enough to its pixels, and far nearer than to shuffled pixels."""
+    return scored.alignment.ok and shuffled_px >= SHUFFLED_MARGIN * max(scored.alignment.worst_px, AS_NEAR_PX)
 
 
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
-    """Measure the mean distance, 0 to 1, between base colours and photos at a layout's pixels; NaN without either."""
+    """Measure the mean difference, 0 to 1, of base colours from photos at a layout's pixels; NaN without either."""
     return _color_distance(inputs, inputs.pairs(sample_layout(layout)))
 
 
@@ -169,7 +169,7 @@ def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
     if not len(pairs.rows):
         return math.nan
     base = sh0_to_rgb(gather(inputs.gaussians.sh0, pairs.rows)[:, 0])
-    if (base == base[0]).all():  # depth maps without images
+    if (base == base[0]).all():  # Gaussians made from depth maps without images have one colour
         return math.nan
     x, y = pairs.pixels.astype(np.int64).T
     colors = photo_colors(inputs.images, pairs.views, y, x)
@@ -190,8 +190,8 @@ def photo_colors(images: np.ndarray, views: np.ndarray, y: np.ndarray, x: np.nda
 def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Alignment:
     """Measure how far a sample of Gaussians in every view projects from their own pixels.
 
-    ``gaussians`` are V·H·W rows in view-major, row-major order; rows that are False in ``valid [V·H·W]`` (or
-    ``[V,H,W]``) are left out. ValueError for another number of rows.
+    ``gaussians`` are V·H·W rows, view by view and line by line. Rows that are False in ``valid [V·H·W]`` (or
+    ``[V,H,W]``) are left out. Raises ValueError for another number of rows.
     """
     free_pages(vars(gaussians).values())
     return check_pairs(sample_pixels(gaussians, cameras, valid), cameras)
@@ -221,7 +221,7 @@ def check_pixels(scene: Scene) -> Alignment:
 
 
 def check_pairs(pairs: Correspondences, cameras: Cameras, num_parts: int | None = None) -> Alignment:
-    """Measure how near a sample projects to its pixels, in each of ``num_parts`` parts of the rows; None: each view."""
+    """Measure how near a sample projects to its pixels, in each of ``num_parts`` parts; None: one part per view."""
     limit = pixel_limit(cameras.width, cameras.height)
     errors = pixel_errors(pairs, cameras)
     medians = tuple(
@@ -229,6 +229,6 @@ def check_pairs(pairs: Correspondences, cameras: Cameras, num_parts: int | None 
         for part in pairs.split(errors, len(cameras) if num_parts is None else num_parts)
     )
     count = max(1, len(errors))
-    in_front, near = float(np.isfinite(errors).sum()) / count, float((errors <= 1).sum()) / count
+    in_front, within_1px = float(np.isfinite(errors).sum()) / count, float((errors <= 1).sum()) / count
     fits = [middle < limit for middle in medians if not math.isnan(middle)]
-    return Alignment(medians, in_front, near, limit, bool(fits) and all(fits) and in_front > 0.5)
+    return Alignment(medians, in_front, within_1px, limit, bool(fits) and all(fits) and in_front > 0.5)

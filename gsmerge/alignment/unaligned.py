@@ -1,4 +1,4 @@
-"""Choose cameras that see rows without pixels, by the share of Gaussians they see and by the photos' colours."""
+"""Choose cameras for rows without pixels, by the share of Gaussians that they see and by the photos' colours."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.alignment.cameras import Poses, other_conventions
 from gsmerge.alignment.centres import check_centres, sample_points
 from gsmerge.alignment.frames import exporter_frames
-from gsmerge.alignment.grids import Grid, Place, read_as
+from gsmerge.alignment.grids import Grid, Place, with_poses
 from gsmerge.alignment.score import MARGIN, RANDOM_SHARE, SAME_COLORS, AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
@@ -18,37 +18,37 @@ from gsmerge.io.cameras.camera_file import Convention
 from gsmerge.kernels.elementary import exp
 from gsmerge.types import Cameras, Gaussians
 
-_FRAME_GAIN = 1.1  # times the score of the cameras as given, for another frame; of as good ones those stay as they are
-_PEAK_GAIN = 1.05  # times that of a scale two steps of the search beside it, for a scale that colours chose
-_SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to see whether cameras see them
-# In other conventions and frames, whose scores differ by 5 % and more where it counts; so many have 0.4 % of noise
+_FRAME_GAIN = 1.1  # least score of another frame over that of the given frame
+_PEAK_GAIN = 1.05  # least score of a scale chosen by colours over that of the scales two steps away
+_SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to count those that cameras see
+# Gaussians compared in other conventions and frames. They have 0.4 % of noise; scores that matter differ by 5 % or more
 _COMPARED_GAUSSIANS = 5000
-_FEW_GAUSSIANS, _MAX_PROJECTED = 200, 4_000_000  # at least, and times the cameras at most
-_MIN_SEEN = 0.5  # share of them that some camera sees
-_MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, of the foremost ones alone in a frame that colours chose
-_FRONT, _PER_CELL = 1.05, 3  # times the depth of the nearest one of its cell; Gaussians of a cell
+_MIN_GAUSSIANS, _MAX_PROJECTED = 200, 4_000_000  # least number of Gaussians, and most Gaussians times cameras
+_MIN_SEEN = 0.5  # share of the Gaussians that must be in some camera
+_MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, but for only the foremost Gaussians in a frame chosen by colours
+_FRONT, _PER_CELL = 1.05, 3  # depth of foremost Gaussians, over the least one of their cell; mean Gaussians per cell
 _SCALES = np.geomspace(1 / 30, 30, 55)  # of the cameras' positions, tried in turn
-_SCALE_GAUSSIANS = 2000  # Gaussians that they are tried on
-# next, nearer and nearer: reach (natural logarithm), steps, Gaussians
+_SCALE_GAUSSIANS = 2000  # Gaussians that the scales are tried on
+# Finer searches around the best scale: range (natural logarithm), steps, Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
-_CENTRED = ((0.02, 81), (5e-4, 51))  # then nearer to centres of pixels: reach and steps
+_CENTRED = ((0.02, 81), (5e-4, 51))  # last searches, by distances from pixel centres: range and steps
 
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """Check of cameras against unaligned Gaussians: the share they see, and how well colours agree."""
+    """The share of Gaussians that cameras see, and how well the colours agree with the photos."""
 
-    share_seen: float  # share of the Gaussians inside at least one picture
-    # distance of their colours from the photos where they are seen, over the distance from the same pixels shuffled;
-    # NaN without photos, or where the colours hardly vary
+    share_seen: float  # share of the Gaussians that project into at least one view
+    # colour error of the Gaussians in the photos, over the error after shuffling the pixels; NaN without photos, or if
+    # the colours hardly vary
     color_ratio: float
-    ok: bool  # whether these are likely the cameras of these Gaussians
-    num_compared: int = 0  # Gaussians whose colours were compared, in one picture or several
-    ratio_error: float = np.nan  # standard error of the ratio, by chance alone
+    ok: bool  # True if these are probably the cameras of these Gaussians
+    num_compared: int = 0  # Gaussians whose colours were compared in at least one photo
+    ratio_error: float = np.nan  # standard error of the ratio, from sampling alone
 
     @property
     def score(self) -> float:
-        """Score in [0, 1] to rank cameras: the share seen, reduced where colours fit hardly better than chance."""
+        """Score in [0, 1] to rank cameras: the share seen, times 1 minus the colour ratio if that is known."""
         return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
 
     @property
@@ -57,7 +57,7 @@ class CameraCheck:
         seen = f"the cameras see {100 * self.share_seen:.0f} % of the Gaussians"
         if np.isnan(self.color_ratio):
             return seen
-        return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as any others"
+        return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as from random pixels"
 
 
 def check_cameras(
@@ -70,12 +70,12 @@ def check_cameras(
     foremost: bool = False,
     hiding: np.ndarray | None = None,
 ) -> CameraCheck:
-    """Measure the share of sampled Gaussians that views see, and how well colours fit ``images [c,h,w,3]``, if any.
+    """Measure the share of sampled Gaussians that views see, and how well their colours fit ``images [c,h,w,3]``.
 
-    With ``foremost`` only Gaussians that no other hides count for the colours; ``hiding``: points ``[n,3]`` that hide
-    them too.
+    ``images`` may be empty. With ``foremost``, the colours of hidden Gaussians do not count. ``hiding`` are further
+    points ``[n,3]`` that hide Gaussians.
     """
-    samples = min(samples, max(_FEW_GAUSSIANS, _MAX_PROJECTED // len(cameras)))
+    samples = min(samples, max(_MIN_GAUSSIANS, _MAX_PROJECTED // len(cameras)))
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
     points = gaussians.means[rows].astype(np.float64)
@@ -87,9 +87,9 @@ def check_cameras(
     rng = np.random.default_rng(0)
     at_once = 1 + _SEEN_GAUSSIANS // max(1, len(points))
     for first in range(0, len(cameras), at_once):
-        some = cameras[first : first + at_once]
+        batch = cameras[first : first + at_once]
         with np.errstate(all="ignore"):
-            xy, depth = project_points(points[None], some.viewmats, some.Ks)
+            xy, depth = project_points(points[None], batch.viewmats, batch.Ks)
         inside, x, y = (depth > 0) & is_inside(xy, cameras), xy[..., 0], xy[..., 1]
         visible |= inside.any(0)
         for view in np.flatnonzero(inside.any(1)) if len(images) else ():
@@ -100,33 +100,36 @@ def check_cameras(
                 front &= seen < len(rows)
                 seen, column, row = seen[front], column[front], row[front]
             photo = photo_colors(images, np.full(len(seen), first + view), row, column)
-            if (photo == photo[:1]).all():  # black, where a view has no photo
+            if (photo == photo[:1]).all():  # a view without a photo is black
                 continue
             compared[seen] = True
-            errors.append(_mean_apart(colors[seen], photo))
-            shuffled_errors.append(_mean_apart(colors[seen], rng.permutation(photo)))
+            errors.append(_mean_difference(colors[seen], photo))
+            shuffled_errors.append(_mean_difference(colors[seen], rng.permutation(photo)))
     share, num_compared = float(visible[: len(rows)].sum()) / max(1, len(rows)), int(compared.sum())
     ratio, error = _color_ratio(errors, shuffled_errors, num_compared)
     return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > RANDOM_SHARE, num_compared, error)
 
 
-def _color_ratio(errors: list[np.ndarray], others: list[np.ndarray], count: int) -> tuple[float, float]:
-    """Return the ratio of two mean differences, and its standard error of ``count`` Gaussians; NaN where none vary."""
-    if not errors or not (other := float(np.concatenate(others).mean())) > SAME_COLORS:
+def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: int) -> tuple[float, float]:
+    """Return the mean error over that of shuffled pixels, and its standard error with ``count`` Gaussians.
+
+    Both are NaN if the colours hardly vary.
+    """
+    if not errors or not (mean_shuffled := float(np.concatenate(shuffled).mean())) > SAME_COLORS:
         return np.nan, np.nan
-    ratio = float(np.concatenate(errors).mean()) / other
-    apart = np.concatenate(errors) - ratio * np.concatenate(others)  # of the mean 0
-    return ratio, float(np.sqrt(np.square(apart).mean() / count)) / other
+    ratio = float(np.concatenate(errors).mean()) / mean_shuffled
+    residuals = np.concatenate(errors) - ratio * np.concatenate(shuffled)  # with a mean of 0
+    return ratio, float(np.sqrt(np.square(residuals).mean() / count)) / mean_shuffled
 
 
-def _mean_apart(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the mean differences ``[n]`` between colours ``[n,3]``."""
+def _mean_difference(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the mean absolute difference ``[n]`` over the channels of colours ``[n,3]``."""
     red, green, blue = np.abs(colors - others).T
     return np.asarray((red + green + blue) / 3)
 
 
 def _are_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
-    """Return which points ``[n]`` in pixels are about as near as the nearest point of their cell."""
+    """Return True for points ``[n]`` in pixels that are about as near as the nearest point of their cell."""
     if not len(row):
         return np.zeros(0, bool)
     side = max(1, int(np.sqrt(_PER_CELL * area / len(row))))
@@ -140,11 +143,11 @@ def _are_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area: 
 def choose_poses(
     gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray, convention: Convention
 ) -> tuple[Poses | None, CameraCheck, str | None]:
-    """Choose the pose convention whose cameras see the most Gaussians, with the nearest colours.
+    """Choose the pose convention in which the cameras see most Gaussians and the colours fit best.
 
     ``cameras`` are in the usual convention; other arguments are those of :func:`check_cameras`. Returns the poses, or
-    None if no other convention is clearly better than the usual one; the check of the chosen poses; and a note if
-    photos fit others as well.
+    None if no other convention is clearly better than the usual one. Also returns the check of the chosen poses, and a
+    note if another convention fits the photos as well.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
@@ -158,7 +161,7 @@ def choose_poses(
     scores = [check.score for check in (usual, *(check for _, check in ranked[1:2])) if check.ok]
     if best.score >= MARGIN * max(scores, default=0.0):
         return poses, best, None
-    # Without photos other readings see as many of any scene that lies before its cameras, which says nothing
+    # Without photos other conventions may see as many Gaussians of any scene, so no note is needed
     as_good = usual.ok and usual.num_compared > 0 and _FRAME_GAIN * best.score >= usual.score
     note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
     return None, usual, note if as_good else None
@@ -167,18 +170,18 @@ def choose_poses(
 def choose_cameras(
     inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], why: SceneError
 ) -> tuple[Place, list[str]]:
-    """Choose cameras that see the Gaussians: unchanged, in another frame, or in another convention; with notes.
+    """Choose cameras that see the Gaussians: unchanged, in another frame, or in another convention; also return notes.
 
-    ``frames`` are the frames that a file names; the usual frames of exporters are tried next. If no camera sees the
-    Gaussians, a SceneError gives ``why`` there are no pixels.
+    ``frames`` are the frames that a file gives. The usual frames of exporters are tried next. ``why`` is the error that
+    explains why the rows have no pixels. It is raised, with what was tried, if no camera sees the Gaussians.
     """
-    rows, stay = (inputs.gaussians, inputs.valid), Place(grid, IDENTITY)
+    rows, unchanged = (inputs.gaussians, inputs.valid), Place(grid, IDENTITY)
     if frames:
         least = check_cameras(*rows, inputs.cameras, inputs.images).score
         checks = [check_cameras(*rows, frame.move(inputs.cameras), inputs.images) for frame in frames]
         best = max(checks, key=lambda check: check.score)
         if best.ok and best.score > least:
-            return replace(stay, frame=frames[checks.index(best)]), []
+            return replace(unchanged, frame=frames[checks.index(best)]), []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
     other = _choose_frame(inputs, check)
     if other is not None:
@@ -187,28 +190,31 @@ def choose_cameras(
     if not check.ok:
         raise SceneError(why.path, f"{why.problem}; {check.description}", why.remedy)
     if poses is None:
-        return stay, [note] if note else []
+        return unchanged, [note] if note else []
     _check_colors(inputs, replace(inputs.cameras, viewmats=poses.viewmats), f"read as {poses.description}", why)
-    return replace(stay, grid=read_as(grid, poses)), []
+    return replace(unchanged, grid=with_poses(grid, poses)), []
 
 
 def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: SceneError) -> None:
-    """Raise the SceneError ``why`` if the photos differ much from the colours of the rows that they should show."""
+    """Raise the SceneError ``why`` if the colours of the foremost Gaussians do not fit the photos.
+
+    ``name`` describes the cameras in words.
+    """
     ratio = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True).color_ratio
     if ratio > _MAX_FRONT_RATIO:
-        found = (
+        measured = (
             f"even with cameras {name} the colours of the foremost Gaussians are {ratio:.2f} times as far from the"
-            " photos as any"
+            " photos as from random pixels"
         )
         remedy = "name the exporter with --hint exporter, export all pixels, or give cameras in the file's frame"
-        raise SceneError(why.path, f"{why.problem}; {found} others", remedy)
+        raise SceneError(why.path, f"{why.problem}; {measured}", remedy)
 
 
 def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
-    """Choose the exporter's frame in which the colours fit the photos clearly better; None without one.
+    """Choose an exporter's frame in which the colours fit the photos clearly better than in the given one; or None.
 
-    At any scale but the true one the colours fit less well. The scale is solved for if no frame stands out at the scale
-    of the cameras.
+    Colours fit best at the true scale, so the chosen frame must fit better than at nearby scales. If no frame does at
+    the scale of the cameras, the scale is solved for.
     """
     if not len(inputs.images):
         return None
@@ -221,36 +227,36 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
         stands_out = _stands_out(inputs, best, score)
     if best is IDENTITY or not stands_out:
         return None
-    enough = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
-    return best if score > _FRAME_GAIN * enough else None
+    given_score = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
+    return best if score > _FRAME_GAIN * given_score else None
 
 
 def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:
-    """Score what the cameras see in a frame; 0 where the photos cannot tell."""
-    # the first camera may see all Gaussians at any scale
-    seen = slice(1 if len(inputs.cameras) > 1 else 0, None)
-    cameras = frame.move(inputs.cameras)[seen]
-    check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images[seen], samples)
+    """Score the cameras in a frame; 0 if the photos do not decide."""
+    # the first camera is left out, because it may see all Gaussians at any scale
+    later = slice(1 if len(inputs.cameras) > 1 else 0, None)
+    cameras = frame.move(inputs.cameras)[later]
+    check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images[later], samples)
     return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
 
 
 def _best_frame(
     inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _COMPARED_GAUSSIANS
 ) -> tuple[Similarity, float]:
-    """Return the frame with the highest score, the first of equal ones, and its score."""
+    """Return the first frame with the highest score, and the score."""
     scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
     return max(scored, key=lambda each: each[1])
 
 
 def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool:
-    """Return whether the ``score`` of a frame is clearly higher than that of the same frame at nearby scales."""
-    away = float(_SCALES[2] / _SCALES[0])
-    beside = (_score_frame(inputs, _scaled(frame, factor)) for factor in (1 / away, away))
+    """Return True if the ``score`` of a frame is clearly higher than at scales two steps away."""
+    two_steps = float(_SCALES[2] / _SCALES[0])
+    beside = (_score_frame(inputs, _scale_frame(frame, factor)) for factor in (1 / two_steps, two_steps))
     return all(score > _PEAK_GAIN * other for other in beside)
 
 
-def _scaled(frame: Similarity, factor: float) -> Similarity:
-    """Return a frame with another scale, about the origin of the Gaussians."""
+def _scale_frame(frame: Similarity, factor: float) -> Similarity:
+    """Multiply the scale of a frame by ``factor``, about the origin of the Gaussians."""
     scale = factor * frame.scale
     text = f"positions scaled by {scale:.4g}"
     name = frame.description.partition("positions scaled")[0].removesuffix(", ")
@@ -259,15 +265,15 @@ def _scaled(frame: Similarity, factor: float) -> Similarity:
 
 
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
-    """Find the scale at which the colours are nearest to the photos, and of those about it the Gaussians to centres."""
-    best, _ = _best_frame(inputs, (_scaled(frame, float(scale)) for scale in _SCALES), _SCALE_GAUSSIANS)
+    """Solve for the scale of a frame: first by the colours in the photos, then by the distances from pixel centres."""
+    best, _ = _best_frame(inputs, (_scale_frame(frame, float(scale)) for scale in _SCALES), _SCALE_GAUSSIANS)
     for reach, steps, samples in _FINER:
         factors = exp(np.linspace(-reach, reach, steps))
-        best, _ = _best_frame(inputs, [_scaled(best, float(factor)) for factor in factors], samples)
+        best, _ = _best_frame(inputs, [_scale_frame(best, float(factor)) for factor in factors], samples)
     points = sample_points(inputs.gaussians.means, inputs.valid)
     for reach, steps in _CENTRED:
-        scales = [_scaled(best, float(factor)) for factor in exp(np.linspace(-reach, reach, steps))]
-        checks = [check_centres(points, scaled.move(inputs.cameras)) for scaled in scales]
+        scales = [_scale_frame(best, float(factor)) for factor in exp(np.linspace(-reach, reach, steps))]
+        checks = [check_centres(points, each.move(inputs.cameras)) for each in scales]
         nearest = min(range(steps), key=lambda number: checks[number].px)
         best = scales[nearest] if checks[nearest].ok else best
     return best

@@ -90,7 +90,7 @@ def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False
 
 
 def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
-    """Return the four ``old`` pixels that each of ``new`` pixels is interpolated from, and their weights ``[4,new]``.
+    """Return the four of ``old`` pixels that each new pixel is interpolated from, and their weights, both ``[4,new]``.
 
     Pixels may lie outside.
     """

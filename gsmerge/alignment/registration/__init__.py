@@ -1,1 +1,1 @@
-"""Scenes of one place, each in a frame of its own, put into one."""
+"""Join scenes of one place, each in its own frame, into one scene."""

@@ -1,4 +1,4 @@
-"""Scenes of one place -> one scene: each is moved to where it lies in the first one."""
+"""Join scenes of one place into one scene: each is moved into the frame of the first one."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ class JoinedScene:
     """Several scenes joined into one, in the frame of the first scene used."""
 
     scene: Scene
-    used: tuple[int, ...]  # which of the given scenes are in it
-    names: tuple[str, ...]  # of the given scenes, for people
+    used: tuple[int, ...]  # numbers of the given scenes that are joined
+    names: tuple[str, ...]  # of the given scenes, for messages
     notes: tuple[str, ...]
-    # for each given scene its path, whether it was joined, and then the keypoints that say where it
-    # lies, the degrees that it was turned, its scale and the shift of its origin
+    # for each given scene: its path and whether it was joined; if so, the number of keypoints that it was registered
+    # by, the angle of its rotation in degrees, its scale and the shift of its origin
     facts: tuple[dict[str, Any], ...]
 
 
 def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     """Join scenes of pixels of one place, each with its own frame and scale, into one scene.
 
-    ``paths`` are their files, for messages. SceneError if a scene has no pixels, if views or harmonics differ in size,
-    or if no two scenes show the same surfaces.
+    ``paths`` are their files, for messages. Raises SceneError if a scene has no pixels, if views or harmonics differ in
+    size, or if no two scenes show the same surfaces.
     """
     _check(scenes, paths)
     registration = register(scenes)
     names = _names(paths)
-    used = [i for i, place in enumerate(registration.similarities) if place is not None]
+    used = [i for i, similarity in enumerate(registration.similarities) if similarity is not None]
     if len(used) < 2:
         problem = f"expected files that show one place, found no two of {len(paths)}"
         remedy = "give photos that overlap by half, name their folder with --images"
         remedy += ", or compact each file by itself"
         raise SceneError(paths[0], f"{problem} whose photos share enough of it", remedy)
-    moved = [move_scene(scenes[i], place) for i in used if (place := registration.similarities[i]) is not None]
+    moved = [move_scene(scenes[i], move) for i in used if (move := registration.similarities[i]) is not None]
     counts = [registration.matches[i] for i in used]
     joined = f"{len(used)} of {len(scenes)} files are joined in the frame of {names[used[0]]}"
     notes = [f"{joined}, by {min(counts)} to {max(counts)} keypoints each"]
-    left_out = "is left out: too little of what its photo shows is found in the others"
+    left_out = "is left out: its photo shares too few keypoints with the others"
     notes += [f"{name} {left_out}" for i, name in enumerate(names) if i not in used]
     if len({scene.images is None for scene in moved}) > 1:
         notes.append("some files have no photos, so none are used; name the folder of all with --images")
@@ -58,12 +58,13 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Return the names of the files, with folders where names are equal."""
-    alike = len({path.name for path in paths}) < len(paths)
-    return [os.path.join(path.parent.name, path.name) if alike else path.name for path in paths]
+    """Return the names of the files, with their folders if any two names are equal."""
+    with_folder = len({path.name for path in paths}) < len(paths)
+    return [os.path.join(path.parent.name, path.name) if with_folder else path.name for path in paths]
 
 
 def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
+    """Raise SceneError if scenes cannot be joined."""
     first = scenes[0]
     size = first.cameras.width, first.cameras.height
     degree = first.gaussians.sh_degree
@@ -72,7 +73,7 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
         sh_degree = scene.gaussians.sh_degree
         if not scene.has_own_pixels:
             problem = "expected one Gaussian per pixel and a camera, to be joined, found none"
-            raise SceneError(path, problem, "compact it by itself; a result is named with -o")
+            raise SceneError(path, problem, "compact it by itself; name a result with -o")
         if other != size:
             problem = f"expected views of {size[0]} x {size[1]} as in {paths[0].name}"
             problem += f", found {other[0]} x {other[1]}"
@@ -82,27 +83,29 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
             raise SceneError(path, problem, "export all with one degree")
 
 
-def _facts(path: Path, place: Similarity | None, matches: int) -> dict[str, Any]:
-    facts: dict[str, Any] = {"path": str(path), "joined": place is not None}
-    if place is None:
+def _facts(path: Path, similarity: Similarity | None, matches: int) -> dict[str, Any]:
+    """Return the facts of a scene in the report, see :class:`JoinedScene`."""
+    facts: dict[str, Any] = {"path": str(path), "joined": similarity is not None}
+    if similarity is None:
         return facts
-    half = np.abs(rotmat_to_quat(place.rotation[None])[0, :1]).clip(0, 1)
+    half = np.abs(rotmat_to_quat(similarity.rotation[None])[0, :1]).clip(0, 1)
     degrees = round(float(np.degrees(2 * arccos(half))[0]), 4)
     facts |= {"matches": matches, "degrees": degrees}
-    return facts | {"scale": place.scale, "shift": place.shift.tolist()}
+    return facts | {"scale": similarity.scale, "shift": similarity.shift.tolist()}
 
 
-def move_scene(scene: Scene, place: Similarity) -> Scene:
-    """Move a scene's Gaussians and cameras by a similarity; photos stay."""
-    if place.scale == 1 and np.array_equal(place.rotation, np.eye(3)) and not place.shift.any():
+def move_scene(scene: Scene, similarity: Similarity) -> Scene:
+    """Move a scene's Gaussians and cameras by a similarity; photos do not change."""
+    if similarity.scale == 1 and np.array_equal(similarity.rotation, np.eye(3)) and not similarity.shift.any():
         return scene
-    return replace(scene, gaussians=place.move_gaussians(scene.gaussians), cameras=place.move(scene.cameras))
+    gaussians, cameras = similarity.move_gaussians(scene.gaussians), similarity.move(scene.cameras)
+    return replace(scene, gaussians=gaussians, cameras=cameras)
 
 
 def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> Scene:
-    """Concatenate the views of scenes of one size and frame; pixels are known if those of all are.
+    """Concatenate the views of scenes of one size and frame; the result has pixels if all scenes do.
 
-    ``photos``: the photos of all views, if they are in one array already.
+    ``photos`` are the photos of all views, if they are in one array already.
     """
     cameras = Cameras(
         np.concatenate([scene.cameras.viewmats for scene in scenes]),
@@ -128,7 +131,7 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
 
 
 def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
-    """Concatenate the pixels of scenes; None if views of some are not known to have Gaussians of their own."""
+    """Concatenate the pixels of scenes; None if the views of any scene have no Gaussians of their own."""
     homes, fronts, rows, views = list[np.ndarray](), list[np.ndarray](), 0, 0
     for scene in scenes:
         if not scene.has_own_pixels:
@@ -141,7 +144,7 @@ def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
 
 
 def _concat_filled(scenes: Sequence[Scene]) -> np.ndarray | None:
-    """Concatenate which Gaussians ``[n]`` fill holes; None if none do."""
+    """Concatenate the masks ``[n]`` of Gaussians that fill holes; None if no Gaussian does."""
     if all(scene.filled is None for scene in scenes):
         return None
     each = [np.zeros(len(scene.gaussians), bool) if scene.filled is None else scene.filled for scene in scenes]
@@ -151,7 +154,7 @@ def _concat_filled(scenes: Sequence[Scene]) -> np.ndarray | None:
 def _concat_values(
     scenes: Sequence[Scene], values: Sequence[np.ndarray | None], *, usual: bool | np.float32
 ) -> np.ndarray | None:
-    """Concatenate values ``[v,h,w]`` of pixels; a scene without any has the ``usual``. None if all are."""
+    """Concatenate values ``[v,h,w]`` of pixels; a scene without values gets ``usual``. None if no scene has values."""
     if all(each is None for each in values):
         return None
     shapes = ((len(scene), scene.cameras.height, scene.cameras.width) for scene in scenes)
@@ -160,7 +163,7 @@ def _concat_values(
 
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:
-    """Concatenate large photos; None if a scene has none or sizes differ."""
+    """Concatenate large photos; None if a scene has none, or if their sizes differ."""
     sources = [source for source in photos if source is not None]
     if len(sources) < len(photos) or len({(source.width, source.height) for source in sources}) > 1:
         return None

@@ -1,4 +1,4 @@
-"""Find keypoints of photos with the scene's points under them, and match those of two scenes."""
+"""Find keypoints in photos and their points in the scene, and match the keypoints of two scenes."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.raster.photos import row_pictures
 from gsmerge.types import Scene
 
-SIDE = 1600  # longest side of a photo that keypoints are looked for in, pixels
+SIDE = 1600  # longest side of a photo in which keypoints are searched, pixels
 MIN_SIDE = 8  # least side of it, pixels
-KEYPOINTS = 4000  # most of a photo
-CONTRAST = 0.02  # of a keypoint; OpenCV's default finds too few on plain walls
-GREY = np.array([77, 150, 29], np.int32)  # red, green and blue of a grey value, 256ths
-RATIO = 0.8  # distance of the best match to that of the second best (Lowe 2004)
-OPAQUE = 0.5  # share of a pixel's largest opacity from which the nearest Gaussian is its surface
-SAME_DEPTH = 0.15  # share by which depths around a keypoint may differ on one surface
-PIXEL_SPREAD = 0.003  # standard deviation of a keypoint, share of the picture's diagonal
+KEYPOINTS = 4000  # most keypoints of a photo
+CONTRAST = 0.02  # least contrast of a keypoint; OpenCV's default finds too few on plain walls
+GREY = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
+RATIO = 0.8  # largest distance of the best match over that of the second best (Lowe 2004)
+OPAQUE = 0.5  # the surface of a pixel is its nearest Gaussian with at least this share of its largest opacity
+SAME_DEPTH = 0.15  # largest relative difference of depths around a keypoint on one surface
+PIXEL_SPREAD = 0.003  # standard deviation of a keypoint, over the diagonal of the picture
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """Keypoints of one photo, and the points of the scene under them."""
+    """Keypoints of one photo, and their points in the scene."""
 
     pixels: np.ndarray  # [n,2] of the scene's grid
     points: np.ndarray  # [n,3] float64, in the scene's frame
@@ -52,7 +52,7 @@ class End:
 
 @dataclass(frozen=True, eq=False)
 class KeypointMatches:
-    """KeypointMatches between the keypoints of two scenes, row by row."""
+    """Matches between the keypoints of two scenes, row by row."""
 
     scenes: tuple[int, int]
     ends: tuple[End, End]
@@ -93,9 +93,9 @@ def find_keypoints(scene: Scene) -> list[Photo]:
 
 
 def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a view shows, ``[h,w,3]`` uint8, and the intrinsics of that picture.
+    """Return a picture ``[h,w,3]`` uint8 of a view, and its intrinsics.
 
-    It is the largest photo up to SIDE or, without photos, the base colours of the Gaussians.
+    The picture is the largest photo, reduced to SIDE pixels. Without photos it has the base colours of the Gaussians.
     """
     if scene.large_photos is not None:
         large = scene.large_photos
@@ -110,9 +110,9 @@ def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find keypoints of a picture ``[h,w,3]`` uint8: places ``[n,2]``, descriptors ``[n,128]``.
+    """Find keypoints of a picture ``[h,w,3]`` uint8; return their places ``[n,2]`` and descriptors ``[n,128]``.
 
-    ``stretch``: width over height of a pixel's footprint; the picture is resized to square pixels.
+    ``stretch`` is the width of a pixel's footprint over its height. The picture is resized to square pixels.
     """
     height, width = picture.shape[:2]
     wide = max(MIN_SIDE, round(width * max(stretch, 1)))
@@ -130,7 +130,7 @@ def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarr
 
 @contextmanager
 def _any_processor() -> Iterator[None]:
-    """Make OpenCV use only instructions of all processors in the block, so that keypoints are equal everywhere."""
+    """Restrict OpenCV in the block to instructions of all processors, so that keypoints are equal on all of them."""
     before = cv2.useOptimized()
     cv2.setUseOptimized(False)
     try:
@@ -140,9 +140,11 @@ def _any_processor() -> Iterator[None]:
 
 
 def _surface(scene: Scene, layers: Sequence[int], viewmat: np.ndarray) -> np.ndarray:
-    """Return depths ``[h,w]`` of the nearest opaque one of the views ``layers`` of a camera; infinite without any."""
-    views = list(layers)
-    rows = scene.get_pixels().fronts[views]
+    """Return the depth ``[h,w]`` of the nearest opaque Gaussian of each pixel of a camera; infinite without any.
+
+    ``layers`` are the views with the pose ``viewmat`` of that camera.
+    """
+    rows = scene.get_pixels().fronts[list(layers)]
     means = scene.gaussians.means[rows].astype(np.float64)
     opacities = scene.gaussians.opacities[rows] * (rows >= 0)
     depths = camera_depths(means, viewmat)
@@ -151,20 +153,20 @@ def _surface(scene: Scene, layers: Sequence[int], viewmat: np.ndarray) -> np.nda
 
 
 def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Look up the median depth around places ``[n,2]``, and whether they lie on one surface."""
+    """Return the median depth in the 3 x 3 pixels around each of ``pixels [n,2]``, and True if they are one surface."""
     padded = np.pad(depths, 1, mode="edge")
     height, width = depths.shape
     x = np.floor(pixels[:, 0]).astype(int).clip(0, width - 1)
     y = np.floor(pixels[:, 1]).astype(int).clip(0, height - 1)
-    nine = np.array([padded[y + down, x + right] for down in range(3) for right in range(3)])
-    even = np.isfinite(nine).all(0) & (nine.max(0) < nine.min(0) * (1 + SAME_DEPTH))
-    return lower_median(nine), even
+    around = np.array([padded[y + down, x + right] for down in range(3) for right in range(3)])
+    is_surface = np.isfinite(around).all(0) & (around.max(0) < around.min(0) * (1 + SAME_DEPTH))
+    return lower_median(around), is_surface
 
 
 def match_photos(
     scenes: tuple[int, int], photos: Sequence[Photo], other_photos: Sequence[Photo], size: tuple[int, int]
 ) -> KeypointMatches:
-    """Match the keypoints of all photos of two scenes; ``size``: width and height of their grids."""
+    """Match the keypoints of all photos of two scenes; ``size`` is width and height of their grids, pixels."""
     pairs = [(a, b) for a in photos for b in other_photos]
     rows = [_match(a.descriptors, b.descriptors) for a, b in pairs]
     first = _make_end([a for a, _ in pairs], [ids for ids, _ in rows])
@@ -186,13 +188,13 @@ def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:
 
 
 def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs of rows that are each other's best match, and clearly better than the second best."""
+    """Return pairs of rows of ``a`` and ``b`` that are mutual best matches, clearly better than the second best."""
     if min(len(a), len(b)) < 2:
         return np.empty(0, int), np.empty(0, int)
-    # whole numbers below 2^24: float32 has them exactly, in any order of summation
+    # all sums are whole numbers below 2^24, so float32 is exact in any order of summation
     distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
     best = distances.argmin(1)
-    two = np.partition(distances, 1, axis=1)[:, :2].astype(np.float64)
-    clear = two[:, 0] < RATIO**2 * two[:, 1]
-    good = clear & (distances.argmin(0)[best] == np.arange(len(a)))
-    return np.flatnonzero(good), best[good]
+    two_best = np.partition(distances, 1, axis=1)[:, :2].astype(np.float64)
+    is_clear = two_best[:, 0] < RATIO**2 * two_best[:, 1]
+    matched = is_clear & (distances.argmin(0)[best] == np.arange(len(a)))
+    return np.flatnonzero(matched), best[matched]

@@ -1,10 +1,9 @@
-"""Find how scenes of one place lie in one another, by their photos and the depths under them.
+"""Register scenes of one place: find the similarities between their frames from photos and depths.
 
-Keypoints of two photos that look alike are points of both scenes, at the depths of their Gaussians.
-Three of them give a similarity (Umeyama 1991); of seeded samples the one is chosen that most
-matches agree with. All scenes are then moved at once, by Gauss-Newton steps, until points project
-to where the other photos show them. A depth may be wrong by itself: a point is free to lie
-elsewhere along its ray, within the spread that the depths have.
+Matched keypoints of two photos are points of both scenes, at the depths of their Gaussians. Three matches determine a
+similarity (Umeyama 1991). Of similarities of random triples, the one is chosen that agrees with most matches. Then all
+scenes are moved at once by Gauss-Newton steps, until points project to their keypoints in the other photos. Single
+depths may be wrong, so a point may move along its ray within the standard deviation of depths.
 """
 
 from __future__ import annotations
@@ -16,41 +15,41 @@ from itertools import combinations
 import numpy as np
 
 from gsmerge.alignment.registration.keypoints import End, KeypointMatches, Photo, find_keypoints, match_photos
-from gsmerge.alignment.registration.similarities import apply_after, fit_similarities, invert_place, round_place
+from gsmerge.alignment.registration.similarities import compose, fit_similarities, invert_similarity, round_similarity
 from gsmerge.geometry import IDENTITY, Damping, Similarity, camera_depths, descend, lower_median, motion_matrices
 from gsmerge.kernels.elementary import exp, log, log1p
 from gsmerge.kernels.matrices import matmul, solve, transform
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
-SAMPLE_TRIPLES = 2000  # triples of matches
-TRIALS = 60  # of their similarities, those that are tried in the photos
-CLOSE = 0.25  # distance of matched points, share of their depths, up to which a triple counts it
+SAMPLE_TRIPLES = 2000  # random triples of matches
+TRIALS = 60  # best similarities of triples that are tested in the photos
+CLOSE = 0.25  # distance of matched points, over their depth, up to which a match supports a triple
 DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
-MIN_DEPTH_SPREAD = 0.01  # the least that is measured
-MIN_PIXELS = 0.2  # the least standard deviation of a keypoint that is measured
-NORMAL = 1.4826  # standard deviation over the median size of a normal number
-NORMAL_2D = 1 / 1.1774  # the same for the length of a vector of two
-AGREE = 9.0  # squared residual, in standard deviations, up to which a match agrees
-LOOSE = (100.0, 10.0, 2.0, 2.0)  # times AGREE, round by round: a chain of scenes has drifted
-BEHIND = 1e3  # stands for the logarithm of a depth behind the camera
-DOUBT = 4.0  # squared residual from which on a match counts less
-MIN_MATCHES = 16  # that agree where two scenes are connected; of unrelated photos up to 5 do
-MIN_SHARE = 0.15  # of the matches
-ROUNDS = 3  # of choosing the matches of a pair that agree, and moving it by them
+MIN_DEPTH_SPREAD = 0.01  # least measured value of it
+MIN_PIXELS = 0.2  # least measured standard deviation of a keypoint, pixels
+NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+NORMAL_2D = 1 / 1.1774  # the same for the length of a vector with two normal components
+AGREE = 9.0  # largest squared residual of a match that agrees; residuals are in standard deviations
+LOOSE = (100.0, 10.0, 2.0, 2.0)  # multiples of AGREE in each round; the first are large because chains of scenes drift
+BEHIND = 1e3  # replaces the logarithm of the depth ratio of points behind the camera
+CAUCHY = 4.0  # squared residual at which the weight of a match halves
+MIN_MATCHES = 16  # agreeing matches of two connected scenes; unrelated photos have up to 5
+MIN_SHARE = 0.15  # least share of agreeing matches
+ROUNDS = 3  # of selecting the agreeing matches of a pair and refining its similarity
 DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
-SIZE = 7  # numbers of a step: turn, shift, logarithm of the scale
+SIZE = 7  # parameters of a step: rotation, shift, logarithm of the scale
 
 Similarities = Sequence[Similarity | None]
-_Fit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]  # with the cost there, its curvature and its slope
+_Fit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]  # with their cost, its curvature and its slope
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
     """Similarity from each scene's frame to that of the first scene of the largest connected set."""
 
-    similarities: tuple[Similarity | None, ...]  # of each scene; None where it is not connected
-    matches: tuple[int, ...]  # keypoints of each that agree with those of others
+    similarities: tuple[Similarity | None, ...]  # of each scene; None if it is not connected
+    matches: tuple[int, ...]  # number of agreeing matches of each scene
 
 
 def register(scenes: Sequence[Scene]) -> Registration:
@@ -65,16 +64,16 @@ def register(scenes: Sequence[Scene]) -> Registration:
     pairs = [match_photos((a, b), photos[a], photos[b], size) for a, b in ids]
     links = [link for link in parallel_map(connect, pairs) if link is not None]
     similarities = _chain(links, count)
-    inside = [pair for _, pair in links if all(similarities[scene] is not None for scene in pair.scenes)]
+    connected = [pair for _, pair in links if all(similarities[scene] is not None for scene in pair.scenes)]
     spread = DEPTH_SPREAD
-    for loose in LOOSE if inside else ():
-        kept = [pair.select(_squares(similarities, pair, spread) < loose * AGREE) for pair in inside]
-        similarities = _refine(similarities, kept, spread)
-        inside, spread = _measure_spreads(similarities, inside)
-    agreeing = [pair.select(_squares(similarities, pair, spread) < AGREE) for pair in inside]
+    for loose in LOOSE if connected else ():
+        agreeing = [pair.select(_squares(similarities, pair, spread) < loose * AGREE) for pair in connected]
+        similarities = _refine(similarities, agreeing, spread)
+        connected, spread = _measure_spreads(similarities, connected)
+    agreeing = [pair.select(_squares(similarities, pair, spread) < AGREE) for pair in connected]
     matches = [sum(len(pair) for pair in agreeing if i in pair.scenes) for i in range(count)]
     unit = _unit(photos, similarities)
-    rounded = tuple(None if place is None else round_place(place, unit) for place in similarities)
+    rounded = tuple(None if each is None else round_similarity(each, unit) for each in similarities)
     return Registration(rounded, tuple(matches))
 
 
@@ -89,7 +88,7 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
     if len(matches) < MIN_MATCHES:
         return None
     pair = replace(matches, scenes=(0, 1))
-    trials = _sample_places(matches)
+    trials = _sample_similarities(matches)
     misses = [_squares((trial, IDENTITY), pair, DEPTH_SPREAD) for trial in trials]
     scores = [(1 - squares / AGREE).clip(0).sum() for squares in misses]
     similarities: Similarities = (trials[int(np.argmax(scores))], IDENTITY)
@@ -99,23 +98,23 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
             return None
         similarities = _refine(similarities, [pair.select(agree)], DEPTH_SPREAD, fixed=1)
         agree = _squares(similarities, pair, DEPTH_SPREAD) < AGREE
-    place = similarities[0]
-    if place is None or agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(matches)):
+    similarity = similarities[0]
+    if similarity is None or agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(matches)):
         return None
-    return place, matches.select(agree)
+    return similarity, matches.select(agree)
 
 
-def _sample_places(matches: KeypointMatches) -> list[Similarity]:
-    """Fit similarities to triples of matches; return those that most matches agree with."""
+def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
+    """Fit similarities to random triples of matches; return those that most matches agree with."""
     rng = np.random.default_rng(0)
     p, q = (end.points for end in matches.ends)
-    near, far = (camera_depths(end.points, end.viewmats) for end in matches.ends)
+    first_depths, second_depths = (camera_depths(end.points, end.viewmats) for end in matches.ends)
     rows = rng.integers(0, len(matches), (SAMPLE_TRIPLES, 3))
-    weights = (1 / (near * far))[rows]
+    weights = (1 / (first_depths * second_depths))[rows]
     rotations, scales, shifts = fit_similarities(p[rows], q[rows], weights)
     moved = scales[:, None, None] * matmul(p, rotations.swapaxes(1, 2)) + shifts[:, None]
-    away = ((moved - q) ** 2).sum(2) / np.minimum(far, scales[:, None] * near) ** 2
-    closeness = (1 - away / CLOSE**2).clip(0).sum(1)
+    squares = ((moved - q) ** 2).sum(2) / np.minimum(second_depths, scales[:, None] * first_depths) ** 2
+    closeness = (1 - squares / CLOSE**2).clip(0).sum(1)
     best = np.argsort(-closeness, kind="stable")[:TRIALS]
     return [Similarity(rotations[i], float(scales[i]), shifts[i], kind="other") for i in best]
 
@@ -125,7 +124,7 @@ def _between(similarities: Similarities, scenes: Sequence[int]) -> Similarity:
     first, second = (similarities[scene] for scene in scenes)
     assert first is not None
     assert second is not None
-    return apply_after(invert_place(second), first)
+    return compose(invert_similarity(second), first)
 
 
 # Residuals
@@ -133,30 +132,30 @@ def _between(similarities: Similarities, scenes: Sequence[int]) -> Similarity:
 
 @dataclass(frozen=True, eq=False)
 class _Residuals:
-    """What points of one scene miss in the photos of another, in standard deviations."""
+    """Errors of points of one scene in the photos of another, in standard deviations."""
 
-    moved: np.ndarray  # [m,3] points in the other's frame
-    values: np.ndarray  # [m,3]: two of the place in the photo, one of the depth
-    slopes: np.ndarray  # [m,3,3] their derivatives by ``moved``
+    moved: np.ndarray  # [m,3] points in the frame of the other scene
+    values: np.ndarray  # [m,3] two errors of the place in the photo, and one of the depth
+    slopes: np.ndarray  # [m,3,3] derivatives of ``values`` by ``moved``
 
 
-def _residuals(place: Similarity, end: End, other: End, pixels: float, spread: float) -> _Residuals:
-    """Compute the distances between projected points of one end and the keypoints of the other, in standard deviations.
+def _residuals(similarity: Similarity, end: End, other: End, pixels: float, spread: float) -> _Residuals:
+    """Compute the errors between projected points of one end and the keypoints of the other, in standard deviations.
 
-    ``place`` maps between the frames of the two scenes. ``pixels``, ``spread``: standard deviations of a keypoint and
-    of the logarithm of a depth.
+    ``similarity`` maps from the frame of ``end`` to that of ``other``. ``pixels`` is the standard deviation of a
+    keypoint, and ``spread`` that of the logarithm of a depth.
     """
-    turns = other.viewmats[:, :3, :3]
-    moved = place.move_points(end.points)
-    camera = transform(turns, moved) + other.viewmats[:, :3, 3]
+    rotmats = other.viewmats[:, :3, :3]
+    moved = similarity.move_points(end.points)
+    camera = transform(rotmats, moved) + other.viewmats[:, :3, 3]
     z = np.maximum(camera[:, 2], 1e-9 * np.abs(camera).max(1) + 1e-30)
     projected = transform(other.Ks, camera)[:, :2] / z[:, None]
     by_camera = np.zeros((len(moved), 3, 3))
     by_camera[:, :2] = (other.Ks[:, :2] - projected[..., None] * np.eye(3)[2]) / z[:, None, None]
-    # how the place in the photo moves where a depth is wrong by one standard deviation
+    # movement of the place in the photo if a depth is wrong by one standard deviation
     poses = end.viewmats[:, :3, :3]
     eyes = -transform(poses.swapaxes(1, 2), end.viewmats[:, :3, 3])
-    along = place.scale * transform(turns, matmul(end.points - eyes, place.rotation.T))
+    along = similarity.scale * transform(rotmats, matmul(end.points - eyes, similarity.rotation.T))
     streaks = spread * transform(by_camera[:, :2], along)
     lengths = np.maximum((streaks * streaks).sum(1), 1e-30)
     shrink = (1 - pixels / np.sqrt(pixels**2 + lengths)) / lengths
@@ -169,29 +168,33 @@ def _residuals(place: Similarity, end: End, other: End, pixels: float, spread: f
     values = np.empty((len(moved), 3))
     values[:, :2] = transform(whiten, projected - other.pixels)
     values[:, 2] = np.where(camera[:, 2] > 0, ratios, BEHIND) / depth_share
-    return _Residuals(moved, values, matmul(by_camera, turns))
+    return _Residuals(moved, values, matmul(by_camera, rotmats))
 
 
 def _squares(similarities: Similarities, matches: KeypointMatches, spread: float) -> np.ndarray:
     """Return the squared residual ``[m]`` of each match: the larger one of both directions."""
-    both = [(residuals.values**2).sum(1) for residuals in _both_ways(similarities, matches, spread)]
+    both = [(residuals.values**2).sum(1) for residuals in _both_residuals(similarities, matches, spread)]
     return np.asarray(np.maximum(*both))
 
 
-def _both_ways(similarities: Similarities, matches: KeypointMatches, spread: float) -> list[_Residuals]:
+def _both_residuals(similarities: Similarities, matches: KeypointMatches, spread: float) -> list[_Residuals]:
+    """Compute the residuals of matches in both directions: from the first scene to the second, and back."""
     first, second = matches.ends
-    there = _between(similarities, matches.scenes)
+    forward = _between(similarities, matches.scenes)
     return [
-        _residuals(there, first, second, matches.spread, spread),
-        _residuals(invert_place(there), second, first, matches.spread, spread),
+        _residuals(forward, first, second, matches.spread, spread),
+        _residuals(invert_similarity(forward), second, first, matches.spread, spread),
     ]
 
 
 def _measure_spreads(
     similarities: Similarities, matches: Sequence[KeypointMatches]
 ) -> tuple[list[KeypointMatches], float]:
-    """Measure errors robustly; return the matches with that of keypoints, and that of the logarithms of depths."""
-    values = [_both_ways(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
+    """Measure standard deviations robustly.
+
+    Returns the matches with the measured standard deviation of keypoints, and that of the logarithms of depths.
+    """
+    values = [_both_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
     lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]
     ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
     spread = NORMAL * float(lower_median(ratios))
@@ -204,7 +207,7 @@ def _measure_spreads(
 
 
 def _chain(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
-    """Place the largest connected set by its strongest links, in the frame of its first scene."""
+    """Place the scenes of the largest connected set along their strongest links, in the frame of its first scene."""
     strength = [0] * count
     for _, pair in links:
         for scene in pair.scenes:
@@ -214,105 +217,105 @@ def _chain(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> S
         similarities = _chain_from(start, links, count)
         if _num_connected(similarities) > _num_connected(best):
             best = similarities
-    first = next(place for place in best if place is not None)
-    back = invert_place(first)
-    return [place and (IDENTITY if place is first else apply_after(back, place)) for place in best]
+    first = next(each for each in best if each is not None)
+    to_first = invert_similarity(first)
+    return [each and (IDENTITY if each is first else compose(to_first, each)) for each in best]
 
 
 def _num_connected(similarities: Similarities) -> int:
-    return sum(place is not None for place in similarities)
+    return sum(each is not None for each in similarities)
 
 
 def _chain_from(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
-    """Place scenes in the frame of ``start``, each by its strongest link to a scene already placed."""
+    """Place scenes in the frame of scene ``start``, each along its strongest link to a scene already placed."""
     similarities: list[Similarity | None] = [None] * count
     similarities[start] = IDENTITY
     while True:
-        ends = [link for link in links if sum(similarities[scene] is not None for scene in link[1].scenes) == 1]
-        if not ends:
+        half_placed = [link for link in links if sum(similarities[scene] is not None for scene in link[1].scenes) == 1]
+        if not half_placed:
             return similarities
-        place, pair = max(ends, key=lambda link: len(link[1]))
+        similarity, pair = max(half_placed, key=lambda link: len(link[1]))
         a, b = pair.scenes
         first = similarities[a]
         second = similarities[b]
         if second is not None:
-            similarities[a] = apply_after(second, place)
+            similarities[a] = compose(second, similarity)
         elif first is not None:
-            similarities[b] = apply_after(first, invert_place(place))
+            similarities[b] = compose(first, invert_similarity(similarity))
 
 
 def _refine(
     similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, fixed: int | None = None
 ) -> Similarities:
-    """Move all placed scenes but ``fixed`` (None: the first) until matches agree best, by damped Gauss-Newton steps."""
-    placed = [i for i, place in enumerate(similarities) if place is not None]
+    """Move all placed scenes but ``fixed`` (None: the first) by damped Gauss-Newton steps to minimise the residuals."""
+    placed = [i for i, each in enumerate(similarities) if each is not None]
     free = [i for i in placed if i != (placed[0] if fixed is None else fixed)]
 
-    def fit(near: Similarities) -> _Fit:
-        return near, _normal_equations(near, matches, spread, free)
+    def fit(current: Similarities) -> _Fit:
+        return current, _normal_equations(current, matches, spread, free)
 
     def step(state: _Fit, damping: float) -> _Fit | None:
-        current_places, (_, curvature, slope) = state
+        current, (_, curvature, slope) = state
         scale = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
         steps = -solve(curvature + np.diag(scale), slope).reshape(-1, SIZE)
         if not np.isfinite(steps).all():
             return None
-        moved = list(current_places)
+        moved = list(current)
         for i, vector in zip(free, steps, strict=True):
-            moved[i] = apply_after(current_places[i] or IDENTITY, _make_step(vector))
+            moved[i] = compose(current[i] or IDENTITY, _make_step(vector))
         return fit(moved)
 
     return descend(fit(similarities), lambda state: state[1][0], step, DAMPING)[0]
 
 
 def _make_step(step: np.ndarray) -> Similarity:
-    """Make a similarity of a turn, a shift and the logarithm of a scale, ``[7]``."""
-    turn = motion_matrices(np.concatenate([step[:3], np.zeros(3)])[None])[0, :3, :3]
-    growth = float(exp(step[6:].clip(-1, 1))[0])
-    return Similarity(turn, growth, step[3:6], kind="other")
+    """Make the similarity of a step ``[7]``: rotation vector, shift and logarithm of the scale."""
+    rotation = motion_matrices(np.concatenate([step[:3], np.zeros(3)])[None])[0, :3, :3]
+    scale = float(exp(step[6:].clip(-1, 1))[0])
+    return Similarity(rotation, scale, step[3:6], kind="other")
 
 
 def _normal_equations(
     similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, free: Sequence[int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return cost (Cauchy's), curvature and slope with respect to the steps of the free scenes."""
+    """Return Cauchy's cost of the residuals, its curvature and its slope with respect to steps of the free scenes."""
     size = len(free) * SIZE
     curvature = np.zeros((size, size))
     slope = np.zeros(size)
     cost = 0.0
     columns = {scene: slice(i * SIZE, (i + 1) * SIZE) for i, scene in enumerate(free)}
     for pair in matches:
-        there = _between(similarities, pair.scenes)
-        ways = _both_ways(similarities, pair, spread)
-        for way, place, residuals in zip((0, 1), (there, invert_place(there)), ways, strict=True):
+        forward = _between(similarities, pair.scenes)
+        both = _both_residuals(similarities, pair, spread)
+        for source, similarity, residuals in zip((0, 1), (forward, invert_similarity(forward)), both, strict=True):
             squares = (residuals.values**2).sum(1)
-            weights = 1 / (1 + squares / DOUBT)
-            cost += DOUBT * float(log1p(squares / DOUBT).sum())
-            jacobian = _by_step(residuals.slopes, pair.ends[way].points, place)
-            other_jacobian = -_by_step(residuals.slopes, residuals.moved, IDENTITY)
-            parts = {pair.scenes[way]: jacobian, pair.scenes[1 - way]: other_jacobian}
-            parts = {scene: part for scene, part in parts.items() if scene in columns}
-            for scene, part in parts.items():
-                weighted = (weights[:, None, None] * part).reshape(-1, SIZE).T
+            weights = 1 / (1 + squares / CAUCHY)
+            cost += CAUCHY * float(log1p(squares / CAUCHY).sum())
+            source_jacobian = _by_step(residuals.slopes, pair.ends[source].points, similarity)
+            target_jacobian = -_by_step(residuals.slopes, residuals.moved, IDENTITY)
+            jacobians = {pair.scenes[source]: source_jacobian, pair.scenes[1 - source]: target_jacobian}
+            jacobians = {scene: jacobian for scene, jacobian in jacobians.items() if scene in columns}
+            for scene, jacobian in jacobians.items():
+                weighted = (weights[:, None, None] * jacobian).reshape(-1, SIZE).T
                 slope[columns[scene]] += matmul(weighted, residuals.values.reshape(-1))
-                for second, more in parts.items():
-                    block = matmul(weighted, more.reshape(-1, SIZE))
+                for second, second_jacobian in jacobians.items():
+                    block = matmul(weighted, second_jacobian.reshape(-1, SIZE))
                     curvature[columns[scene], columns[second]] += block
     return cost, curvature, slope
 
 
-def _by_step(slopes: np.ndarray, points: np.ndarray, place: Similarity) -> np.ndarray:
-    """Differentiate residuals by a step of their points before ``place`` is applied: ``[m,3,7]``."""
-    by_point = place.scale * matmul(slopes, place.rotation)
+def _by_step(slopes: np.ndarray, points: np.ndarray, similarity: Similarity) -> np.ndarray:
+    """Differentiate residuals by a step of their points before ``similarity`` is applied: ``[m,3,7]``."""
+    by_point = similarity.scale * matmul(slopes, similarity.rotation)
     x, y, z = points.T
     zero = np.zeros_like(x)
-    turns = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
+    by_rotation = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
     by_scale = matmul(by_point, points[..., None])
-    return np.concatenate([matmul(by_point, turns), by_point, by_scale], 2)
+    return np.concatenate([matmul(by_point, by_rotation), by_point, by_scale], 2)
 
 
 def _unit(photos: Sequence[Sequence[Photo]], similarities: Similarities) -> float:
     """Return the power of two nearest to the median depth of the points of the first placed scene."""
-    first = next(scene_photos for scene_photos, place in zip(photos, similarities, strict=True) if place is not None)
+    first = next(scene_photos for scene_photos, each in zip(photos, similarities, strict=True) if each is not None)
     depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
     return float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0

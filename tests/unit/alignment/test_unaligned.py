@@ -47,7 +47,7 @@ def padded(rows: np.ndarray) -> np.ndarray:
 def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The number of its rows allows many grids; none of them is worth a search for a frame, as no camera shows them."""
     tried = []
-    monkeypatch.setattr(match, "read_views", lambda *args: tried.append(args))
+    monkeypatch.setattr(match, "score_views", lambda *args: tried.append(args))
     rows = turned(padded(voxels()), SMOOTH.w2c[0, :3, :3])
     loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
     assert not loaded.scene.has_own_pixels
