@@ -1,8 +1,8 @@
-"""Read changed files with every reader, and keep those that fail: ``python tasks.py fuzz --minutes 30 READER...``.
+"""Read changed files of every kind, and keep those that fail: ``python tasks.py fuzz --minutes 30 KIND...``.
 
 With atheris (pip install atheris) changes follow the lines of code that they reach, and files that reached new ones are
 kept in build/fuzz; without it files are changed blindly. A reader returns, or raises an error of the package, within
-its budget; the smallest file that makes it do anything else goes to tests/fuzz/findings, which the tests read.
+its budget; the smallest file that makes it do anything else goes to tests/damage/findings, which the tests read.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ except ImportError:
 ROOT = Path(__file__).resolve().parent.parent
 TESTS = ROOT / "tests"
 sys.path[:0] = [str(ROOT), str(TESTS), str(TESTS / "helpers")]
-FINDINGS, LEARNT = TESTS / "fuzz" / "findings", ROOT / "build" / "fuzz"
+LEARNT = ROOT / "build" / "fuzz"
 SECONDS, BYTES = 15, 512 << 20  # of processor time and memory, several times the budget of such small files
 TRIES = 300  # to make a finding smaller
 SHARED_MEMORY = "/dev/shm" if os.path.isdir("/dev/shm") else None
@@ -46,12 +46,12 @@ def stop(*_: object) -> None:
     raise TooLong
 
 
-def failure(target: Any, data: bytes) -> tuple[str, str]:
+def failure(sound: Any, data: bytes) -> tuple[str, str]:
     """Read bytes -> where and how it fails, and the traceback; two empty texts if it does not."""
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     with tempfile.TemporaryDirectory(dir=SHARED_MEMORY) as folder:
         try:
-            target.attempt(data, Path(folder))
+            sound.attempt(data, Path(folder))
         except (Exception, TooLong) as error:
             signal.setitimer(signal.ITIMER_PROF, 0)
             frames = [f for f in traceback.extract_tb(error.__traceback__) if "gsmerge/" in f.filename]
@@ -62,14 +62,14 @@ def failure(target: Any, data: bytes) -> tuple[str, str]:
     return "", ""
 
 
-def shrink(target: Any, data: bytes, cause: str) -> bytes:
+def shrink(sound: Any, data: bytes, cause: str) -> bytes:
     """Leave out pieces of a file as long as it fails in the same way."""
     size, tries = len(data) // 2, 0
     while size and tries < TRIES:
         for start in range(0, len(data), size):
             shorter = data[:start] + data[start + size :]
             tries += 1
-            if tries < TRIES and failure(target, shorter)[0] == cause:
+            if tries < TRIES and failure(sound, shorter)[0] == cause:
                 data = shorter
                 break
         else:
@@ -77,38 +77,39 @@ def shrink(target: Any, data: bytes, cause: str) -> bytes:
     return data
 
 
-def keep(reader: str, data: bytes) -> Path:
+def keep(kind: str, data: bytes) -> Path:
     """Write a finding to the folder of findings."""
+    from damage.random_changes import FINDINGS
+
     FINDINGS.mkdir(exist_ok=True)
-    path = FINDINGS / f"{reader}.{hashlib.sha256(data).hexdigest()[:8]}"
+    path = FINDINGS / f"{kind}.{hashlib.sha256(data).hexdigest()[:8]}"
     path.write_bytes(data)
     return path
 
 
-def work(reader: str, seconds: int) -> None:
-    """Try one reader for some seconds; print each finding, and the number of inputs as libFuzzer does."""
-    from fuzz.mutate import mutate, splice
-    from fuzz.targets import TARGETS, seeds_of
+def work(kind: str, seconds: int) -> None:
+    """Try files of one kind for some seconds; print each finding, and the number of inputs as libFuzzer does."""
+    from damage import SOUNDS
+    from damage.random_changes import FINDINGS, mutate, splice
 
     signal.signal(signal.SIGPROF, stop)
-    target = TARGETS[reader]
-    seeds = seeds_of(target)
-    for seed in seeds:
-        failure(target, seed)  # which imports all that it takes
-    seeds += [path.read_bytes() for path in FINDINGS.glob(f"{reader}.*")]
+    sound = SOUNDS[kind]
+    seeds = [sound.content()]
+    failure(sound, seeds[0])  # which imports all that it takes
+    seeds += [path.read_bytes() for path in FINDINGS.glob(f"{kind}.*")]
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
     causes: set[str] = set()
 
     def attempt(data: bytes) -> None:
-        cause, trace = failure(target, data)
+        cause, trace = failure(sound, data)
         if cause and cause not in causes:
             causes.add(cause)
-            path = keep(reader, data if cause.startswith("TooLong") else shrink(target, data, cause))
+            path = keep(kind, data if cause.startswith("TooLong") else shrink(sound, data, cause))
             print(f"FINDING {cause}: {path}\n{trace}", flush=True)
 
     if atheris:
-        learn(reader, seconds, seeds, attempt, mutate, splice)
+        learn(kind, seconds, seeds, attempt, mutate, splice)
     random, count, end = Random(time.time_ns()), 0, time.monotonic() + seconds
     while time.monotonic() < end:
         attempt(mutate(random.choice(seeds), random))
@@ -117,10 +118,10 @@ def work(reader: str, seconds: int) -> None:
 
 
 def learn(
-    reader: str, seconds: int, seeds: list[bytes], attempt: Callable[[bytes], None], mutate: Any, splice: Any
+    kind: str, seconds: int, seeds: list[bytes], attempt: Callable[[bytes], None], mutate: Any, splice: Any
 ) -> None:
     """Run libFuzzer, which keeps the files that reach new lines; it ends the process."""
-    corpus = LEARNT / reader
+    corpus = LEARNT / kind
     corpus.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
         (corpus / hashlib.sha256(seed).hexdigest()).write_bytes(seed)
@@ -135,23 +136,23 @@ def learn(
             return splice(data, Random(seed))[:most]
 
     options = {"max_total_time": seconds, "max_len": max(8192, 3 * max(map(len, seeds))), "timeout": 4 * SECONDS,
-               "artifact_prefix": f"{LEARNT}/{reader}.input-", "print_final_stats": 1, "rss_limit_mb": 0}  # fmt: skip
+               "artifact_prefix": f"{LEARNT}/{kind}.input-", "print_final_stats": 1, "rss_limit_mb": 0}  # fmt: skip
     flags = [f"-{name}={value}" for name, value in options.items()]
     atheris.Setup(["fuzz", *flags, str(corpus)], attempt, custom_mutator=change)
     atheris.Fuzz()
 
 
-def start(reader: str, seconds: int) -> int:
-    """Try one reader in a process of its own, which writes a log -> its id."""
-    for left in LEARNT.glob(f"{reader}.input-*"):
+def start(kind: str, seconds: int) -> int:
+    """Try files of one kind in a process of its own, which writes a log -> its id."""
+    for left in LEARNT.glob(f"{kind}.input-*"):
         left.unlink()
     process = os.fork()
     if process == 0:
-        log = os.open(LEARNT / f"{reader}.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        log = os.open(LEARNT / f"{kind}.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(log, 1)
         os.dup2(log, 2)
         try:
-            work(reader, seconds)
+            work(kind, seconds)
             os._exit(0)
         except Exception:
             traceback.print_exc()
@@ -159,45 +160,45 @@ def start(reader: str, seconds: int) -> int:
     return process
 
 
-def report(reader: str, code: int, seconds: float) -> bool:
-    """Print what came of a reader -> whether it is sound."""
-    log = LEARNT / f"{reader}.log"
+def report(kind: str, code: int, seconds: float) -> bool:
+    """Print what came of a kind -> whether its kind is sound."""
+    log = LEARNT / f"{kind}.log"
     text = log.read_text(errors="replace")
     counted = re.findall(r"number_of_executed_units: +(\d+)", text)
     findings = re.findall(r"^FINDING (.*)", text, re.MULTILINE)
-    for crash in LEARNT.glob(f"{reader}.input-*"):
-        findings.append(f"ended the process: {keep(reader, crash.read_bytes())}")
+    for crash in LEARNT.glob(f"{kind}.input-*"):
+        findings.append(f"ended the process: {keep(kind, crash.read_bytes())}")
     if code and not findings:
         findings.append(f"ended with exit code {code}: {log}")
-    print(f"{reader:18}{int(counted[0]) if counted else 0:10,} inputs{seconds:7.0f} s", flush=True)
+    print(f"{kind:18}{int(counted[0]) if counted else 0:10,} inputs{seconds:7.0f} s", flush=True)
     for finding in findings:
         print(f"  {finding}", flush=True)
     return not findings
 
 
 def main() -> int:
-    """Try the named readers, or all, for some minutes together; exit code 1 if there are findings."""
+    """Try the named kinds, or all, for some minutes together; exit code 1 if there are findings."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10)
-    parser.add_argument("readers", nargs="*")
+    parser.add_argument("kinds", nargs="*")
     arguments = parser.parse_args()
     LEARNT.mkdir(parents=True, exist_ok=True)
     os.environ["OPENCV_LOG_LEVEL"] = "SILENT"
     with atheris.instrument_imports(include=["gsmerge"]) if atheris else nullcontext():
-        from fuzz.targets import TARGETS
+        from damage import SOUNDS
 
-        waiting = arguments.readers or list(TARGETS)
+        waiting = arguments.kinds or [kind for kind, sound in SOUNDS.items() if sound.fuzzed]
         processes = min(os.cpu_count() or 1, len(waiting))
         seconds = max(1, round(60 * arguments.minutes * processes / len(waiting)))
         running: dict[int, tuple[str, float]] = {}
         sound = True
         while waiting or running:
             while waiting and len(running) < processes:
-                reader, waiting = waiting[0], waiting[1:]
-                running[start(reader, seconds)] = reader, time.monotonic()
+                kind, waiting = waiting[0], waiting[1:]
+                running[start(kind, seconds)] = kind, time.monotonic()
             process, status = os.wait()
-            reader, begin = running.pop(process)
-            sound &= report(reader, os.waitstatus_to_exitcode(status), time.monotonic() - begin)
+            kind, begin = running.pop(process)
+            sound &= report(kind, os.waitstatus_to_exitcode(status), time.monotonic() - begin)
     return 0 if sound else 1
 
 

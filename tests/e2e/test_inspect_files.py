@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from damage.tensors import negated
 from former_formats import compressed_bytes
-from hostile.gsm_files import damaged
 from messages import ERROR, says
 from sweeps import sweep
 
@@ -107,7 +107,7 @@ WRONG: dict[str, tuple[Any, ...]] = {
     "a bit of a sog": ("away/a.sog", member_bit, "", "CRC-32"),
     "a bit of an npz": ("views.npz", member_bit, "", "CRC-32"),
     "a bit of a gsm": ("state.gsm", flip(-9), "", "checksum"),
-    "an array of a gsm": ("state.gsm", damaged("means"), "means", "checksum"),
+    "an array of a gsm": ("state.gsm", negated("means"), "means", "checksum"),
     "no file": ("scene.ply", Path.unlink, "", "no such file"),
 }
 

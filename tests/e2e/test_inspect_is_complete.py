@@ -1,6 +1,6 @@
 """``gsmerge inspect`` refuses what other commands refuse, by the same line: mutations of sound files of every kind.
 
-``test_hostile_input.py`` holds the same for the table of hostile inputs.
+``test_damaged_files.py`` asks the same of the table of damaged files.
 """
 
 from __future__ import annotations
@@ -14,15 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from damage import SOUNDS, places
+from damage.random_changes import mutate
 from forked_commands import CommandServer, Limits, refused_by_inspect
-from fuzz.mutate import mutate
-from hostile import array_files, camera_models, places
-from hostile.case import cameras_of, without_transforms
+from gsmerge.file_checks import check_content
 from messages import says
 from tiny_scene import make_tiny
-
-from gsmerge.cli import main
-from gsmerge.inspection.file_checks import check_content
 
 COUNT, MANY = 2, 20  # mutations of a kind
 FEWER = 10  # of kinds that take one or two seconds for each mutation: their rows have to be placed
@@ -31,28 +28,16 @@ LIMITS = Limits(1 << 30, 100)
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
 
 
-def of_views(kind: str) -> Callable[[Path], None]:
-    return array_files.saved(kind, lambda arrays, folder: None)
+@dataclass(frozen=True)
+class Kind:
+    """Sound files of a kind in a scene's folder, one of which is changed, and the command that reads them."""
 
-
-def colmap(suffix: str) -> Callable[[Path], None]:
-    def make(folder: Path) -> None:
-        contents = camera_models.colmap(*cameras_of(folder), text=suffix == "txt")
-        without_transforms(folder)
-        (folder / "sparse").mkdir()
-        for part, data in zip(("cameras", "images"), contents, strict=True):
-            (folder / "sparse" / f"{part}.{suffix}").write_bytes(data)
-
-    return make
-
-
-def extended(*batches: str) -> Callable[[Path], None]:
-    def make(folder: Path) -> None:
-        scenes = [str(folder / batch) for batch in batches]
-        small = ["--set", "superpixels=60", "--set", "checkpoint=none", "--quiet"]
-        assert main(["extend", str(folder / "a.gsm"), *scenes, *small]) == 0
-
-    return make
+    pattern: str
+    sound: str = "scene"
+    change: Callable[[Path], Any] = lambda _: None  # what is done to the folder first
+    words: tuple[str, ...] = ("compact", "--dry-run", "{}")  # the last is what is checked, {} the folder
+    named: tuple[str, str] | tuple[()] = ()  # option and file: what is only found beside a scene is left out
+    many: int = MANY  # mutations in the sweep
 
 
 def with_one_photo(folder: Path) -> None:
@@ -61,29 +46,18 @@ def with_one_photo(folder: Path) -> None:
         path.unlink()
 
 
-@dataclass(frozen=True)
-class Kind:
-    """Files of a kind in a scene's folder, one of which is changed, and the command that reads them."""
-
-    pattern: str
-    make: Callable[[Path], Any] = lambda _: None
-    words: tuple[str, ...] = ("compact", "--dry-run", "{}")  # the last is what is checked, {} the folder
-    named: tuple[str, str] | tuple[()] = ()  # option and file: what is only found beside a scene is left out
-    many: int = MANY  # mutations in the sweep
-
-
 STATE = ("compact", "--fit", "none", "-o", "made.ply", "--overwrite", "a.gsm")
 KINDS = {
     "rows": Kind("scene.ply", many=FEWER),
-    "parts": Kind("view_*.ply", places.in_parts(lambda path: None), many=FEWER),
+    "parts": Kind("view_*.ply", change=places.in_parts(lambda path: None), many=FEWER),
     "transforms": Kind("transforms.json", named=("--cameras", "transforms.json")),
-    "photos": Kind("images/*.png", with_one_photo, named=("--images", "images")),
-    "views.npz": Kind("views.npz", of_views("views.npz"), named=("--cameras", "views.npz")),
-    "results.npz": Kind("results.npz", of_views("results.npz"), named=("--cameras", "results.npz")),
-    "COLMAP, binary": Kind("sparse/*.bin", colmap("bin"), named=("--cameras", "sparse"), many=FEWER),
-    "COLMAP, text": Kind("sparse/*.txt", colmap("txt"), named=("--cameras", "sparse"), many=FEWER),
-    "state": Kind("a.gsm", extended("."), STATE),
-    "state of two batches": Kind("a.gsm", extended(".", "."), STATE),
+    "photos": Kind("images/*.png", change=with_one_photo, named=("--images", "images")),
+    "views.npz": Kind("views.npz", "views.npz", named=("--cameras", "views.npz")),
+    "results.npz": Kind("results.npz", "results.npz", named=("--cameras", "results.npz")),
+    "COLMAP, binary": Kind("sparse/*s.bin", "COLMAP binary", named=("--cameras", "sparse"), many=FEWER),
+    "COLMAP, text": Kind("sparse/*s.txt", "COLMAP text", named=("--cameras", "sparse"), many=FEWER),
+    "state": Kind("a.gsm", "gsm", words=STATE),
+    "state of two batches": Kind("a.gsm", "gsm of two batches", words=STATE),
 }
 OFTEN = ("views.npz", "state")  # in the default run; the others are in the sweep
 
@@ -99,12 +73,11 @@ def placed(words: tuple[str, ...], folder: Path) -> list[object]:
         *(pytest.param(name, kind.many, marks=pytest.mark.slow) for name, kind in KINDS.items()),
     ],
 )
-def test_what_a_command_refuses_inspect_refuses(
-    name: str, count: int, smallest_scene: Path, tmp_path: Path, server: CommandServer
-) -> None:
+def test_what_a_command_refuses_inspect_refuses(name: str, count: int, tmp_path: Path, server: CommandServer) -> None:
     kind, rng = KINDS[name], random.Random(f"{name} {count}")
-    folder = Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
-    kind.make(folder)
+    folder = tmp_path / "scene"
+    SOUNDS[kind.sound].put(folder)
+    kind.change(folder)
     words = placed(kind.words, folder)
     check = ["inspect", words[-1]]
     if kind.named:
@@ -131,7 +104,7 @@ def test_a_file_is_read_with_what_is_beside_it(smallest_scene: Path, tmp_path: P
     whole, alone = check_content(folder), check_content(folder / "scene.ply")
     assert (whole.num_views, whole.num_photos, whole.problems, whole.notes) == (3, 3, (), ())
     assert (alone.num_views, alone.count) == (3, whole.count)
-    of_views("views.npz")(folder)
+    SOUNDS["views.npz"].make(folder)
     assert not check_content(folder / "views.npz").notes
 
 

@@ -16,7 +16,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hostile.gsm_files import Spoil, cut, damaged
+from damage.case import Change
+from damage.changes import cut
+from damage.tensors import negated
 from scripts import load_script
 
 import gsmerge
@@ -316,8 +318,8 @@ def test_the_papers_online_experiment(
 # what may go wrong
 
 
-@pytest.mark.parametrize("spoil", [cut(0.5), damaged("sh0")], ids=["half", "a changed byte"])
-def test_a_damaged_state_is_refused_by_all(spoil: Spoil, state: Path, walks: list[Path], run: Run) -> None:
+@pytest.mark.parametrize("spoil", [cut(0.5), negated("sh0")], ids=["half", "a changed byte"])
+def test_a_damaged_state_is_refused_by_all(spoil: Change, state: Path, walks: list[Path], run: Run) -> None:
     spoil(state)
     (out := state.parent / "out.ply").write_text("precious")
     before = digests(state.parent)

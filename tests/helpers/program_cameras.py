@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scenes
-from hostile.case import HEIGHT, VIEWS, WIDTH
 from tiny_scene import FLIP, save_json
 
 from gsmerge.geometry import motion_vectors
 from gsmerge.kernels.matrices import invert, matmul
 
+VIEWS, WIDTH, HEIGHT = 3, 24, 16
 C2W = invert(scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64))
 MOTIONS = motion_vectors(np.tile(np.eye(4), (VIEWS, 1, 1)), invert(C2W))
 K = np.array([[40.0, 0, WIDTH / 2 + 1], [0, 42, HEIGHT / 2 - 2], [0, 0, 1]])
@@ -67,3 +68,20 @@ def write_metashape(folder: Path, lens: str = "", kind: str = "frame") -> Path:
         f'<cameras>{"".join(cameras)}<camera id="99" sensor_id="1" label="not placed"/></cameras></chunk></document>'
     )
     return path
+
+
+def world_mirror(c2w: np.ndarray, K: np.ndarray) -> dict[str, Any]:
+    """The document of WorldMirror's ``camera_params.json``."""
+    poses = [{"camera_id": name, "matrix": pose.tolist()} for name, pose in zip(view_names(c2w), c2w, strict=True)]
+    return {"extrinsics": poses, "intrinsics": [{**pose, "matrix": K.tolist()} for pose in poses]}
+
+
+def long_lrm(c2w: np.ndarray, K: np.ndarray, size: tuple[int, int] = (WIDTH, HEIGHT)) -> dict[str, Any]:
+    """The document of Long-LRM's cameras."""
+    common = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": size[0], "h": size[1]}
+    poses = zip(view_names(c2w), invert(c2w), strict=True)
+    return {"frames": [{"file_path": name, "w2c": pose.tolist(), **common} for name, pose in poses]}
+
+
+def view_names(c2w: np.ndarray) -> list[str]:
+    return [f"view_{view:03d}" for view in range(len(c2w))]

@@ -8,12 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene
-from gsmerge.cli import main
-from gsmerge.errors import SceneError
 from gsmerge.geometry import normalize
 from gsmerge.io import read_gaussians
 from gsmerge.kernels import elementary
@@ -91,13 +88,3 @@ def corners() -> Gaussians:
         sh0=np.array([[[-9.0, 0, 9]], [[1, 2, 3]], [[0, 0, 0]]], np.float32),
         shN=np.zeros((3, 0, 3), np.float32),
     )
-
-
-def assert_damage_is_one_line(path: Path, content: bytes, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of the library and of the command."""
-    path.write_bytes(content)
-    with pytest.raises(SceneError, match=path.suffix):
-        read_gaussians(path)
-    assert main(["inspect", str(path)]) == 3
-    captured = capsys.readouterr()
-    assert (captured.out, captured.err.count("\n")) == ("", 1)

@@ -97,7 +97,8 @@ def _focal(values: Mapping[str, float], axis: str, size: float) -> float:
         return values[f"fl_{axis}"]
     if f"camera_angle_{axis}" in values:
         half = 0.5 * values[f"camera_angle_{axis}"]
-        return float(0.5 * size * cos(half) / sin(half))
+        with np.errstate(all="ignore"):  # of an angle of 0: a focal length that is not finite is refused
+            return float(0.5 * size * cos(half) / sin(half))
     return 0.0
 
 

@@ -60,35 +60,6 @@ def test_angles_are_those_of_the_turn(degrees: tuple[float, ...]) -> None:
     np.testing.assert_allclose(turn_by(angles_of(rotation)), rotation, atol=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("table", "found"),
-    [
-        ({"shape": "ball"}, "shape: expected box or sphere, found 'ball'"),
-        ({"shape": ["box"]}, "shape: expected box or sphere"), ({"center": [0, 0, 0], "radius": 1}, "found None"),
-        ({"shape": "box"}, "neither"), ({"shape": "box", "min": [0, 0, 0], "size": [1, 1, 1]}, "min, size"),
-        ({"shape": "sphere", "center": [0, 0, 0], "radius": 1, "rotate": [0, 0, 1]}, "center, radius, rotate"),
-        ({"shape": "box", "min": [0, 0], "max": [1, 1, 1]}, "min: expected 3"),
-        ({"shape": "box", "min": [0, 0, "a"], "max": [1, 1, 1]}, "min: expected 3"),
-        ({"shape": "box", "min": [[0], 0, 0], "max": [1, 1, 1]}, "min: expected 3"),
-        ({"shape": "box", "min": [1, 0, 0], "max": [1, 1, 1]}, "x0 < x1"),
-        ({"shape": "sphere", "center": [0, 0, 0], "radius": 0}, "radius above 0"),
-        ({"shape": "sphere", "center": [0, 0, 0], "radius": True}, "radius: expected 1"),
-        ({"shape": "sphere", "center": [0, 0, 0], "radius": 1e300}, "below 1e+15"),
-        ({"shape": "box", "matrix": np.eye(3).tolist()}, "matrix: expected 4 x 4"),
-        ({"shape": "box", "matrix": np.diag([1, 1, 0, 1]).tolist()}, "matrix: "),
-        ({"shape": "box", "matrix": np.ones((4, 4)).tolist()}, "matrix: "),
-        ({"shape": "box", "matrix": (np.eye(4) + np.eye(4, k=1) * [0, 0.1, 0, 0]).tolist()}, "cosine"),
-        ({"shape": "sphere", "matrix": np.diag([1, 2, 1, 1]).tolist()}, "one scale"),
-    ],
-)  # fmt: skip
-def test_a_file_that_is_no_crop(tmp_path: Path, table: dict[str, Any], found: str) -> None:
-    with pytest.raises(SceneError) as raised:
-        crop(tmp_path, **table)
-    assert found in str(raised.value)
-    with refuses(SceneError, "crop.json"):
-        read_crop(tmp_path / "crop.json")
-
-
 def test_the_command_line_reads_crops_from_files(tmp_path: Path) -> None:
     crop(tmp_path, shape="sphere", center=[0, 0, 2], radius=1)
     for args in (Args(crop=str(tmp_path / "crop.json")), Args(set=[f"crop={tmp_path / 'crop.json'}"])):

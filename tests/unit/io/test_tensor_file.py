@@ -60,14 +60,6 @@ def test_types_that_numpy_lacks(tmp_path: Path) -> None:
         read_tensors(path, "a file", REMEDY)
 
 
-def test_a_sparse_file_is_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.gsm"
-    path.touch()
-    os.truncate(path, 1 << 40)
-    with refuses(SceneError, path, "header"):
-        read_tensors(path, "a file", REMEDY)
-
-
 def test_more_arrays_than_a_file_may_have(tmp_path: Path) -> None:
     """Each of 55 bytes, of which the reader would make 1.7 kB."""
     path = tmp_path / "a.gsm"

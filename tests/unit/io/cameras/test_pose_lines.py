@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from hostile.case import HEIGHT, VIEWS, WIDTH
 from messages import refuses
+from program_cameras import HEIGHT, VIEWS, WIDTH
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rotmat_to_quat

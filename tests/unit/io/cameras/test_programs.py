@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hostile.case import HEIGHT, VIEWS, WIDTH
 from messages import refuses
 from program_cameras import (
     C2W,
+    HEIGHT,
+    VIEWS,
+    WIDTH,
     K,
     write_globalsplat,
     write_globalsplat_divided,

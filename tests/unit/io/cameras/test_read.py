@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from hostile.camera_models import long_lrm, world_mirror
-from hostile.case import HEIGHT, VIEWS, WIDTH
 from messages import refuses
+from program_cameras import HEIGHT, VIEWS, WIDTH, long_lrm, world_mirror
 from tiny_scene import Tiny, edited_json, save_json, write_colmap_text, write_inria, write_transforms
 
 from gsmerge.errors import SceneError

@@ -129,39 +129,6 @@ def test_a_pixel_without_depth_has_no_gaussian(tmp_path: Path, tiny: Tiny, value
     assert file.info.num_nonfinite == 1
 
 
-def test_damaged_depth_maps(tmp_path: Path, tiny: Tiny) -> None:
-    path, depths = tmp_path / "results.npz", depths_of(tiny)
-    write_npz(path, tiny, depth=depths[:, 1:])
-    with refuses(SceneError, path.name, "images", "size"):
-        read_gaussians(path)
-    write_npz(path, tiny, depth=depths[:2])
-    with refuses(SceneError, path.name, "[3,h,w]"):
-        read_gaussians(path)
-    write_npz(path, tiny, depth=depths, intrinsics=None)
-    assert not holds_depth_maps(path)
-    np.savez_compressed(
-        path, extrinsics=np.eye(4)[None], intrinsics=np.eye(3)[None], depth=np.ones((1, 2000, 3000), "i1")
-    )
-    with refuses(SceneError, path.name, "memory"):
-        read_gaussians(path)
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"depth": np.empty((3, 0, 0), np.float32), "image": None}, "0 x 0"),
-        ({"intrinsics": np.zeros((3, 3, 3))}, "focal"),
-        ({"intrinsics": np.ones((3, 3, 3))}, "0 0 1"),
-        ({"extrinsics": np.zeros((3, 3, 4))}, "orthonormal"),
-    ],
-)
-def test_impossible_depth_maps(tmp_path: Path, tiny: Tiny, changes: dict[str, Any], said: str) -> None:
-    path = tmp_path / "results.npz"
-    write_npz(path, tiny, **{"depth": depths_of(tiny), **changes})
-    with refuses(SceneError, path.name, said):
-        read_gaussians(path)
-
-
 @pytest.mark.slow
 def test_small_files_of_many_pixels(tmp_path: Path, tiny: Tiny) -> None:
     """Depths of 16 bits with images take 3.8 bytes a pixel; frames that pack to nothing may not take more together."""
@@ -176,29 +143,6 @@ def test_small_files_of_many_pixels(tmp_path: Path, tiny: Tiny) -> None:
     assert len(read_gaussians(frames[0]).gaussians) == height * width
     with refuses(SceneError, "results_output", "memory"):
         read_parts(frames)
-
-
-def test_damaged_npz_says_so(tmp_path: Path, tiny: Tiny) -> None:
-    frames = write_frames(tmp_path, tiny)
-    frames[1].write_bytes(frames[1].read_bytes()[:200])
-    with refuses(SceneError, frames[1].name, "readable"):
-        load_scene(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"depth": np.ones((5, 5), np.float32)}, "size"),
-        ({"depth": np.ones((5, 5, 2), np.float32)}, "[h,w]"),
-        ({"intrinsics": np.ones((2, 3))}, "intrinsics"),
-        ({"intrinsics": np.zeros((3, 3))}, "focal"),
-        ({"image": np.array(["text"])}, "images"),
-    ],
-)
-def test_damaged_frames(tmp_path: Path, tiny: Tiny, changes: dict[str, Any], said: str) -> None:
-    frames = write_frames(tmp_path, tiny, **changes)
-    with refuses(SceneError, "frame_0.npz", said):
-        read_gaussians(frames[0])
 
 
 def test_frames_that_are_not_all_there(tmp_path: Path, tiny: Tiny) -> None:

@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 import scenes
 from former_formats import spz4_bytes
-from messages import refuses
 from slow_readers import drawn
 
 from gsmerge import Gaussians, Scene
-from gsmerge.errors import SceneError
 from gsmerge.geometry import multiply_quats, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.glb import holds_gaussians
@@ -196,65 +194,6 @@ def test_a_spz_inside(scene: Scene, tmp_path: Path, name: str, write: Callable[[
     same(actual.gaussians, read_gaussians(tmp_path / "b.glb").gaussians)
     assert holds_gaussians(path)
     assert actual.info.file_bytes == path.stat().st_size
-
-
-@pytest.mark.parametrize(
-    ("view", "said"),
-    [
-        ({"byteLength": 10**9}, "cut"),
-        ({"byteOffset": -900}, "cut"),
-        ({"byteOffset": 4}, "gzip"),
-        ({"buffer": 1}, "cut"),
-    ],
-)
-def test_a_damaged_spz_inside(scene: Scene, tmp_path: Path, view: Document, said: str) -> None:
-    packed = spz_bytes(drawn(scene, 1))
-    if "byteOffset" in view:
-        view = view | {"byteLength": 500}
-    save_glb_of_spz(tmp_path / "a.glb", packed, f"{NAME}_compression_spz_2", **view)
-    with refuses(SceneError, "a.glb", said):
-        read_gaussians(tmp_path / "a.glb")
-
-
-def of_primitive(change: Callable[[Document], object]) -> Callable[[Document], object]:
-    return lambda document: change(document["meshes"][0]["primitives"][0])
-
-
-def of_splats(**values: Any) -> Callable[[Document], object]:
-    return of_primitive(lambda primitive: primitive["extensions"][NAME].update(values))
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (of_primitive(lambda p: p["extensions"].clear()), (NAME, "mesh")),
-        (of_splats(colorSpace="lin_rec709_display"), ("lin_rec709_display",)),
-        (of_splats(kernel="customShape"), ("customShape",)),
-        (of_splats(extensions={f"{NAME}_spz_2": {}}), (f"{NAME}_spz_2",)),
-        (of_primitive(lambda p: p["attributes"].pop(f"{NAME}:SCALE")), (f"{NAME}:SCALE",)),
-        (of_primitive(lambda p: p["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_2")), ("SH_DEGREE_1_COEF_2",)),
-        (of_primitive(lambda p: p["attributes"].pop(f"{NAME}:SH_DEGREE_0_COEF_0")), ("SH_DEGREE_0_COEF_0",)),
-        (lambda d: d.update(extensionsRequired=["EXT_meshopt_compression"]), ("EXT_meshopt_compression",)),
-        (lambda d: d["buffers"][0].update(uri="b.bin"), ("another file",)),
-        (lambda d: d["accessors"][2].update(sparse={}), ("sparse",)),
-        (lambda d: d["accessors"][2].update(count=10**12), ("cut",)),
-        (lambda d: d["accessors"][2].update(count=5), ("others",)),
-        (lambda d: d["nodes"][0].update(children=[0]), ("node 0",)),
-        (lambda d: d["nodes"][0].update(scale=[1, 2, 1]), ("stretches",)),
-        (lambda d: d["nodes"][0].update(scale=[-1, -1, -1]), ("mirrors",)),
-        (lambda d: d.update(nodes=[{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0}]), ("same values",)),
-    ],
-)  # fmt: skip
-def test_what_is_refused(
-    change: Callable[[Document], object], said: tuple[str, ...], scene: Scene, tmp_path: Path
-) -> None:
-    path = tmp_path / "a.glb"
-    document = save_glb(path, attributes_of(drawn(scene, 1)))
-    content = path.read_bytes()[-document["buffers"][0]["byteLength"] :]
-    change(document)
-    put(path, document, content)
-    with refuses(SceneError, "a.glb", *said):
-        read_gaussians(path)
 
 
 def test_whether_it_holds_gaussians(scene: Scene, tmp_path: Path) -> None:

@@ -29,9 +29,6 @@ def test_comments_may_hold_any_byte(tmp_path: Path, comment: bytes, text: bool) 
     scene = read_ply(path)
     assert np.array_equal(scene.gaussians.means, expected.means)
     assert all(kept.isascii() for kept in scene.info.comments)
-    path.write_bytes(path.read_bytes().replace(b"float f_dc_0", b"float f_dc_\xe9").replace(b"comment", b"c\xe9mment"))
-    with pytest.raises(SceneError):
-        read_ply(path)
 
 
 @pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
@@ -41,9 +38,6 @@ def test_empty_lines_between_rows_of_text_are_passed_over(tmp_path: Path, newlin
     spaced = b"\n \t\n" + rows.replace(b"\n", b"\n\n\n") + b"\n\n"
     path.write_bytes((head + b"end_header\n" + spaced).replace(b"\n", newline))
     assert np.array_equal(read_ply(path).gaussians.means, expected.means)
-    path.write_bytes((head + b"end_header\n" + b"\n" * 10_000).replace(b"\n", newline))
-    with refuses(SceneError, path, "5 rows", 0):
-        read_ply(path)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a file that is mapped keeps its size there")
@@ -98,24 +92,6 @@ def resident(path: str) -> int:
         elif inside and line.startswith("Rss:"):
             total += 1024 * int(line.split()[1])
     return total
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "found"),
-    [
-        ("vertex 5", "vertex 0", ("one Gaussian", 0)),
-        ("element vertex", "element points", ("'vertex'", "'points'")),
-        ("vertex 5", "vertex -5", (-5,)),
-        ("property float rot_3", "property list uchar float rot_3", ("list",)),
-        ("end_header\n", "", ("end of file",)),
-        ("ply\n", "plywood\n", ("text", "'plywood'")),
-    ],
-)
-def test_headers_that_are_refused(tmp_path: Path, old: str, new: str, found: tuple[object, ...]) -> None:
-    path = save(tmp_path / "a.ply", columns(5), text=True)
-    path.write_bytes(path.read_bytes().replace(old.encode(), new.encode(), 1))
-    with refuses(SceneError, path, *found):
-        read_ply(path)
 
 
 def test_what_a_header_promises(tmp_path: Path) -> None:

@@ -5,16 +5,14 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import scenes
-from slow_readers import assert_damage_is_one_line, corners, drawn
+from slow_readers import corners, drawn
 
 from gsmerge import Gaussians
 from gsmerge.io import read_gaussians, write_gaussians
@@ -83,48 +81,3 @@ def test_a_palette_stands_for_all_vectors() -> None:
     assert np.abs(vectors - palette[labels]).mean() < spread / 4
     few, own = fit_palette(vectors, 10)
     np.testing.assert_array_equal(few[own], vectors)
-
-
-def sog_with(change: Callable[[dict[str, Any], dict[str, bytes]], None]) -> bytes:
-    """A .sog of three Gaussians whose meta.json and files were changed."""
-    with zipfile.ZipFile(io.BytesIO(sog_bytes(corners()))) as archive:
-        files = {name: archive.read(name) for name in archive.namelist()}
-    meta = json.loads(files.pop("meta.json"))
-    change(meta, files)
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
-        for name, data in {**files, "meta.json": json.dumps(meta).encode()}.items():
-            archive.writestr(name, data)
-    return content.getvalue()
-
-
-def webp(height: int, width: int, *settings: int) -> bytes:
-    return cv2.imencode(".webp", np.zeros((height, width, 3), np.uint8), settings)[1].tobytes()
-
-
-LOSSLESS = (cv2.IMWRITE_WEBP_QUALITY, 101)
-DAMAGED = {
-    "empty": b"",
-    "text": b"PK\3\4 and no more",
-    "cut": sog_bytes(corners())[:-9],
-    "old": sog_with(lambda meta, files: meta.pop("version") and None),
-    "list": sog_with(lambda meta, files: meta.update(version=[2])),
-    "promise": sog_with(lambda meta, files: meta.update(count=10**18)),
-    "count": sog_with(lambda meta, files: meta.update(count=17)),
-    "word": sog_with(lambda meta, files: meta.update(count="three\nlines")),
-    "absent": sog_with(lambda meta, files: files.pop("quats.webp") and None),
-    "outside": sog_with(lambda meta, files: meta["quats"].update(files=["../../etc/passwd"])),
-    "codes": sog_with(lambda meta, files: meta["sh0"].update(codebook=[0.5])),
-    "huge": sog_with(lambda meta, files: meta["means"].update(mins=[10**400] * 3)),
-    "nan": sog_with(lambda meta, files: meta["means"].update(mins=[float("nan")] * 3)),
-    "lossy": sog_with(lambda meta, files: files.update({"scales.webp": webp(4, 4, cv2.IMWRITE_WEBP_QUALITY, 50)})),
-    "pixels": sog_with(lambda meta, files: files.update({"scales.webp": webp(1024, 1024, *LOSSLESS)})),
-    "mode": sog_with(lambda meta, files: files.update({"quats.webp": files["sh0.webp"]})),
-    "header": sog_with(lambda meta, files: files.update({"scales.webp": files["scales.webp"][:25]})),
-    "harmonics": sog_with(lambda meta, files: meta.update(shN={"count": 10**9, "bands": 3, "files": ["a", "b"]})),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGED)
-def test_damage_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert_damage_is_one_line(tmp_path / f"{name}.sog", DAMAGED[name], capsys)

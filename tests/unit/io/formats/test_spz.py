@@ -10,14 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zstandard
+from damage.gaussians import add_record, axes_record
 from former_formats import spz4_bytes
-from hostile.case import sparse
-from messages import refuses
-from slow_readers import assert_damage_is_one_line, corners
+from slow_readers import corners
 
 from gsmerge import Gaussians
-from gsmerge.errors import SceneError
 from gsmerge.geometry import covariances, turn_harmonics
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.read import file_notes
@@ -31,9 +28,6 @@ NIANTIC = bytes.fromhex(
     "00000080ff28b52ffd2002110000ff3328b52ffd2006310000a6805980938028b52ffd2006310000a0908070605028b52ffd"
     "2008410000000000c069a5953628b52ffd2012910000a08080a08080a080808040c08040c08040c0"
 )
-
-
-SIZES = slice(32, 32 + 16 * 6)  # the table of a file with harmonics
 
 
 def some(degree: int, count: int = 50) -> Gaussians:
@@ -93,24 +87,11 @@ def test_harmonics_of_degree_4(tmp_path: Path) -> None:
     assert read_gaussians(tmp_path / "b.spz").info.layout == ".spz version 3, SH degree 3"
 
 
-def with_extensions(content: bytes, more: bytes) -> bytes:
-    """Put records into a file: before the table of version 4, or after the columns of an older one."""
-    flagged = bytearray(content if content[:4] == b"NGSP" else gzip.decompress(content))
-    flagged[14] |= 2
-    if content[:4] != b"NGSP":
-        return gzip.compress(flagged + more)
-    return bytes(flagged[:16] + struct.pack("<I", 32 + len(more)) + flagged[20:32] + more + flagged[32:])
-
-
-def axes_record(number: int, size: int = 4) -> bytes:
-    return struct.pack("<2I", 0xADBE0003, size) + struct.pack("<I", number)[:size]
-
-
 @pytest.mark.parametrize("more", [b"", struct.pack("<2I3f", 0xADBE0002, 12, 0, 1, 2), axes_record(0), axes_record(6)])
 @pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
 def test_extensions_that_change_nothing(tmp_path: Path, write: Callable[[Gaussians], bytes], more: bytes) -> None:
     """Limits of an orbit, and axes that say nothing or are those of a ``.ply``."""
-    for name, data in {"plain": write(some(1)), "more": with_extensions(write(some(1)), more)}.items():
+    for name, data in {"plain": write(some(1)), "more": add_record(write(some(1)), more)}.items():
         (tmp_path / f"{name}.spz").write_bytes(data)
     plain, extended = (read_gaussians(tmp_path / f"{name}.spz") for name in ("plain", "more"))
     assert file_notes(extended.info) == ()
@@ -126,7 +107,7 @@ def test_axes_are_turned_to_those_of_a_ply(
     """Of both hands: world directions of positions, ellipsoids and colours stay the same."""
     content, orbit = write(some(2)), struct.pack("<2I3f", 0xADBE0002, 12, 0, 1, 2)
     (tmp_path / "plain.spz").write_bytes(content)
-    (tmp_path / "axes.spz").write_bytes(with_extensions(content, orbit + axes_record(number)))
+    (tmp_path / "axes.spz").write_bytes(add_record(content, orbit + axes_record(number)))
     plain, ply = read_gaussians(tmp_path / "plain.spz").gaussians, read_gaussians(tmp_path / "axes.spz")
     world = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
     turn, turned = np.array([world[letter] for letter in axes], float).T, ply.gaussians
@@ -142,61 +123,6 @@ def test_axes_are_turned_to_those_of_a_ply(
     assert all(axes in note for note in file_notes(ply.info))
 
 
-@pytest.mark.parametrize("record", [axes_record(17), axes_record(4, 2), axes_record(4)[:-1]])
-@pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
-def test_unknown_axes(tmp_path: Path, write: Callable[[Gaussians], bytes], record: bytes) -> None:
-    (tmp_path / "a.spz").write_bytes(with_extensions(write(some(0)), record))
-    with refuses(SceneError, "a.spz", "SPZ_ADOBE_coordinate_system", "17" if record[8] == 17 else "damaged"):
-        read_gaussians(tmp_path / "a.spz")
-
-
-def spz_with(**changes: int) -> bytes:
-    names = ("magic", "version", "count", "degree", "fraction", "flags", "zero")
-    data = gzip.decompress(spz_bytes(corners()))
-    header = dict(zip(names, struct.unpack_from("<3I4B", data), strict=True)) | changes
-    return gzip.compress(struct.pack("<3I4B", *header.values()) + data[16:])
-
-
-WHOLE = spz4_bytes(some(1))
-
-
-OLDER = {
-    "empty": b"",
-    "text": b"ply\n",
-    "cut short": spz_bytes(corners())[:40],
-    "short": gzip.compress(gzip.decompress(spz_bytes(corners()))[:-1]),
-    "other": spz_with(magic=1),
-    "later": b"NGSP\4\0\0\0",
-    "another version": spz_with(version=9),
-    "another degree": spz_with(degree=4),
-    "fraction": spz_with(fraction=200),
-    "no count": spz_with(count=0),
-    "a promise": spz_with(count=2**32 - 1),
-    "more": spz_with(count=4),
-}
-DAMAGED = OLDER | {
-    "header": WHOLE[:15],
-    "table": WHOLE[:60],
-    "cut": WHOLE[:-3],
-    "promise": WHOLE[:8] + b"\xff\xff\xff\xff" + WHOLE[12:],
-    "none": WHOLE[:8] + bytes(4) + WHOLE[12:],
-    "degree": WHOLE[:12] + b"\5" + WHOLE[13:],
-    "streams": WHOLE[:15] + b"\3" + WHOLE[16:],
-    "far": WHOLE[:16] + b"\xff\xff\xff\x7f" + WHOLE[20:],
-    "sizes": WHOLE[:32] + struct.pack("<QQ", 2**63, 450) + WHOLE[48:],
-    "larger": WHOLE[:40] + struct.pack("<Q", 2**40) + WHOLE[48:],
-    "stream": WHOLE[: SIZES.stop] + b"none" + WHOLE[SIZES.stop + 4 :],
-    "frame": WHOLE[: SIZES.stop] + b"\x28\xb5\x2f\xfd\xe0" + b"\xff" * 7 + b"\x00" + WHOLE[SIZES.stop + 13 :],
-    "longer": WHOLE[:32] + struct.pack("<QQ", len(zeros := zstandard.compress(bytes(10**6))), 450)
-    + WHOLE[48 : SIZES.stop] + zeros + WHOLE[SIZES.stop + struct.unpack_from("<Q", WHOLE, 32)[0] :],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", DAMAGED)
-def test_damage_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert_damage_is_one_line(tmp_path / f"{name}.spz", DAMAGED[name], capsys)
-
-
 @pytest.mark.parametrize(("how", "word"), [((9,), b"\2"), ((1, zlib.Z_RLE), b"\4")])
 def test_streams_name_no_time_and_the_same_system(how: tuple[int, ...], word: bytes) -> None:
     """Python 3.10 to 3.13 write one of two systems into what ``gzip.compress`` returns."""
@@ -205,30 +131,6 @@ def test_streams_name_no_time_and_the_same_system(how: tuple[int, ...], word: by
     assert actual[:10] == b"\x1f\x8b\x08" + bytes(5) + word + b"\3"
     assert gzip.decompress(actual) == data
     assert data[:10] == gzip_bytes(b"")[:10]
-
-
-def test_another_file_of_any_size_is_refused_by_its_start(tmp_path: Path) -> None:
-    sparse(tmp_path / "a.spz", 2**40)
-    with refuses(SceneError, "a.spz", "gzip"):
-        read_gaussians(tmp_path / "a.spz")
-
-
-@pytest.mark.parametrize("version", [3, 4])
-def test_more_gaussians_than_its_bytes_can_describe(version: int, tmp_path: Path) -> None:
-    """Equal ones are packed a thousandfold: they would take more memory than the file says."""
-    count = 1_000_001
-    header = struct.pack("<3I4B", 0x5053474E, version, count, 0, 12, 0, 5 if version == 4 else 0)
-    columns = [bytes(width * count) for width in (9, 1, 3, 3, 4)]
-    content = gzip.compress(header + b"".join(columns), 1)
-    if version == 4:
-        packed = [zstandard.compress(column) for column in columns]
-        sizes = b"".join(struct.pack("<QQ", len(part), len(c)) for part, c in zip(packed, columns, strict=True))
-        content = header + struct.pack("<I12x", 32) + sizes + b"".join(packed)
-        content += bytes(20 * count // 1000)  # so that it is not refused for its ratio alone
-    path = tmp_path / "a.spz"
-    path.write_bytes(content)
-    with refuses(SceneError, "a.spz", "1,000,001"):
-        read_gaussians(path)
 
 
 def test_a_wrong_version_leaks_no_warning(tmp_path: Path) -> None:

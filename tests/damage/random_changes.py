@@ -10,9 +10,11 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from pathlib import Path
 from random import Random
 from typing import Any
 
+FINDINGS = Path(__file__).parent / "findings"  # files that a reader failed on; the tests read them
 Change = Callable[[bytes, Random], bytes]
 
 PIECES = (b"\0" * 8, b"\xff" * 8, b"-1", b"99999999999", b"nan", b"1e999", b"\n", b"list uchar", b"[" * 50, b"9" * 5000)

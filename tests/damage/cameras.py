@@ -1,0 +1,102 @@
+"""COLMAP models, lists of poses and files of Metashape that promise much."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+from .case import Change, Damage, either, refused
+from .changes import at, beside, content, of_bytes, put, swap, zeros
+
+MILLION = "MILLION"  # stands for as many attributes, which take a second to name
+NAME_IN_IMAGES = 72  # place of the first name in images.bin
+POINTS_IN_IMAGES = NAME_IN_IMAGES + len("view_000.png\0")
+
+
+def lines(change: Callable[[list[str]], list[str]]) -> Change:
+    """Change the lines of a text."""
+    return of_bytes(lambda data: "\n".join(change(data.decode().splitlines())).encode())
+
+
+def of_binary() -> dict[str, Damage]:
+    many = (2**63, 2**64 - 1)
+    huge = zeros(2**33)
+    return {
+        **{f"cameras.bin, count {n}": either(beside("cameras.bin", at(0, "<Q", n))) for n in many},
+        **{f"cameras.bin, width {n}": either(beside("cameras.bin", at(16, "<Q", n))) for n in (60_000, 2**63)},
+        **{f"count {n}": either(at(0, "<Q", n)) for n in many},
+        **{f"{n} points": either(at(POINTS_IN_IMAGES, "<Q", n)) for n in (2**40, 2**61, 2**64 - 1)},
+        "a million images": either(of_bytes(lambda d: struct.pack("<Q", 10**6) + d[8:] * 330_000), slow=True),
+        "a name of 1 MB": either(of_bytes(lambda d: d[:NAME_IN_IMAGES] + b"x" * 2**20 + d[NAME_IN_IMAGES:])),
+        "a name that is not UTF-8": either(at(NAME_IN_IMAGES, "<2B", 255, 254)),
+        "a name with line breaks": either(at(NAME_IN_IMAGES, "<3B", 10, 13, 27)),
+        "cameras.bin of 8 GB of zeros": refused(beside("cameras.bin", huge)),
+    }
+
+
+def of_text() -> dict[str, Damage]:
+    many = b"".join(b"%d SIMPLE_PINHOLE 1 1 1 1 1\n" % i for i in range(20_000))
+    contents = {
+        "a size of 5000 digits": b"1 PINHOLE " + b"9" * 5000 + b" 16 20 20 12 8", "bytes": bytes(range(256)),
+        "20,000 cameras": many,
+    }  # fmt: skip
+    return {
+        **{
+            f"cameras.txt with {word}": refused(beside("cameras.txt", content(data))) for word, data in contents.items()
+        },
+        "a million images": refused(content(b"0 1 0 0 0 0 0 0 1 a\n" * 1_000_000), slow=True),
+        "cameras.txt of 8 GB of zeros": refused(beside("cameras.txt", zeros(2**33))),
+    }
+
+
+def of_pose_list() -> dict[str, Damage]:
+    changes: dict[str, Callable[[list[str]], list[str]]] = {
+        "a line of 1 MB": lambda _: ["1 " * 2**19], "50,000 lines": lambda x: [x[1]] * 50_000,
+        "a zero byte": lambda x: [x[0] + " \0", *x[1:]],
+        "4,000,000 lines of one number": lambda x: [x[0], "1\n" * 4_000_000],
+        "15,000,000 blank lines": lambda x: [*x, " \n" * 15_000_000],
+        "15,000,000 comments": lambda x: [*x, "#\n" * 15_000_000],
+    }  # fmt: skip
+    return {word: either(lines(change), slow=word[0].isdigit()) for word, change in changes.items()}
+
+
+def element(tag: str) -> Change:
+    """Put an element into a file of Metashape, behind its cameras."""
+    return swap("</chunk>", f"{tag}</chunk>")
+
+
+def nested_sensors(path: Path) -> None:
+    """Each of 400 sensors holds the next one; the innermost has 100,000 elements."""
+    data, count = path.read_text(), 400
+    start, end = data.index("<sensor "), data.index("</sensors>")
+    sensor = data[start:end].replace("</sensor>", "")
+    camera = data[data.index("<camera ") : data.index("</camera>")] + "</camera>"
+    sensors = "".join(sensor.replace('id="0"', f'id="{i}"', 1) for i in range(count))
+    cameras = "".join(camera.replace('sensor_id="0"', f'sensor_id="{i}"', 1) for i in range(count))
+    head, tail = data[:start], data[data.index("</cameras>") :]
+    put(path, f"{head}{sensors}{'<a/>' * 100_000}{'</sensor>' * count}</sensors><cameras>{cameras}{tail}")
+
+
+def million_attributes(path: Path) -> None:
+    element(f"<x {' '.join(f'a{i}=' + chr(39) * 2 for i in range(1_000_000))}/>")(path)
+
+
+def of_metashape() -> dict[str, Damage]:
+    """XML whose parts a parser copies, or goes through again and again."""
+    address = "u" * 1_000_000
+    names = "".join(f"<a:b{i}/>" for i in range(3000))
+    return {
+        "nested sensors": either(nested_sensors, slow=True),
+        "a million attributes": either(million_attributes, slow=True),
+        "a namespace of 1 MB": either(element(f"<x xmlns:a='{address}'>{'<a:b/>' * 100_000}</x>"), slow=True),
+        "names in a namespace of 1 MB": either(element(f"<x xmlns:a='{address}'>{names}</x>"), slow=True),
+        "depth": either(element("<a>" * 400_000 + "</a>" * 400_000), slow=True),
+        "a component named by a quote": either(swap('<camera id="0"', '<camera component_id="a\'b" id="0"')),
+        "an entity": either(swap("<document>", "<!DOCTYPE x [<!ENTITY a 'aaaa'>]><document>")),
+    }
+
+
+DAMAGES = {
+    "COLMAP binary": of_binary(), "COLMAP text": of_text(), "pose list": of_pose_list(), "Metashape": of_metashape(),
+}  # fmt: skip

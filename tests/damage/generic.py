@@ -1,0 +1,128 @@
+"""What is done to sound files of every kind: they are cut, filled with zeros, and other content takes their place."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import pickle
+import tarfile
+from pathlib import PurePath
+
+from .case import Damage, either, refused, slow
+from .changes import content, cut, of_bytes, of_entries, packed, text, zeros
+from .sounds import SOUNDS
+
+TERABYTE = 2**40
+BRACKETS = 100_000
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 63327587\n"
+PAGE = b"\n<!doctype HTML>\n<head><title>\n Virus scan\n warning</title></head>"
+
+# Formats by what their files begin with, or what they are read as
+GAUSSIANS = (
+    *("rows", "ply", "ply, big", "ply, text", "ply, faces", "ply, faces first", "compressed ply", "spz", "spz 4"),
+    *("sog", "splat", "glb", "glb of spz"),
+)
+JSON = (
+    *("transforms", "INRIA", "Long-LRM", "WorldMirror", "frames", "bare frames", "Blender", "GlobalSplat", "OpenSfM"),
+    *("moved Long-LRM", "levels", "levels of a tree", "crop"),
+)
+ARRAYS = ("views.npz", "results.npz", "predictions.npz", "depth maps", "depth frames")
+TENSORS = ("gsm", "gsm of two batches", "gsm of features", "checkpoint")
+PICTURES = ("photos", *(kind for kind in SOUNDS if kind.startswith(("photo.", "photo of", "mask."))))
+TEXTS = ("COLMAP text", "pose list", "TUM", "RealEstate10K", "Tanks and Temples")
+# Kinds of which a part may be sound, as a file is that is read line by line
+PARTS_MAY_BE_SOUND = {*TEXTS, "ply, text", "splat"}
+FOLDERS = ("scene", "Polycam", "pose folder")
+LINES = ("list", "set")  # each a value, which is damaged at random alone
+FILES = tuple(kind for kind in SOUNDS if kind not in (*FOLDERS, *LINES))
+
+
+def _archive(add: str) -> bytes:
+    stream = io.BytesIO()
+    if add == "tar":
+        with tarfile.open(fileobj=stream, mode="w") as archive:
+            archive.addfile(tarfile.TarInfo("scene.ply"))
+        return stream.getvalue()
+    return packed({"scene.ply": b"ply\n"})
+
+
+# What stands in the place of files that were copied or downloaded, and what the line says of it
+OTHER_CONTENT: dict[str, tuple[bytes, tuple[str, ...]]] = {
+    "a pointer of LFS": (LFS, ("LFS", "git lfs pull")),
+    "a web page": (PAGE, ("web page", "'Virus scan warning'", "download")),
+    "an error as JSON": (b'{"error": "Not found"}', ("text", "Not found", "download")),
+    "an error as text": (b"404: Not Found", ("text", "404: Not Found")),
+    "a zip": (_archive("zip"), ("zip", "unpack")),
+    "a gzip": (gzip.compress(b"ply\n", mtime=0), ("gzip", "unpack")),
+    "a tar": (_archive("tar"), ("tar", "unpack")),
+    "a 7z": (b"7z\xbc\xaf\x27\x1c\0\4", ("7z", "unpack")),
+    "a rar": (b"Rar!\x1a\x07\x01\0", ("rar", "unpack")),
+    "a PLY file": (b"ply\nformat ascii 1.0\n", ("PLY", ".ply")),
+}
+# Where such content is what the kind consists of, so that its own reader says what is wrong
+OWN = {"a zip": (".sog", ".npz"), "a gzip": (".spz",), "a PLY file": (".ply", ".safetensors")}
+
+
+def _pieces(kind: str) -> dict[str, Damage]:
+    """Damages of a file as bytes."""
+    outcome = either if kind in PARTS_MAY_BE_SOUND else refused
+    damages = {f"the first {share:.2%}": outcome(cut(share)) for share in (0.0001, 0.05, 0.3, 0.5, 0.9)}
+    damages |= {
+        "all but the end": either(cut(0.999)),
+        "empty": refused(content(b"")),
+        "zeros": refused(content(bytes(5000))),
+        "a pickle": refused(content(pickle.dumps({"a": 1}) * 9)),
+        "bytes that are no text": outcome(content(bytes(range(256)))),
+        "a byte too many": either(of_bytes(lambda data: data + b"x")),
+        "1 TB of zeros": refused(zeros(TERABYTE)),
+        "1 TB of zeros behind it": either(zeros(TERABYTE, None)),
+    }
+    if kind == "SHARP":  # which is asked of every file whether it has a camera
+        damages = {name: either(damage.change) for name, damage in damages.items()}
+    return damages
+
+
+def _other_content(kind: str) -> dict[str, Damage]:
+    suffix = PurePath(SOUNDS[kind].name).suffix
+    chosen = OTHER_CONTENT if kind in (*GAUSSIANS, *TENSORS, *ARRAYS) else {}
+    if suffix in (".json", ".png"):
+        chosen = {name: OTHER_CONTENT[name] for name in ("a pointer of LFS", "a web page")}
+    few = kind == "photos"  # of several, one is left out in fewer words
+    return {
+        name: refused(content(data), *(() if few or suffix in OWN.get(name, ()) else said))
+        for name, (data, said) in chosen.items()
+    }
+
+
+def _json(kind: str) -> dict[str, Damage]:
+    """Damages of a document of JSON."""
+    return {
+        "JSON of brackets": refused(text(b"[" * BRACKETS)),
+        "JSON of nested objects": refused(text(b'{"a":' * BRACKETS)),
+        "JSON of many digits": refused(text(b"9" * 10_000)),
+        "JSON of a huge number": refused(text(b"1e999")),
+        "JSON that ends": refused(text(b"{")),
+        **{f"JSON {value}": refused(text(json.dumps(value).encode())) for value in ([], [1], {}, 7, "a", None)},
+    }
+
+
+def _archives(kind: str) -> dict[str, Damage]:
+    """Damages of a zip that holds the file's parts."""
+    return {
+        "encrypted": either(of_entries(6, 8, lambda flags: flags | 1)),
+        "an unknown compression": refused(of_entries(8, 10, lambda _: 99), "method 99"),
+        "the directory alone": refused(of_bytes(lambda data: data[data.index(b"PK\x01\x02") :])),
+    }
+
+
+def _all(kind: str) -> dict[str, Damage]:
+    damages = _pieces(kind) | _other_content(kind)
+    if kind in (*JSON, "sog", "glb", "glb of spz"):
+        damages |= _json(kind)
+    if kind in ("sog", *ARRAYS):
+        damages |= _archives(kind)
+    return slow(damages) if SOUNDS[kind].rare else damages
+
+
+DAMAGES: dict[str, dict[str, Damage]] = {kind: _all(kind) for kind in FILES}

@@ -1,0 +1,222 @@
+"""Photos and masks that lie about their size, that unpack to far more than they have, or that are of rare kinds."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import zlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from .case import Change, Damage, either, read, refused
+from .changes import content, cut, edit, of_bytes, with_numbers, zeros
+from .sounds import NAMES, TINY
+
+Bytes = Callable[[bytes], bytes]
+WIDTH, HEIGHT, VIEWS = TINY.width, TINY.height, len(NAMES)
+ALL = "images"  # what is named where no photo can be used
+
+
+def every(change: Bytes) -> Change:
+    """Change all photos."""
+
+    def both(path: Path) -> None:
+        for photo in path.parent.iterdir():
+            photo.write_bytes(change(photo.read_bytes()))
+
+    return both
+
+
+def recoded(suffix: str, change: Bytes) -> Change:
+    """All photos as another format under its own suffix, and changed."""
+
+    def both(path: Path) -> None:
+        for photo in list(path.parent.iterdir()):
+            image = cv2.imread(str(photo))
+            photo.unlink()
+            photo.with_suffix(suffix).write_bytes(change(cv2.imencode(suffix, image)[1].tobytes()))
+
+    return both
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def png(width: int, height: int, data: bytes, *, depth: int = 8, color: int = 2) -> bytes:
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+def with_size(width: int, height: int) -> Bytes:
+    """A PNG whose header tells another size than its rows have."""
+    return lambda data: data[:8] + chunk(b"IHDR", struct.pack(">II", width, height) + data[24:29]) + data[33:]
+
+
+@cache
+def black(width: int, height: int) -> bytes:
+    """A PNG of black pixels, a thousandth of their size."""
+    packer, row = zlib.compressobj(1), bytes(1 + 3 * width)
+    return png(width, height, b"".join(packer.compress(row) for _ in range(height)) + packer.flush())
+
+
+def with_chunks(more: bytes) -> Bytes:
+    """A PNG with more chunks between its header and its pixels."""
+    return lambda data: data[:33] + more + data[33:]
+
+
+def texts() -> bytes:
+    packed = zlib.compress(bytes(2**20), 9)
+    return b"".join(chunk(b"zTXt", b"a%d\0\0" % i + packed) for i in range(60))
+
+
+def flipped(place: int) -> Change:
+    """Some bits of a byte."""
+    return of_bytes(lambda data: data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
+
+
+def tiff(order: str, tags: list[tuple[int, int, int, int]]) -> bytes:
+    head = struct.pack(f"{order}2sHIH", b"II" if order == "<" else b"MM", 42, 8, len(tags))
+    return head + b"".join(struct.pack(f"{order}HHII", *tag) for tag in tags)
+
+
+def with_tags(order: str) -> bytes:
+    """A TIFF of 240 kB with 4,000 tags that refer to all of it, each."""
+    size, bytes_of_rows = 240_000, WIDTH * HEIGHT
+    rows = {256: WIDTH, 257: HEIGHT, 258: 8, 259: 1, 262: 1, 273: 100_000, 277: 1, 278: HEIGHT, 279: bytes_of_rows}
+    tags = [(tag, 4, 1, value) for tag, value in rows.items()] + [(1000 + i, 7, size - 8, 8) for i in range(4000)]
+    return tiff(order, tags).ljust(size, b"\0")
+
+
+def with_tile(side: int, order: str = "<", *more: tuple[int, int]) -> bytes:
+    """A TIFF of one tile of a few deflated zeros, by far larger than the image, and more tags."""
+    packed = zlib.compress(b"\0")
+    tags = [(256, WIDTH), (257, HEIGHT), (258, 8), (259, 8), (262, 1), (277, 1), (322, side), (323, side)]
+    tags += [(324, 8 + 2 + 12 * (len(tags) + 2 + len(more)) + 4), (325, len(packed)), *more]
+    return tiff(order, [(tag, 4, 1, value) for tag, value in tags]) + bytes(4) + packed
+
+
+def masks(data: bytes) -> Change:
+    """The bytes as the mask of every view."""
+
+    def change(path: Path) -> None:
+        folder = path.parent.with_name("masks")
+        folder.mkdir()
+        for name in NAMES:
+            (folder / name).with_suffix(".tiff").write_bytes(data)
+
+    return change
+
+
+def one_photo(path: Path) -> None:
+    """300 frames that name the same photo of 4 million pixels of one colour, which has 0.2 kB."""
+    scene = path.parent.parent
+    shutil.rmtree(path.parent)
+    cv2.imwrite(str(scene / "p.webp"), np.zeros((2000, 2000, 3), np.uint8))
+
+    def change(data: dict[str, Any]) -> None:
+        frames = data["frames"] * (300 // VIEWS)
+        data["frames"] = [  # each in a place of its own
+            {"file_path": "p.webp", "transform_matrix": [[*row[:3], row[3] + 1e-6 * i] for row in pose]}
+            for i, pose in enumerate(frame["transform_matrix"] for frame in frames)
+        ]
+        for key in ("w", "h"):
+            del data[key]
+
+    edit(change)(scene / "transforms.json")
+
+
+def jpeg_size(width: int, height: int) -> Bytes:
+    def change(data: bytes) -> bytes:
+        start = data.index(b"\xff\xc0") + 5
+        return data[:start] + struct.pack(">HH", height, width) + data[start + 4 :]
+
+    return change
+
+
+def cmyk(_: bytes) -> bytes:
+    """A JPEG header with four components and no data for them."""
+    parts = b"".join(bytes((i, 0x11, 0)) for i in range(1, 5))
+    frame = struct.pack(">HBHHB", 20, 8, HEIGHT, WIDTH, 4) + parts
+    tables = b"\xff\xdb" + struct.pack(">HB", 67, 0) + bytes([1] * 64)
+    scan = b"\xff\xda" + struct.pack(">HB", 14, 4) + b"".join(bytes((i, 0)) for i in range(1, 5)) + b"\0\x3f\0"
+    return b"\xff\xd8" + tables + b"\xff\xc0" + frame + scan + b"\0" * 50 + b"\xff\xd9"
+
+
+def of_png() -> dict[str, Damage]:
+    sizes = [(60_000, 60_000), (2**31 - 1, 1), (2**32 - 1, 2**32 - 1), (0, 0), (WIDTH + 1, HEIGHT)]
+    bits = png(WIDTH, HEIGHT, zlib.compress(b"\0\xaa" * HEIGHT), depth=1, color=0)
+    return {
+        **{f"a PNG that claims {w} x {h}": either(of_bytes(with_size(w, h))) for w, h in sizes},
+        "all PNG claim 60000 x 60000": refused(every(with_size(60_000, 60_000)), place=ALL),
+        "8 GB of zeros": refused(zeros(2**33)),
+        "three bombs": refused(every(lambda _: black(9000, 9000)), place=ALL, slow=True),
+        "solid of 8190 x 8190": refused(every(lambda _: black(8190, 8190)), place=ALL, slow=True),
+        "300 frames of one photo": refused(one_photo, "300 of 2000 x 2000", place="scene", compacts=True, slow=True),
+        "60 texts of 1 MB": read(every(with_chunks(texts())), slow=True),
+        "a million chunks without data": either(every(with_chunks(chunk(b"IDAT", b"") * 1_000_000)), slow=True),
+        "a script": refused(of_bytes(lambda data: b"#!/bin/sh\ntouch executed\n")),
+        "a chunk of 4 GB": refused(of_bytes(with_numbers(33, ">I", 2**32 - 1))),
+        "JPEG of four channels": either(every(cmyk)),
+        "a PNG of 1 bit": read(every(lambda _: bits)),
+    }
+
+
+def of_other_formats() -> dict[str, Damage]:
+    lies = {
+        ".jpg": jpeg_size(60_000, 60_000), ".bmp": with_numbers(18, "<ii", 60_000, 60_000),
+        ".webp": with_numbers(26, "<HH", 16383, 16383), ".ppm": lambda data: data.replace(b"6 4", b"60000 60000", 1),
+    }  # fmt: skip
+    tiffs: dict[str, Bytes] = {
+        "whose directory is itself": with_numbers(4, "<I", 0),
+        "whose directory is far away": with_numbers(4, "<I", 2**32 - 1),
+        "whose tags are all of it, little-endian": lambda _: with_tags("<"),
+        "whose tags are all of it, big-endian": lambda _: with_tags(">"),
+        "of a tile of 8192 x 8192": lambda _: with_tile(8192),
+        "of a tile of two sizes": lambda _: with_tile(8192, "<", (322, 16), (323, 16)),
+    }
+    return {
+        **{
+            f"{suffix} that lies": (either if suffix == ".webp" else refused)(recoded(suffix, lie), place=ALL)
+            for suffix, lie in lies.items()
+        },
+        ".bmp upside down": read(recoded(".bmp", with_numbers(22, "<i", -HEIGHT))),
+        ".bmp of least height": refused(recoded(".bmp", with_numbers(22, "<i", -(2**31))), place=ALL),
+        **{f".tiff {word}": refused(recoded(".tiff", change), place=ALL) for word, change in tiffs.items()},
+        **{
+            f".tiff masks of a tile of 26000 x 26000, {order}": refused(
+                masks(with_tile(26_000, order)), "view_000.tiff", "26000 x 26000", place="masks", compacts=True
+            )
+            for order in "<>"
+        },
+    }
+
+
+def progressive(scans: int) -> Change:
+    """A progressive JPEG of 4 million pixels, with its last scan as many times."""
+    picture = np.zeros((2048, 2048), np.uint8)
+
+    def change(path: Path) -> None:
+        data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+        path.write_bytes(data[:-2] + data[data.rindex(b"\xff\xda") : -2] * (scans - 1) + data[-2:])
+
+    return change
+
+
+DAMAGES: dict[str, dict[str, Damage]] = {
+    "photos": of_png() | of_other_formats(),
+    "photo.png": {
+        **{f"byte {place} changed": refused(flipped(place)) for place in (10, 20, 30, 40, -20)},
+        "an unknown critical chunk": refused(of_bytes(with_chunks(chunk(b"ABCD", b"")))),
+        "no picture": refused(content(b"\0no image"), "decoded"),
+        "text": refused(content(b"no image"), "text"),
+        "no bytes": refused(content(b""), "empty"),
+        "half of it": refused(cut(0.5), "decoded"),
+    },
+    "photo.jpg": {"a few scans": read(progressive(1)), "5,006 scans": refused(progressive(5001), "5,006 scans")},
+}

@@ -1,0 +1,188 @@
+"""``.sog`` and Streamed SOG: documents that promise more than the pictures have, or lead out of their folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from .case import Change, Damage, either, read, refused
+from .changes import beside, bomb, cut, edit, of_member, packed, place, put, without, without_member
+
+LOSSLESS = (cv2.IMWRITE_WEBP_QUALITY, 101)
+BOX = {"min": [-9, -9, -9], "max": [9, 9, 9]}
+HUGE = 10**400
+
+
+def webp(width: int, height: int, value: int = 0, quality: int = 101, channels: int = 4) -> bytes:
+    """A picture of one colour: a kilobyte, however large it is."""
+    picture = np.full((height, width, channels), value, np.uint8)
+    return cv2.imencode(".webp", picture, (cv2.IMWRITE_WEBP_QUALITY, quality))[1].tobytes()
+
+
+def equal_files(count: int, bands: int) -> dict[str, bytes]:
+    """The files of equal Gaussians."""
+    side = int(np.ceil(count**0.5))
+    names = {"means": ["a.webp", "a.webp"], "scales": ["a.webp"], "quats": ["b.webp"], "sh0": ["a.webp"]}
+    codes = [index / 256 for index in range(256)]
+    meta: dict[str, Any] = {key: {"files": files, "codebook": codes} for key, files in names.items()}
+    meta["means"] |= {"mins": [0, 0, 0], "maxs": [1, 1, 1]}
+    files = {"a.webp": webp(side, side, 99), "b.webp": webp(side, side, 252)}
+    if bands:
+        meta["shN"] = {"count": 64, "bands": bands, "codebook": codes, "files": ["c.webp", "d.webp"]}
+        files |= {"c.webp": webp(64 * 15, 1, channels=3), "d.webp": webp(side, side)}
+    return files | {"meta.json": json.dumps({"version": 2, "count": count} | meta).encode()}
+
+
+def equal(count: int, bands: int) -> Change:
+    return lambda path: put(path, packed(equal_files(count, bands)))
+
+
+def picture(name: str, *size: int, **settings: int) -> Change:
+    """Put another picture in the place of a texture."""
+    return of_member(name, lambda _: webp(*size, **settings))
+
+
+def swap_pictures(path: Path) -> None:
+    """Colours in the place of rotations, whose mode they lack."""
+    with zipfile.ZipFile(path) as archive:
+        colors = archive.read("sh0.webp")
+    of_member("quats.webp", lambda _: colors)(path)
+
+
+def of_sog() -> dict[str, Damage]:
+    return {
+        "no version": refused(without("version")),
+        "version as a list": refused(place("version", value=[2])),
+        "a count of 10^18": refused(place("count", value=10**18)),
+        "a count of 400 digits": refused(place("count", value=HUGE)),
+        "a count beyond the pixels": refused(place("count", value=17)),
+        "a count in words": refused(place("count", value="three\nlines")),
+        "a million equal Gaussians": refused(equal(1_000_000, 3)),
+        "900 equal Gaussians": read(equal(900, 3)),
+        "a texture missing": refused(without_member("quats.webp")),
+        "a texture from outside": refused(place("quats", "files", value=["../../etc/passwd"])),
+        "a codebook of one code": refused(place("sh0", "codebook", value=[0.5])),
+        "a huge minimum": refused(place("means", "mins", value=[HUGE] * 3)),
+        "a minimum of NaN": refused(place("means", "mins", value=[float("nan")] * 3)),
+        "a texture with losses": refused(picture("scales.webp", 4, 4, quality=50)),
+        "a texture of a million pixels": refused(picture("scales.webp", 1024, 1024)),
+        "a texture of its header": refused(of_member("scales.webp", lambda data: data[:25])),
+        "rotations of no mode": refused(swap_pictures),
+        "a palette of 10^9": refused(place("shN", value={"count": 10**9, "bands": 3, "files": ["a", "b"]})),
+        "meta.json of bzip2": refused(
+            bomb("meta.json", zipfile.ZIP_BZIP2), "method 12", place="a.sog: 'meta.json'", slow=True
+        ),
+        "meta.json that promises less": refused(bomb("meta.json", zipfile.ZIP_DEFLATED), slow=True),
+    }
+
+
+# Levels: an index of chunks, each a folder of a meta.json and its textures
+
+
+def leaf(*files: int, count: int = 900) -> dict[str, Any]:
+    children = [{"bound": BOX, "lods": {"0": {"file": file, "offset": 0, "count": count}}} for file in files]
+    return {"bound": BOX, "children": children}
+
+
+def chunks_of(count: int = 900, chunks: int = 1, bands: int = 0, **changes: Any) -> Change:
+    """An index of equal chunks, whose entries are changed."""
+
+    def change(path: Path) -> None:
+        names = [f"{number}/meta.json" for number in range(chunks)]
+        document = {"version": 1, "lodLevels": 1, "filenames": names, "tree": leaf(*range(chunks), count=count)}
+        put(path, json.dumps(document | changes))
+        for name in names:
+            chunk = (path.parent / name).parent
+            chunk.mkdir()
+            for file, data in equal_files(count, bands).items():
+                (chunk / file).write_bytes(data)
+
+    return change
+
+
+def two_names(path: Path) -> None:
+    """Two chunks that are one by a link."""
+    chunks_of(filenames=["0/meta.json", "1/meta.json"], tree=leaf(0, 1))(path)
+    (path.parent / "1").symlink_to("0")
+
+
+def link_out(path: Path) -> None:
+    (path.parent / "0_0").rename(path.parent.parent / "outside")
+    (path.parent / "0_0").symlink_to(path.parent.parent / "outside")
+
+
+def fewer(index: dict[str, Any]) -> None:
+    """A count that agrees with all of the index, and not with the chunk."""
+    index["tree"]["lods"]["0"]["count"] -= 1
+    index.update(count=index["count"] - 1, counts=[index["counts"][0] - 1, *index["counts"][1:]])
+
+
+def forget(index: dict[str, Any]) -> None:
+    """What writers before versions left out."""
+    for key in ("version", "asset", "count", "counts"):
+        del index[key]
+    index["environment"] = None
+
+
+def deepen(index: dict[str, Any]) -> None:
+    for _ in range(300):
+        index["tree"] = {"bound": BOX, "children": [index["tree"]]}
+
+
+def more_name(name: str) -> Change:
+    return edit(lambda index: index["filenames"].append(name))
+
+
+def of_levels() -> dict[str, Damage]:
+    chunk, lods = "0_0/meta.json", ("tree", "lods")
+    return {
+        "another version": refused(place("version", value=2)),
+        "a version as a list": refused(place("version", value=[])),
+        "fewer levels than its tree": refused(place("lodLevels", value=1)),
+        "a tree as a list": refused(place("tree", value=[])),
+        "leaves and children": refused(place("tree", "children", value=[])),
+        "a box turned": refused(place("tree", "bound", value={"min": [9, 9, 9], "max": [1, 1, 1]})),
+        "a box of NaN": refused(place("tree", "bound", "min", value=[float("nan")] * 3)),
+        "a box of huge integers": either(place("tree", "bound", value={"min": [HUGE] * 3, "max": [HUGE] * 3})),
+        "another count": refused(place("count", value=5)),
+        "a file beyond the list": refused(place(*lods, "0", "file", value=2)),
+        "an offset of true": refused(place(*lods, "0", "offset", value=True)),
+        "a gap": refused(place(*lods, "0", "offset", value=1)),
+        "a level in words": refused(place(*lods, "finest", value={})),
+        "a chunk of two levels": refused(place(*lods, "1", "file", value=0)),
+        "a chunk above": refused(more_name("../lod-meta.json")),
+        "a chunk above, as Windows has it": refused(more_name("..\\meta.json")),
+        "a chunk of another name": refused(more_name("0_0/other.json")),
+        "an environment above": refused(place("environment", value="../meta.json")),
+        "a chunk by a link out": refused(link_out),
+        "a chunk by two names": refused(two_names),
+        "a chunk missing": refused(lambda path: shutil.rmtree(path.parent / "0_0"), place=chunk),
+        "a texture missing": refused(beside("0_0/quats.webp", Path.unlink), place="quats.webp"),
+        "a texture of 16 million pixels": refused(
+            beside("0_0/scales.webp", lambda path: put(path, webp(4096, 4096, channels=3))), place=chunk
+        ),
+        "fewer rows than its chunk": refused(edit(fewer), place=chunk),
+        "a texture from outside": refused(
+            beside(chunk, place("quats", "files", value=["../../etc/passwd"])), place=chunk
+        ),
+        "a chunk's count of 10^15": refused(beside(chunk, place("count", value=10**15)), place=chunk),
+        "a chunk of version 1": refused(beside(chunk, without("version")), place=chunk),
+        "a chunk that is cut": refused(beside("0_0/means_l.webp", cut(0.5)), place=chunk),
+        "chunks of equal Gaussians": read(chunks_of(chunks=2)),
+        "many chunks of equal Gaussians": refused(chunks_of(180_000, 4, 3), slow=True),
+        "100,000 names": read(chunks_of(filenames=[f"{number}/meta.json" for number in range(100_000)]), slow=True),
+        "a deep tree": read(edit(deepen)),
+        "no version": read(edit(forget)),
+        "no more than an empty list": refused(
+            lambda path: put(path, '{"version": 1, "filenames": [], "lodLevels": 1}')
+        ),
+    }
+
+
+DAMAGES = {"sog": of_sog(), "levels": of_levels()}

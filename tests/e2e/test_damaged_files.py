@@ -1,0 +1,224 @@
+"""Every damaged file ends in a result or in one clear line: in bounded time and memory, and nothing is executed.
+
+The table of sound files and of what is done to them is in ``tests/damage``. The default run tries all that is quick, in
+this process. The sweep tries all in processes of their own within limits, and asks ``inspect``, too, which refuses by
+the same line what ``compact`` refuses.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+from damage import DAMAGES, SOUNDS
+from damage.arrays import MARKER
+from damage.sounds import COMPACT, OF_CAMERAS, TINY
+from forked_commands import FAILED, CommandServer, Limits, Outcome, refused_by_inspect, run_forked
+from messages import ERROR, names, says
+from sweeps import sweep
+from tiny_scene import edited_json
+
+from gsmerge.cli import main
+from gsmerge.errors import SceneError
+
+from .conftest import Run, listing
+
+FREE_MEMORY, MEMORY_PER_BYTE = 64e6, 20  # the budget of a reader, as SECURITY.md has it
+FREE_SECONDS, SECONDS_PER_BYTE = 5, 2e-6
+SANITIZED = "libasan" in os.environ.get("LD_PRELOAD", "")  # which keeps what is freed
+MEMORY_MARGIN, SECONDS_MARGIN = 20 if SANITIZED else 2, 10  # a scene is read and placed; a slow machine
+MOST_SECONDS, MOST_MEMORY = 100, 2**30  # of sparse files, whose budget is more than a machine has
+OPTIONS = {"-o", "--images"}  # what they name is nothing for ``inspect``
+# One or two of each kind of harm, that take little time: in the default run within limits, too
+OFTEN = (
+    "rows: count 9223372036854775808", "rows: half of the positions NaN", "rows: 8 GB of zeros as lists",
+    "glb: copies without end", "sog: a million equal Gaussians", "spz: half a million of degree 4",
+    "splat: 1 TB of zeros", "gsm: 1 TB of zeros", "levels: a chunk by two names",
+    "transforms: path that is a device, no images", "transforms: large model, 10,000 frames with poses",
+    "COLMAP binary: 18446744073709551615 points", "views.npz: poses as objects", "results.npz: a bomb of floats",
+    "photos: a PNG that claims 60000 x 60000", "photos: .tiff masks of a tile of 26000 x 26000, <",
+    "scene: a folder with line breaks", "scene: scene.ply as a pipe", "scene: images as a loop",
+    "scene: a device as cameras", "scene: the output a pipe",
+)  # fmt: skip
+QUICK = [name for name, (_, damage) in DAMAGES.items() if not damage.slow]
+BY_COMMANDS = [name for name, (kind, _) in DAMAGES.items() if SOUNDS[kind].words]
+COMPACTED = ("one position 1e30", "half of the positions NaN", *(f"{what} 1e38" for what in ("colours", "opacities",
+             "scales", "rotations")))  # fmt: skip
+
+of_linux = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
+
+
+def limits(num_bytes: int) -> Limits:
+    """Far more than a reader of so many bytes may take."""
+    seconds = SECONDS_MARGIN * (FREE_SECONDS + SECONDS_PER_BYTE * num_bytes)
+    return Limits(MOST_MEMORY + min(MEMORY_PER_BYTE * num_bytes, MOST_MEMORY), min(seconds, MOST_SECONDS))
+
+
+def size_of(folder: Path) -> int:
+    return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def spoil(name: str, folder: Path, *, quick: bool = False) -> tuple[Path, list[str]]:
+    """Make a sound file and damage it -> its path, and the command with its arguments.
+
+    ``quick``: cameras are read by ``inspect``, without the Gaussians beside them, which take a tenth of a second.
+    """
+    kind, damage = DAMAGES[name]
+    sound = SOUNDS[kind]
+    path = sound.put(folder / "scene")
+    other = damage.change(path)
+    if quick and sound.scene is OF_CAMERAS and not damage.in_scene:
+        return path, ["inspect", str(path)]
+    target = folder / "scene" if sound.scene else path
+    arguments = [str(argument) for argument in (other if isinstance(other, list) else [target])]
+    words = sound.words[: 1 if damage.compacts else None]
+    return path, [*words, *["--"] * arguments[0].startswith("-"), *arguments]
+
+
+def one_line(err: str) -> None:
+    assert err.startswith(ERROR)
+    assert err.endswith("\n")
+    assert err.count("\n") == 1
+    assert err[:-1].isprintable()
+    assert len(err) < 6000
+    assert "unexpected" not in err.split(":")[2]
+
+
+def check(outcome: Outcome, name: str, path: Path) -> None:
+    """Check that a command did what is expected of a damage: the exit code, and the only line on stderr."""
+    assert outcome.code in (0, 2, 3), outcome
+    kind, damage = DAMAGES[name]
+    places = [damage.place] if damage.place else [place for place in (path.name, SOUNDS[kind].named) if place]
+    if outcome.code == 0 and 0 not in damage.codes:  # of files beside the Gaussians, what is refused is left out
+        lines = [line for line in (outcome.out + outcome.err).split("\n") if re.search(" (is|are) left out: ", line)]
+        assert len(lines) == 1, outcome
+        one_line(f"{ERROR}{lines[0]}\n")
+        assert any(place in lines[0] for place in places)
+        assert names(lines[0], *damage.says)
+        return
+    assert outcome.code in damage.codes, outcome.err
+    if outcome.code == 0:
+        assert "gsmerge: warning" not in outcome.err
+        return
+    one_line(outcome.error)
+    if damage.codes == (3,):
+        line = outcome.error.removeprefix(ERROR).strip()
+        assert any(says(line, place, *damage.says) for place in places), outcome.err
+
+
+def within_budget(outcome: Outcome, num_bytes: int, *, describes: bool = False) -> None:
+    """Check that a command ended by itself, had the memory it asked for, and took no more than its readers may.
+
+    ``describes``: it says what it could read of what is refused.
+    """
+    assert outcome.code in (0, 2, 3), outcome
+    budget = MEMORY_MARGIN * (FREE_MEMORY + MEMORY_PER_BYTE * num_bytes)
+    assert outcome.peak < budget, f"{outcome.peak / 1e6:.0f} MB of {budget / 1e6:.0f}"
+    assert "out of memory" not in outcome.err or budget > MOST_MEMORY
+    if outcome.code:
+        assert outcome.out == "" or (describes and outcome.out.startswith("file "))
+        one_line(outcome.error)
+
+
+@pytest.mark.parametrize("kind", SOUNDS)
+def test_sound_files_are_read(kind: str, tmp_path: Path, run: Run) -> None:
+    sound = SOUNDS[kind]
+    path = sound.put(tmp_path / "scene")
+    sound.read(path)
+    if sound.words:
+        run(*sound.words, tmp_path / "scene" if sound.scene else path, code=0)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_damaged_files_are_read_or_refused_in_one_line(
+    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (kind, damage), (path, words) = DAMAGES[name], spoil(name, tmp_path, quick=True)
+    before = listing(tmp_path)
+    capfd.readouterr()
+    if words[0] in ("compact", "inspect"):
+        code, said = main(words), ""
+    else:
+        try:
+            SOUNDS[kind].read(path)
+            code, said = 0, ""
+        except SceneError as error:
+            code, said = 3, f"{ERROR}{error}\n"
+    out, err = capfd.readouterr()
+    assert not err or kind != "photo.png"  # whose library would print what it thinks of it
+    check(Outcome(code, out, err + said, 0, 0), name, path)
+    assert not list(tmp_path.rglob(MARKER))
+    if damage.compacts and code == 0:
+        return
+    assert listing(tmp_path) == before
+
+
+@of_linux
+@sweep("name", sorted(BY_COMMANDS, key=lambda name: name not in OFTEN), often=len(OFTEN))
+def test_damaged_files_are_read_within_a_budget(name: str, tmp_path: Path, server: CommandServer) -> None:
+    damage, (path, words) = DAMAGES[name][1], spoil(name, tmp_path)
+    before, num_bytes = listing(tmp_path), size_of(tmp_path)
+    outcome = server.run(words, limits(num_bytes))
+    within_budget(outcome, num_bytes)
+    check(outcome, name, path)
+    assert not list(tmp_path.rglob(MARKER))
+    if damage.compacts and outcome.code == 0:
+        return
+    assert listing(tmp_path) == before
+    if outcome.code == 3 and words[0] == COMPACT[0] and not damage.other_kind and not OPTIONS & {*words}:
+        files = [word for word in words[1:] if word not in ("--cameras", "--dry-run", "--")]
+        checked = server.run(["inspect", "--quiet", "--", *files], limits(num_bytes))
+        within_budget(checked, num_bytes)
+        refused_by_inspect(outcome, checked)
+
+
+@of_linux
+@sweep("name", ["glb: a length of 2^62", "rows: 600000 rows of one place", *BY_COMMANDS[::9]])
+def test_damaged_files_can_be_inspected(name: str, tmp_path: Path, server: CommandServer) -> None:
+    words = spoil(name, tmp_path)[1]
+    num_bytes = size_of(tmp_path)
+    target = next(word for word in words[1:] if not word.startswith("-") or "--" in words)
+    outcome = server.run(["inspect", "--", target], limits(num_bytes))
+    within_budget(outcome, num_bytes, describes=True)
+    assert not list(tmp_path.rglob(MARKER))
+
+
+@sweep("name", COMPACTED)
+def test_odd_values_are_compacted(name: str, tmp_path: Path, run: Run) -> None:
+    scene = spoil(f"rows: {name}", tmp_path)[0].parent
+    outcome = run("compact", scene, "-o", scene / "small.ply", "--set", "fit_steps=2", "--quiet", code=0)
+    assert "gsmerge: warning" not in outcome.err
+    actual = run("inspect", scene / "small.ply", "--json").out
+    assert json.loads(actual)["num_nonfinite"] == 0
+
+
+@of_linux
+@pytest.mark.slow
+def test_a_frame_of_67_million_pixels_is_drawn_in_bands(tmp_path: Path, server: CommandServer) -> None:
+    scene = TINY.save(tmp_path / "scene")
+    path = Path(shutil.copy(scene / "transforms.json", tmp_path / "path.json"))
+    with edited_json(path) as data:
+        focal, data["w"], data["h"] = 8190 / data["w"], 8190, 8190
+        data |= {name: focal * data[name] for name in ("fl_x", "fl_y")} | {"cx": 4095, "cy": 4095}
+        data["frames"] = data["frames"][:1]
+    words = ["render", str(scene), "--path", str(path), "-o", str(scene / "out")]
+    assert server.run(words, Limits(MOST_MEMORY, MOST_SECONDS)).code == 0
+    assert cv2.imread(str(scene / "out" / "frame_00000.png"), cv2.IMREAD_REDUCED_GRAYSCALE_8).shape == (1023, 1023)
+
+
+@of_linux
+def test_limits_hold() -> None:
+    """A process that takes more ends, however it ends."""
+    limits = Limits(1 << 28, 0.3)
+    assert run_forked(lambda: len(bytearray(1 << 30)), limits).code == FAILED
+    filled = run_forked(lambda: len(bytearray(b"x") * (1 << 26)) >> 26, limits)
+    assert filled.code == 1
+    assert 6e7 < filled.peak < 1.2e8
+    assert run_forked(lambda: sum(iter(int, 1)), limits).code == -signal.SIGPROF

@@ -1,1 +1,0 @@
-"""Readers of files, with small sound files of each format and ways to change these: python tasks.py fuzz."""
