@@ -321,7 +321,7 @@ def plan_section(run: Run) -> str:
             say(
                 "No option asks for a number, and each view has Gaussians of its own, so"
                 f" {plan.settings['superpixels']} of the",
-                limits.exact is None and not plan.keeps_input and plan.target_psnr is None,
+                limits.exact is None and not plan.keeps_fidelity and plan.target_psnr is None,
             ),
             f"{pixels:,} pixels of a view become Gaussians: {limits.per_view} for each view,",
             f"{limits.default:,} in all. The fit has {plan.fit.steps} steps. It starts with fewer Gaussians,",

@@ -46,8 +46,10 @@ AUTO_STEPS = 2  # times the usual steps with budget auto: fewer Gaussians cost l
 SHORT_STEPS = 60  # of a fit that a better start still matters to
 MOST_STEPS = 2.0  # times the steps, for more than the usual share of Gaussians in the pixels
 USUAL_VIEWS = 12  # that the steps of an effort are for; more need more
-KEPT_PSNR = 32.5  # dB from the input in its views that results keep by default where there are no photos and no pixels
-KEPT_LOSS = 0.3  # dB that they may show the photos worse than the input where there are photos and no pixels
+FIDELITY_PSNR = (
+    32.5  # dB from the input in its views that results keep by default where there are no photos and no pixels
+)
+FIDELITY_LOSS = 0.3  # dB that they may show the photos worse than the input where there are photos and no pixels
 # Gaussians of a scene without views for each step of its fit, more of them the more it draws; up to those of an effort
 PER_STEP, PER_DRAWN = 700, 40
 RENDERS_STEPS = 0.35  # times the step sizes of a fit where renders stand for photos: it begins near to them
@@ -93,7 +95,7 @@ class Plan:
     clean: CleanOptions  # What is left out of the result
     unseen: Gaussians  # Merged canonical Gaussians that no view sees
     target_psnr: float | None  # PSNR (dB) that the input's views have to reach; None: no target, or not known yet
-    keeps_input: bool  # see :func:`keeps_input`
+    keeps_fidelity: bool  # see :func:`keeps_fidelity`
     max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
@@ -132,7 +134,7 @@ class Plan:
     @property
     def cleans_last(self) -> bool:
         """Whether the number is searched for without clean-up: what that leaves out would count as errors."""
-        return self.keeps_input and self.clean.asked
+        return self.keeps_fidelity and self.clean.asked
 
     @property
     def prunes(self) -> bool:
@@ -184,8 +186,8 @@ def settle(prepared: Prepared, options: CompactOptions) -> Settled:
 def decide(prepared: Prepared, settled: Settled, checkpoint: Checkpoint | None, unseen: Gaussians) -> Plan:
     """Make all decisions about a run; ``unseen`` are the merged Gaussians that no view sees."""
     size, asked, options, segment = prepared.size, settled.asked, settled.options, settled.segment
-    keeps = keeps_input(size, asked)
-    target = KEPT_PSNR if keeps and size.rendered else asked.budget.target_psnr
+    keeps = keeps_fidelity(size, asked)
+    target = FIDELITY_PSNR if keeps and size.rendered else asked.budget.target_psnr
     choices = choose_for_scene(
         size, settled.counted, num_input=count_input(prepared), num_reserved=len(unseen), keeps=keeps
     )
@@ -207,7 +209,7 @@ def decide(prepared: Prepared, settled: Settled, checkpoint: Checkpoint | None, 
         clean=settled.clean,
         unseen=unseen,
         target_psnr=target,
-        keeps_input=keeps,
+        keeps_fidelity=keeps,
         max_drop=budget.max_drop,
         auto_count=budget.auto,
         levels=budget.levels,
@@ -256,7 +258,7 @@ class SceneChoices:
     match: MatchMethod  # Of merging across views
     checkpoint: str  # Name of the networks to load; "none"
     fit: FitOptions  # With the steps that are taken
-    keeps_input: bool  # see :func:`keeps_input`
+    keeps_fidelity: bool  # see :func:`keeps_fidelity`
     may_merge_pairs: bool  # Whether neighbours are merged pair by pair unless networks are handed to the plan
 
     def settings(self, options: CompactOptions) -> dict[str, Any]:
@@ -277,7 +279,7 @@ def choose_for_scene(
     ``num_input``, ``num_reserved``: as of :func:`gsmerge.budget.count_limits`. ``keeps``: of options as they
     were given, None: of these.
     """
-    keeps = keeps_input(scene, options) if keeps is None else keeps
+    keeps = keeps_fidelity(scene, options) if keeps is None else keeps
     if scene.num_views == 0 and (keeps or resolve_fit(options).steps <= SHORT_STEPS) and options.effort != "best":
         # too few steps for views that have to be placed, or too many counts to be tried
         options = replace(options, fit=replace(options.fit, fit="none"))
@@ -353,10 +355,10 @@ def _whole_needed(options: CompactOptions) -> list[str]:
     return [*options.whole_only, *options.uncut]
 
 
-def keeps_input(scene: SceneSize, options: CompactOptions) -> bool:
+def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     """Return whether the count is the fewest that keep the input, as neither options nor the scene's density decide it.
 
-    Without photos the result has to be ``KEPT_PSNR`` from the input; with them it may show them ``KEPT_LOSS`` worse. A
+    Without photos the result has to be ``FIDELITY_PSNR`` from the input; with them it may show them ``FIDELITY_LOSS`` worse. A
     share of the Gaussians says little where they are fewer than pixels: a scene that is compact already needs most of
     its Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
     """
@@ -538,7 +540,7 @@ def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -
     if placed and fit.fit == "none" != options.fit.fit:
         note(NO_FIT)
     tuning = replace(fit.tuning.scaled(PLACED_STEPS if placed else RENDERS_STEPS), max_ratio=math.inf)
-    return replace(fit, judged=False, beyond=True, tuning=tuning)
+    return replace(fit, scored=False, beyond=True, tuning=tuning)
 
 
 def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:

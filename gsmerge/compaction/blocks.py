@@ -270,7 +270,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[BlockStart]
     tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=SEAM_DECAY)
     looks = SEAM_LOOKS if at_seam.mean() < MOSTLY_SEAMS else ROOM_LOOKS
     options = replace(
-        plan.fit, fit_steps=max(SEAM_STEPS, looks * len(scene)), photo_scale=1.0, judged=False, dropout=0.0,
+        plan.fit, fit_steps=max(SEAM_STEPS, looks * len(scene)), photo_scale=1.0, scored=False, dropout=0.0,
         half_res_share=0.0, min_contribution=0.0, beyond=True, tuning=tuning,
     )  # fmt: skip
     decoded = Decoded(joined[rows], len(rows), exact=True, fixed=~at_seam[rows])

@@ -23,7 +23,7 @@ from gsmerge.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.plan import KEPT_LOSS, KEPT_PSNR, SceneChoices, choose_for_scene, resolve_budget, stands_alone
+from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, SceneChoices, choose_for_scene, resolve_budget, stands_alone
 from gsmerge.report import document_head
 from gsmerge.runtime.estimate import (
     TRIED,
@@ -74,7 +74,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     if stands_alone(scene, options):
         seconds = placed_seconds(
             scene.num_gaussians, count, threads=threads, fit_steps=steps * (choices.fit.fit != "none"),
-            views=count_placed(placed_views(steps)), tries=TRIED if choices.keeps_input else 1,
+            views=count_placed(placed_views(steps)), tries=TRIED if choices.keeps_fidelity else 1,
         )  # fmt: skip
     else:
         inside = float(np.mean(shares_inside(scene, MAX_DRAWN_GAUSSIANS) or [1.0]))
@@ -87,9 +87,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     return {
         "num_gaussians": count,
         "exact": options.budget.is_filled,
-        "psnr_kept": KEPT_PSNR if choices.keeps_input and size.rendered else None,
+        "psnr_kept": FIDELITY_PSNR if choices.keeps_fidelity and size.rendered else None,
         "quality": options.budget.quality,
-        "loss_kept": KEPT_LOSS if choices.keeps_input and not size.rendered else None,
+        "loss_kept": FIDELITY_LOSS if choices.keeps_fidelity and not size.rendered else None,
         "ratio": count / max(1, num_input),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": choices.blocks,
@@ -108,7 +108,7 @@ def _search(size: SceneSize, options: CompactOptions, choices: SceneChoices, ins
     """Return what a search for the number of Gaussians, and levels, add, as arguments of :func:`wall_seconds`."""
     budget, limits = options.budget, choices.limits
     coarser = COARSER * (budget.levels - 1)
-    if choices.keeps_input or budget.target_psnr is not None:
+    if choices.keeps_fidelity or budget.target_psnr is not None:
         return {"tries": TRIED_BY_PHOTOS + coarser}
     if size.rendered or not (budget.auto or budget.max_drop is not None):
         return {"tries": 1 + coarser}

@@ -157,7 +157,7 @@ class Candidate:
     cameras: Cameras  # The given views as the Gaussians were made from them, in the world
     psnr: float | None  # Mean PSNR (dB) of the scored views, against photos or renders of the input; None without views
     record: Record  # Seconds, choices and notes of building and scoring it
-    kept_psnr: float | None = None  # The same over the pixels that the input covers, where it decides the count
+    deciding_psnr: float | None = None  # The same over the pixels that the input covers, where it decides the count
 
 
 def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
@@ -270,7 +270,7 @@ def _score_photos(
 ) -> PhotoScore:
     """Score Gaussians in the stage ``name`` on the scored photos: a quarter of each, or all if a quality is sought."""
     with stage(name):
-        near, quarter = NEAR_PLANE * prepared.frame.unit, plan.target_psnr is None and not plan.keeps_input
+        near, quarter = NEAR_PLANE * prepared.frame.unit, plan.target_psnr is None and not plan.keeps_fidelity
         photos = scene_photos(views)
         return score_photos(gaussians, photos, plan.scored_views, quarter=quarter, near=near, covered=covered)
 

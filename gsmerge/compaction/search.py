@@ -30,7 +30,7 @@ from gsmerge.facts.row_colors import PHOTOS, RENDERS
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.pipeline import Build
-from gsmerge.plan import KEPT_LOSS, Plan
+from gsmerge.plan import FIDELITY_LOSS, Plan
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
 from gsmerge.runtime.record import begin_part, choose, current_record, note, record_part, report_progress, stage
@@ -49,7 +49,9 @@ KNEE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaus
 SLOPE, RENDERS_SLOPE = 1.0, 3.0  # dB per doubling of the count, of photos and of renders, until two were tried
 CLOSE = 1.15  # counts this near to each other are one
 NEAR_DB = 0.6  # dB above a target for renders at which a count is near enough: with their slope it is CLOSE
-PHOTOS_NEAR_DB = 0.2  # the same for photos that decide the default: below KEPT_LOSS, as all of the input lose nothing
+PHOTOS_NEAR_DB = (
+    0.2  # the same for photos that decide the default: below FIDELITY_LOSS, as all of the input lose nothing
+)
 MAX_RUNS = 6
 # Of photos that are left out: builds, beside the one that is written; dB per doubling until two were tried, the mean
 # below the usual count of eleven captures; dB above a target at which a count is near enough, half of that
@@ -109,7 +111,7 @@ class CountSearch:
 
     def choose_next(self, candidates: Sequence[Candidate]) -> int | None:
         """Choose the next count by the candidates built so far; None ends the search."""
-        target, limits, keeps = self.plan.target_psnr, self.plan.limits, self.plan.keeps_input
+        target, limits, keeps = self.plan.target_psnr, self.plan.limits, self.plan.keeps_fidelity
         if target is None or len(candidates) >= (MAX_RUNS if self.left_out is None else MAX_TRIED):
             return None
         usual = keeps and not self.plan.auto_count
@@ -161,13 +163,13 @@ class CountSearch:
         if self.plan.target_psnr is not None:
             best, tried, met = self.best, tuple(self.tried.items()), self.met
             left_out = 0 if self.left_out is None else len(self.left_out.photos)
-            psnr = best.kept_psnr if self.count == best.count else self.plan.target_psnr  # between two counts
+            psnr = best.deciding_psnr if self.count == best.count else self.plan.target_psnr  # between two counts
             choices["search"] = {"count": self.count, "psnr": psnr, "met": met, "tried": tried, "left_out": left_out}
             views = "photos left out" if left_out else "the input views"
             reached = f"{views} reach {psnr or 0.0:.2f} dB with {len(result.gaussians):,} Gaussians"
             if left_out and met:
                 notes = [*notes, f"quality: {reached}"]
-            elif not met and not self.plan.keeps_input:
+            elif not met and not self.plan.keeps_fidelity:
                 unmet = f"quality: {self.plan.target_psnr:g} dB was asked for; {reached}, the best that was tried"
         return {"seconds": seconds, "choices": choices, "notes": notes, "unmet": unmet}
 
@@ -175,14 +177,14 @@ class CountSearch:
     def notes(self) -> list[str]:
         """Note that says how many Gaussians were kept by default, where they are more than usual."""
         count, limits = self.best.count or 0, self.plan.limits
-        if not self.plan.keeps_input or count <= limits.default:
+        if not self.plan.keeps_fidelity or count <= limits.default:
             return []
         kept = f"kept {len(self.best.gaussians):,} of {limits.num_input:,} Gaussians"
         short = f"be below {self.plan.target_psnr:g} dB from it"
         good = f"are {self.plan.target_psnr:g} dB from the input or better"
         if not self.rendered:
-            short = f"show the photos over {KEPT_LOSS:g} dB worse"
-            good = f"show the photos at most {KEPT_LOSS:g} dB worse than the input"
+            short = f"show the photos over {FIDELITY_LOSS:g} dB worse"
+            good = f"show the photos at most {FIDELITY_LOSS:g} dB worse than the input"
         if not self.met:
             return [f"{kept}: each of the {len(self.tried)} counts tried would {short}"]
         if count > MOSTLY * limits.num_input:
@@ -192,7 +194,7 @@ class CountSearch:
 
 def psnr_by_count(candidates: Sequence[Candidate]) -> dict[int, float]:
     """Return the PSNR (dB) that decides of each candidate by its count, in their order."""
-    return {each.count: each.kept_psnr or 0.0 for each in candidates if each.count is not None}
+    return {each.count: each.deciding_psnr or 0.0 for each in candidates if each.count is not None}
 
 
 def add_target(plan: Plan, prepared: Prepared) -> Plan:
@@ -203,12 +205,12 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
     if prepared.reference.name == RENDERS and may_leave_gaps(prepared, plan):
         shown = measure_renders(prepared.scene.gaussians, prepared, plan)
         plan = plan if covers_all(shown) else replace(plan, covered=shown.covered)
-    if not plan.keeps_input or plan.target_psnr is not None:
+    if not plan.keeps_fidelity or plan.target_psnr is not None:
         return plan
     before = measure_input(prepared, plan)
     assert before is not None, "a scene with photos"
     psnr = before.psnr if covers_all(before) else before.covered_psnr
-    return replace(plan, before=before, target_psnr=psnr - KEPT_LOSS)
+    return replace(plan, before=before, target_psnr=psnr - FIDELITY_LOSS)
 
 
 def search_count(prepared: Prepared, plan: Plan, build: Build, forecast: RunForecast | None = None) -> CountSearch:
@@ -228,7 +230,7 @@ def leave_out_judges(prepared: Prepared, plan: Plan) -> LeftOut | None:
 
     Without a fit no photo has been seen; and a count that keeps the input is compared with what its own views show.
     """
-    judged = (plan.target_psnr is not None and not plan.keeps_input) or plan.max_drop is not None or plan.auto_count
+    judged = (plan.target_psnr is not None and not plan.keeps_fidelity) or plan.max_drop is not None or plan.auto_count
     if not judged or plan.fit.fit == "none":
         return None
     if can_leave_out(prepared):
@@ -289,7 +291,7 @@ def measure_curve(
     """
     short = replace(
         plan.fit, fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, photo_scale=1.0, time_budget=None,
-        judged=True, move_cameras=False, share=None,
+        scored=True, move_cameras=False, share=None,
     )  # fmt: skip
     if left_out is None:
         photos = scene_photos(prepared.scene)[prepared.reference.score_views]

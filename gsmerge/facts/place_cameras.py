@@ -19,7 +19,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 NUM_VIEWS = 24
-JUDGES, JUDGE_SIZE = 8, 512  # views that judge a result, and their pixels per side, at most
+MAX_SCORED, SCORED_SIZE = 8, 512  # views that judge a result, and their pixels per side, at most
 FITTED = 16  # views that a fit without cameras sees of each kind, and half of it on a walk
 FITTED_LONG, LONG = 48, 600  # the same of a long fit, and steps of it from which on it is one
 FEWER = 3  # of the candidates every third is tried where views only judge
@@ -125,9 +125,9 @@ def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
     )
 
 
-def add_judges(scene: Scene) -> Scene:
+def add_scored_views(scene: Scene) -> Scene:
     """Add a few small views on which results of a scene without views are judged."""
-    return _with_cameras(scene, place_cameras(scene.gaussians, JUDGES, largest=JUDGE_SIZE, step=FEWER))
+    return _with_cameras(scene, place_cameras(scene.gaussians, MAX_SCORED, largest=SCORED_SIZE, step=FEWER))
 
 
 def blank_pictures(scene: Scene) -> PicturedScene:

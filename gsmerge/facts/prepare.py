@@ -16,7 +16,7 @@ from gsmerge.facts.move_poses import move_poses
 from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.place_cameras import (
     NO_VIEWS,
-    add_judges,
+    add_scored_views,
     add_views,
     blank_pictures,
     draw_around,
@@ -265,7 +265,7 @@ def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
     """
     finite = keep_finite(scene)
     note(NO_VIEWS)
-    judged, frame = canonicalise(add_judges(finite))
+    judged, frame = canonicalise(add_scored_views(finite))
     reference = Reference(RENDERS, (), tuple(range(len(judged))), placed=True)
     return Prepared(scene, draw_pictures(judged), frame, reference, (), moved=False, unseen=finite.gaussians[:0])
 

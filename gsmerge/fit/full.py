@@ -107,7 +107,7 @@ def start_fit(gaussians: Gaussians, run: FitRun, survey: Survey | None, fixed: n
 
 def score_fit(fit: FullFit) -> None:
     """Score a fit on held-out patches, unless it is scored already or none are held out."""
-    if fit.after is None and fit.run.job.options.judged:
+    if fit.after is None and fit.run.job.options.scored:
         fit.after = score_state(fit.state, fit.run, fit.half)
 
 

@@ -62,7 +62,7 @@ class FitJob:
     progress: Progress | None = None  # Called after each step
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
     # Number of the first photos that the result is scored on, where renders stand for photos; None: all photos
-    num_judged: int | None = None
+    num_scored: int | None = None
     outside: Outside | None = None  # Views from outside, in which some steps clear fog and veils; None: no such steps
     edges: Edges | None = None  # Edges of the views, at which Gaussians are cut; None: no cuts
     region: Region | None = None  # Region in which centres stay; None: everywhere
@@ -70,7 +70,7 @@ class FitJob:
     def scored_photos(self, size: int) -> Photos:
         """Return the photos that a result is scored on, at a size as of :class:`DrawMode`."""
         photos = self.photos[size]
-        return photos[range(len(photos))[: self.num_judged]]
+        return photos[range(len(photos))[: self.num_scored]]
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def prepare_fit(job: FitJob) -> FitRun:
     everywhere, *larger = (_weigh(_weights_of(level), level) for level in (photos[0], *photos[2:]))
     weights = trained = _weights_of(photos[1])
     first_pixels = None
-    if options.judged:
+    if options.scored:
         whole = training_weights(photos[0], options.holdout, job.seed)
         first_pixels = tuple((weight != 0) & (weight != HIDDEN) for weight in whole)
         weights = reduced(whole, photos[1])
@@ -213,7 +213,7 @@ class Schedule:
             self.views_left = self.rng.permutation(len(self.run.job.photos[0])).tolist()
         view, background, mask = self.views_left.pop(), self.rng.random(3, dtype=np.float32), None
         job = self.run.job
-        if job.num_judged is not None and job.photos[0].empty is None:  # renders are black where the scene is empty
+        if job.num_scored is not None and job.photos[0].empty is None:  # renders are black where the scene is empty
             background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
             mask = self.rng.random(count, dtype=np.float32) >= self.run.dropout

@@ -35,11 +35,11 @@ def fit_scene(
     options: FitOptions,
     seed: int,
     *,
-    num_judged: int | None = None,
+    num_scored: int | None = None,
 ) -> Fitted:
     """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene, if a fit is asked for.
 
-    ``num_judged`` is the number of the first views that the result is scored on, where renders stand for photos. None:
+    ``num_scored`` is the number of the first views that the result is scored on, where renders stand for photos. None:
     there are photos, and it is scored on all.
     """
     if options.fit == "none":
@@ -49,7 +49,7 @@ def fit_scene(
         choose(start_count=len(decoded.gaussians))
         if decoded.exact and not options.grows:  # then no Gaussian is dropped either
             options = replace(options, min_contribution=0.0)
-        job = FitJob(photos, options, decoded.count, seed, report_steps, decoded.fixed, num_judged)
+        job = FitJob(photos, options, decoded.count, seed, report_steps, decoded.fixed, num_scored)
         outside = place_outside_views(scene, decoded.gaussians, job.scored_photos(1), options)
         edges = None if options.beyond else find_edges(scene.cameras, decoded.count)
         job = replace(job, outside=outside, edges=edges, region=scene.region)
@@ -88,7 +88,7 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
     if report.accepted:
         assert report.origins is not None
         return fitted, replace(report, origins=rows[report.origins])
-    if not options.judged:
+    if not options.scored:
         return start, replace(report, origins=rows)
     if options.grows:  # the stages before left room for a growth that did not happen
         state = grow_to(start_state(start), job.photos[1], job.count)

@@ -117,7 +117,7 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
 def score_images(images: Sequence[np.ndarray], run: FitRun, half: Photos) -> float:
     """Return the PSNR (dB) of renders of the :func:`scored_views` on held-out patches; NaN if none are held out."""
     options, views = run.job.options, scored_views(len(half))
-    if not options.judged:
+    if not options.scored:
         return float("nan")
     return holdout_psnr(images, half[views], [run.weights[view] for view in views], options.tuning.min_gain)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,14 +28,11 @@ from gsmerge.networks.tokens import (
     sample_members,
     split_tables,
 )
-from gsmerge.networks.weights import NetworkWeights
+from gsmerge.networks.weights import RunnableNetworks
 from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
-
-if TYPE_CHECKING:
-    from gsmerge.research.training.modules import Networks
 
 # What a Feature Gaussian says of itself; its members, their weights and its view are those of its cluster.
 OWN = (*CORRECTED, "gains", "shN", "footprints")
@@ -46,7 +43,7 @@ RunTable = Callable[[np.ndarray, int], Array]  # rows and width of a table -> [r
 class NetworkContext(Corrector):
     """Networks, with the inputs that they read besides Feature Gaussians."""
 
-    networks: NetworkWeights | Networks  # encoder, merger, refiner and decoder heads; the modules of training
+    networks: RunnableNetworks  # encoder, merger, refiner and decoder heads
     members: Members  # the scene's Gaussians
     cameras: Cameras  # its views
     seed: int = 0  # chooses the members of groups that are too large to read whole

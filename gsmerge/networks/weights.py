@@ -10,13 +10,30 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
+from gsmerge.arrays import Array
 from gsmerge.kernels.networks.layers import GELU, PLAIN, TANH, attend, dense, normalise, pack, padded, scratch_size
 from gsmerge.networks.options import NetworkOptions
 
 Layer = tuple[np.ndarray, np.ndarray, int]  # packed weights, packed bias, outputs
+
+
+class RunnableNetworks(Protocol):
+    """Networks as the stages use them: a checkpoint's :class:`NetworkWeights`, or the torch modules of training."""
+
+    @property
+    def options(self) -> NetworkOptions:
+        """Options of the networks."""
+
+    @property
+    def in_parallel(self) -> bool:
+        """Whether tables of groups may run in several threads."""
+
+    def run(self, name: str, *inputs: Any) -> Array:
+        """Run one of the networks on a table of groups, see :meth:`NetworkWeights.run`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,8 +80,8 @@ def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
 
     The mean over channels and over the windows that lie wholly inside the image, as scikit-image's
     ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
-    channel_axis=-1, data_range=1)`` computes it. For measuring only; the loss of the full fit and
-    of training has a definition of its own, :func:`gsmerge.fit.loss.loss_ssim`.
+    channel_axis=-1, data_range=1)`` computes it. For measuring only; the losses of the full fit
+    and of training use uniform windows, see :mod:`gsmerge.kernels.raster.image_loss`.
 
     Images are ``[h,w,c]`` with at most 4 channels; ``mask [h,w]``: centres of the windows that
     count, which also contain the pixels around. Raises ValueError if the shapes differ, the image

@@ -20,8 +20,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene
 
 if TYPE_CHECKING:
-    from gsmerge.networks.weights import NetworkWeights
-    from gsmerge.research.training.modules import Networks
+    from gsmerge.networks.weights import RunnableNetworks
 
 # Factors on the optical depth of groups that other views see through: those at whose place no other view has its
 # surface, and those of which fewer views have it there than see through it
@@ -29,9 +28,7 @@ ALONE, DISPUTED = 0.15, 0.39
 ASKED = 64  # views, the nearest, that say so: a vote that more of them hardly change
 
 
-def make_corrector(
-    networks: NetworkWeights | Networks | None, members: Members, cameras: Cameras, seed: int
-) -> Corrector:
+def make_corrector(networks: RunnableNetworks | None, members: Members, cameras: Cameras, seed: int) -> Corrector:
     """Bundle networks with the facts about a scene that they read; without networks nothing is corrected."""
     if networks is None:
         return ANALYTIC

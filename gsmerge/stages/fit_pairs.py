@@ -49,7 +49,7 @@ def unfitted(start: Decoded, prepared: Prepared) -> Fitted:
 def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
     """Fit a start to renders of the scene's own views, and in a long fit to renders from around them."""
     scene = prepared.scene_around if options.grows else prepared.scene
-    fitted = fit_scene(start, scene, range(len(scene)), options, seed, num_judged=len(prepared.scene))
+    fitted = fit_scene(start, scene, range(len(scene)), options, seed, num_scored=len(prepared.scene))
     accepted = fitted.report is not None and fitted.report.accepted
     gaussians = fitted.gaussians if accepted else start.gaussians
     return replace(fitted, gaussians=gaussians, cameras=prepared.scene.cameras)
@@ -64,7 +64,7 @@ def fit_to_placed(starts: Sequence[Decoded], best: int, prepared: Prepared, opti
     """
     scene = prepared.scene_placed(placed_views(options.steps))
     placed = range(len(prepared.scene), len(scene))
-    fits = [fit_scene(start, scene, placed, options, seed, num_judged=len(placed)) for start in starts]
+    fits = [fit_scene(start, scene, placed, options, seed, num_scored=len(placed)) for start in starts]
     accepted = [fit.report is not None and fit.report.accepted for fit in fits]
     after = [score_views(fit.gaussians, prepared) for fit in fits]
     if any(accepted):

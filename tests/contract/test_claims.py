@@ -135,8 +135,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         " the Gaussians",
         f"If they confirm less than {part(confirm_depths.POOR)} of it, the result will be poor",
         f"shows its photos more than {metrics.MAX_LOSS:g} dB worse than the input".replace(" 0.", " ."),
-        f"They show the photos at most {plan.KEPT_LOSS:g} dB worse than it does",
-        f"at least {plan.KEPT_PSNR:g} dB against the input's",
+        f"They show the photos at most {plan.FIDELITY_LOSS:g} dB worse than it does",
+        f"at least {plan.FIDELITY_PSNR:g} dB against the input's",
         f"moved by up to {cameras_off.MAX_PX:g} pixels",
         f"With more than {word(plan.USUAL_VIEWS)} views the fit takes more steps. Scenes of more than"
         f" {million(plan.WHOLE_GAUSSIANS)} Gaussians or {plan.WHOLE_VIEWS} views are compacted in blocks",
@@ -218,7 +218,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"null if it covers {percent(photos.WHOLE)} or more",
         f"less than {metrics.POOR:g} dB from its input",
         f"(at most {metrics.MAX_PSNR:g}, for equal pictures)",
-        f"`psnr_kept` ({plan.KEPT_PSNR:g}) or `loss_kept` ({plan.KEPT_LOSS:g})",
+        f"`psnr_kept` ({plan.FIDELITY_PSNR:g}) or `loss_kept` ({plan.FIDELITY_LOSS:g})",
     ),
     "SECURITY.md": (
         f"{bounds._FREE_MEMORY / 1e6:g} MB + {bounds._MEMORY_PER_BYTE} x its bytes of memory",

@@ -18,7 +18,7 @@ from sweeps import sweep
 import gsmerge
 from gsmerge import read_scene
 from gsmerge.compaction.search import MAX_RUNS
-from gsmerge.plan import KEPT_LOSS
+from gsmerge.plan import FIDELITY_LOSS
 from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run
@@ -87,7 +87,7 @@ def test_a_result_compacted_again_shows_the_photos_as_it_did(
     psnr = document["psnr_input_views"]
     assert psnr["after"] > psnr["before"] - MAX_LOSS
     planned = run("compact", small, "--images", images, "--dry-run", code=0).out
-    assert f"within {KEPT_LOSS:g} dB of the input" in " ".join(planned.split())
+    assert f"within {FIDELITY_LOSS:g} dB of the input" in " ".join(planned.split())
 
 
 @pytest.mark.slow

@@ -27,8 +27,8 @@ from gsmerge.frame import canonicalise
 from gsmerge.networks.checkpoint import IN_PACKAGE
 from gsmerge.plan import (
     EFFORTS,
-    KEPT_LOSS,
-    KEPT_PSNR,
+    FIDELITY_LOSS,
+    FIDELITY_PSNR,
     Plan,
     choose_for_scene,
     choose_networks,
@@ -192,9 +192,9 @@ def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason:
 def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     kept = plan_of(rows, **settings)
-    assert (kept.target_psnr, kept.keeps_input) == (KEPT_PSNR, True)
+    assert (kept.target_psnr, kept.keeps_fidelity) == (FIDELITY_PSNR, True)
     assert len(kept.scored_views) == len(rows)
-    assert estimate(rows, options_of(**settings))["psnr_kept"] == KEPT_PSNR
+    assert estimate(rows, options_of(**settings))["psnr_kept"] == FIDELITY_PSNR
     assert estimate(rows, options_of(**settings))["fit"] == "full"  # to the renders, as the run does
 
 
@@ -203,16 +203,16 @@ def test_what_asks_for_a_count_decides_it(settings: dict[str, Any], scene: Scene
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     assert plan_of(rows, **settings).target_psnr == (20 if "quality" in settings else None)
     for known in (rows, unaligned_scenes.without_order(scene)):
-        assert not plan_of(known, **settings).keeps_input
+        assert not plan_of(known, **settings).keeps_fidelity
     for known in (scene, replace(scene, images=None)):
-        assert not plan_of(known).keeps_input
+        assert not plan_of(known).keeps_fidelity
 
 
 def test_photos_of_another_scene_decide_no_count(scene: Scene) -> None:
     noise = np.random.default_rng(0).random(scene.images.shape, np.float32)
     rows = unaligned_scenes.without_order(replace(scene, images=noise))
     plan, prepared = plan_of(rows), prepare(rows, options_of().prepare)
-    assert (plan.keeps_input, plan.target_psnr) == (True, KEPT_PSNR)  # of renders
+    assert (plan.keeps_fidelity, plan.target_psnr) == (True, FIDELITY_PSNR)  # of renders
     assert add_target(plan, prepared) is plan
     report = compact(rows, threads=1).report
     assert (report.choices["fidelity"]["views"], report.worse) == (len(rows), None)
@@ -223,14 +223,14 @@ def test_photos_decide_the_count_where_rows_are_fewer_than_pixels(scene: Scene) 
     rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), 3))  # fewer than half of the pixels
     rows = replace(rows, gaussians=replace(rows.gaussians, scales=2 * rows.gaussians.scales))
     prepared, plan = prepare(rows, options_of().prepare), plan_of(rows)
-    assert (plan.keeps_input, plan.target_psnr, len(plan.scored_views)) == (True, None, len(rows))
+    assert (plan.keeps_fidelity, plan.target_psnr, len(plan.scored_views)) == (True, None, len(rows))
     known = add_target(plan, prepared)
-    assert known.target_psnr == pytest.approx(psnr_of(rows.gaussians, prepared.input_scene) - KEPT_LOSS, abs=0.05)
+    assert known.target_psnr == pytest.approx(psnr_of(rows.gaussians, prepared.input_scene) - FIDELITY_LOSS, abs=0.05)
     assert add_target(known, prepared) is known
     estimated = estimate(rows, options_of())
-    assert (estimated["psnr_kept"], estimated["loss_kept"]) == (None, KEPT_LOSS)
-    assert not plan_of(rows, budget="auto").keeps_input  # the photos' own curve decides
-    assert not plan_of(unaligned_scenes.without_order(scene)).keeps_input  # a share is enough of as many as pixels
+    assert (estimated["psnr_kept"], estimated["loss_kept"]) == (None, FIDELITY_LOSS)
+    assert not plan_of(rows, budget="auto").keeps_fidelity  # the photos' own curve decides
+    assert not plan_of(unaligned_scenes.without_order(scene)).keeps_fidelity  # a share is enough of as many as pixels
 
 
 def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) -> None:
@@ -241,11 +241,11 @@ def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) ->
     prepared = prepare(rows, options_of().prepare)
     plan = add_target(plan_of(rows), prepared)
     assert plan.before is not None
-    assert plan.target_psnr == plan.before.covered_psnr - KEPT_LOSS > plan.before.psnr
+    assert plan.target_psnr == plan.before.covered_psnr - FIDELITY_LOSS > plan.before.psnr
     given = prepared.frame.enter(rows.gaussians)  # without those that fill the holes
     again = score(None, Fitted(given, prepared.scene.cameras, None), prepared, plan)
     assert again.psnr == pytest.approx(plan.before.psnr, abs=0.01)
-    assert again.kept_psnr == pytest.approx(plan.before.covered_psnr, abs=0.01)
+    assert again.deciding_psnr == pytest.approx(plan.before.covered_psnr, abs=0.01)
 
 
 def test_sky_stays_where_no_photo_is_used(scene: Scene) -> None:

@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsmerge.fit.loss import loss_ssim
 from gsmerge.measure.lpips import EPSILON, SCALE, SHIFT, Layer, min_size, read_layers
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
 from gsmerge.pooling import Members, pool_members, to_gaussians
 from gsmerge.raster.autograd import render_tensors
 from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.research.training.loss_ssim import loss_ssim
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, decode_crop, predict, refine_crop
 from gsmerge.research.training.train_options import TrainOptions

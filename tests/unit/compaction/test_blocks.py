@@ -175,7 +175,7 @@ def test_what_is_fixed_stays(scene: Scene) -> None:
     canonical, _ = canonicalise(scene)
     start = compact(scene, fit="none", **{**SETTINGS, "superpixels": "5%"}).gaussians
     fixed = np.arange(len(start)) % 2 == 0
-    settings = FitOptions(fit_steps=20, judged=False, min_contribution=0.0)
+    settings = FitOptions(fit_steps=20, scored=False, min_contribution=0.0)
     photos = fit_photos(PicturedScene.with_pictures(canonical, scene.images, None), settings)
     frame_start = replace(start, means=start.means.astype(np.float32))
     fitted, report = fit(frame_start, FitJob(photos, settings, len(start), fixed=fixed))

@@ -31,7 +31,7 @@ from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.fit import FitOptions
 from gsmerge.kernels import elementary
 from gsmerge.pipeline import Build
-from gsmerge.plan import KEPT_LOSS, Plan
+from gsmerge.plan import FIDELITY_LOSS, Plan
 from gsmerge.settings.budget import DEVICES, BudgetOptions, parse_share, share_text
 
 
@@ -50,13 +50,13 @@ def make_plan(
     default: int | None = None,
     levels: int = 1,
     *,
-    keeps_input: bool = False,
+    keeps_fidelity: bool = False,
 ) -> Plan:
     """What a search reads of a plan."""
     limits = SimpleNamespace(
         min_count=least, max_count=most, default=most if default is None else default, num_input=most
     )
-    kept = {"keeps_input": keeps_input, "auto_count": False, "max_drop": None, "fit": FitOptions(fit="none")}
+    kept = {"keeps_fidelity": keeps_fidelity, "auto_count": False, "max_drop": None, "fit": FitOptions(fit="none")}
     return cast("Plan", SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels, **kept))
 
 
@@ -182,7 +182,7 @@ def search(curve: Callable[[int], float], target: float, start: int, least: int,
 
 def built(count: int | None, psnr: float) -> Any:
     record = SimpleNamespace(seconds={})
-    return SimpleNamespace(count=count, psnr=psnr, kept_psnr=psnr, gaussians=range(count or 0), record=record)
+    return SimpleNamespace(count=count, psnr=psnr, deciding_psnr=psnr, gaussians=range(count or 0), record=record)
 
 
 @pytest.mark.parametrize("start", [10, 300, 1000, 4000, 90_000])
@@ -230,7 +230,7 @@ def test_search_begins_within_its_limits(default: int, first: int) -> None:
 
 def keep(curve: Callable[[int], float], default: int, most: int, *, rendered: bool = True) -> CountSearch:
     """Run the search that keeps the input by default: 32.5 dB of its renders, or of photos."""
-    plan = make_plan(target_psnr=32.5, most=most, default=default, keeps_input=True)
+    plan = make_plan(target_psnr=32.5, most=most, default=default, keeps_fidelity=True)
     counts = CountSearch(plan, default, rendered)
     counts.run(lambda count: built(count, curve(count)))
     return counts
@@ -265,7 +265,7 @@ def test_more_are_taken_until_photos_are_shown_as_well(slope: float, needed: flo
     """Beyond the four times the usual count that a quality may take."""
     actual = keep(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 40_000, rendered=False)
     assert actual.met
-    assert actual.best.count <= 1000 * needed * 2 ** (KEPT_LOSS / slope) * CLOSE
+    assert actual.best.count <= 1000 * needed * 2 ** (FIDELITY_LOSS / slope) * CLOSE
     assert len(actual.tried) <= 5
     assert noted(actual.notes, f"{actual.best.count:,} of 40,000", "at most 0.3 dB worse than the input")
 

@@ -11,7 +11,7 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
-from gsmerge.facts.place_cameras import JUDGES, place_viewpoints
+from gsmerge.facts.place_cameras import MAX_SCORED, place_viewpoints
 from gsmerge.facts.prepare import Prepared, prepare_alone
 from gsmerge.geometry import project
 from gsmerge.plan import stands_alone
@@ -33,7 +33,7 @@ def test_views_show_the_input_and_nothing_is_fitted_to_them(prepared: Prepared) 
     scene, reference = prepared.scene, prepared.reference
     assert (reference.placed, reference.fit_views) == (True, ())
     assert reference.score_views == tuple(range(len(scene)))
-    assert 1 <= len(scene) <= JUDGES
+    assert 1 <= len(scene) <= MAX_SCORED
     np.testing.assert_array_equal(scene.images, render(scene.gaussians, scene.cameras).images.clip(0, 1))
     assert scene.images.std() > 0.05
 

@@ -74,7 +74,7 @@ def test_no_stroke_is_left_of_what_photos_show(truth: Gaussians, photos: Pair) -
     scales[rows] = scales[rows].mean() * np.array([12, 1, 0.5], np.float32)
     start, left = replace(truth, scales=scales), []
     for most in (3.0, np.inf):
-        options = replace(LONG, judged=False)
+        options = replace(LONG, scored=False)
         run = scenes.run_for(photos, scenes.tuned(options, max_ratio=most, long_share=0.1, max_scale_change=0.7))
         survey = survey_photos(start, run)
         result, report = fit_full(start, run)
@@ -210,7 +210,7 @@ def test_views_take_turns_and_dropout_follows_the_growth(
 ) -> None:
     """Every view once before any again; the steps after the growth drop out of all Gaussians."""
     start, taken = scenes.spoil(truth), list[Step]()
-    run = scenes.run_for(photos, FitOptions(fit_steps=320, judged=False), len(start) + 20, seed=3)
+    run = scenes.run_for(photos, FitOptions(fit_steps=320, scored=False), len(start) + 20, seed=3)
     monkeypatch.setattr(Optimiser, "step", lambda self, state, step: taken.append(step) or 0.0)
     assert len(fit_full(start, run)[0]) == len(start) + 20
     assert run.dropout == DROPOUT > 0
@@ -355,7 +355,7 @@ def test_whole_photos_have_a_mean_of_their_own(truth: Gaussians, photos: Pair, m
     """Before them a mean over fewer pixels may be another one."""
     monkeypatch.setattr(Optimiser, "step", lambda self, state, step: 0.01 if step.mode.stride > 1 else 0.1)
     calls: list[tuple[int, int, float, bool]] = []
-    options = FitOptions(fit_steps=30, half_res_share=0.5, judged=False)
+    options = FitOptions(fit_steps=30, half_res_share=0.5, scored=False)
     fit_full(scenes.spoil(truth), scenes.run_for(photos, options, progress=lambda *call: calls.append(call)))
     assert {call[3] for call in calls} == {0.5}
     assert {round(call[2]) for call in calls[:15]} == {20}

@@ -1,7 +1,8 @@
-"""Structural similarity as the full fit and the training of networks use it.
+"""Structural similarity in the loss of training, by the formula that the full fit uses.
 
-It has uniform windows, which are quick to differentiate, so its values differ from the measured ones of
-:func:`gsmerge.raster.metrics.ssim`. The gradient of the fit's whole loss is in ``gsmerge/kernels/raster/image_loss``.
+The windows are uniform, which makes the gradient quick. So the values differ from those of
+:func:`gsmerge.raster.metrics.ssim`, which measures. The full fit takes its loss and gradient from
+``gsmerge/kernels/raster/image_loss``.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ LOSS_WINDOW = SIDE  # pixels per side of the windows of loss_ssim
 
 
 def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
-    """Compute the structural similarity ``[h,w,3]`` around every pixel, differentiable.
+    """Compute the structural similarity ``[h,w,3]`` around every pixel; torch can differentiate it.
 
-    Windows are uniform, of ``LOSS_WINDOW`` pixels per side, and zero beyond the border. Covariances are those of the
-    population; K1 = .01, K2 = .03.
+    Windows are uniform and have ``LOSS_WINDOW`` pixels per side; pixels beyond the border are zero. Covariances are
+    those of the population; K1 = .01, K2 = .03.
     """
     import torch
     from torch.nn.functional import avg_pool2d
