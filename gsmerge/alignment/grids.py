@@ -209,7 +209,7 @@ def square_sizes(size: Size) -> list[PhotoTransform]:
 
 
 def _half_sizes(size: Size) -> Iterator[Size]:
-    """Yield the sizes at which Lyra 2 writes Gaussians: half the photos', or half of these as multiples of 14."""
+    """Yield the sizes at which Lyra 2 writes Gaussians: half of each side, maybe rounded to a multiple of 14 first."""
     yield from product(*({side // 2, PATCH * round(side / PATCH) // 2} - {0} for side in size))
 
 

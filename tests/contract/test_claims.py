@@ -149,7 +149,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
     ),
     EVALUATE: (
         f"of the {word(error_maps.NEIGHBORS)} nearest",
-        f"yellow is {error_maps.MOST:g} of the range or more",
+        f"yellow is {error_maps.MAX_ERROR:g} of the range or more",
         f"They start from {word(fog.VIEWS)} input views",
         f"have at most {fog.SIDE} pixels on the longer side",
         f"its opacity is below {fog.EMPTY:g} in the whole square of {fog.MARGIN} x {fog.MARGIN} pixels around",
