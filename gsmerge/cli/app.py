@@ -92,8 +92,10 @@ def make_app(only: str | None = None) -> typer.Typer:
             except UsageError as error:  # one broken package must not disable the other commands
                 say(str(error), kind="warning")
                 continue
-            group, panel = (lab, None) if in_lab else (made, PLUGIN_PANEL)
-            group.command(name, cls=Command, rich_help_panel=panel)(function)
+            if in_lab:
+                lab.command(name, cls=Command)(function)
+            else:
+                made.command(name, cls=Command, rich_help_panel=PLUGIN_PANEL)(function)
     if only in (None, LAB):
         made.add_typer(lab, name=LAB, rich_help_panel="Research")
     return made
