@@ -1,8 +1,8 @@
-"""Canonical frame of a scene, in which all arithmetic runs.
+"""Move scenes into and out of their canonical frame, in which all computations run.
 
-It has its origin at the scene's middle and the median depth as its unit, so that float32 keeps its precision far from
-the world's origin and thresholds (near plane, floors) mean the same at every scale. The unit is a power of two: scaling
-there and back changes no bit.
+The origin of the frame is the middle of the scene, and its unit is about the median depth. So float32 is precise also
+far from the world's origin, and thresholds (near plane, least scales) have the same meaning at every scale. The unit is
+a power of two, so scaling into the frame and back changes no bit.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gsmerge.types import Cameras, Gaussians, Scene, SceneT
 
 SAMPLE_GAUSSIANS = 65536  # Gaussians that the frame is measured on
 ROWS = 65536  # Gaussians per task
-MAX_VIEWS = 32  # that the unit is taken from, where they have no Gaussians of their own
+MAX_VIEWS = 32  # views that the unit is measured in, if views have no Gaussians of their own
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Frame:
     """Canonical frame: x_canonical = (x_world - origin) / unit."""
 
     origin: np.ndarray  # [3] float64, world units
-    unit: float  # Length of the canonical unit in world units, a power of two
+    unit: float  # length of the canonical unit in world units, a power of two
 
     def enter(self, gaussians: Gaussians) -> Gaussians:
         """Move Gaussians from the world into the frame; means in float32."""
@@ -35,7 +35,7 @@ class Frame:
 
         def fill(first: int) -> None:
             rows = slice(first, first + ROWS)
-            for axis, start in enumerate(self.origin):  # axis by axis NumPy takes half the time
+            for axis, start in enumerate(self.origin):  # one axis at a time takes NumPy half the time
                 means[rows, axis] = (gaussians.means[rows, axis] - start) / self.unit
             np.divide(gaussians.scales[rows], self.unit, out=scales[rows])
 
@@ -62,7 +62,10 @@ class Frame:
 
 
 def scene_frame(scene: Scene) -> Frame:
-    """Choose the canonical frame: median mean (float64) and median depth; ValueError without Gaussians or views."""
+    """Choose the canonical frame: its origin is the median mean, its unit the power of two nearest the median depth.
+
+    Raises ValueError without Gaussians or views.
+    """
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
     means = scene.gaussians.means[sample_rows(scene)].astype(np.float64)
@@ -87,7 +90,7 @@ def scene_depth(scene: Scene) -> float:
 
 
 def sample_rows(scene: Scene) -> np.ndarray:
-    """Choose evenly spread rows; raise ValueError if there is none."""
+    """Sample rows at equal steps; raise ValueError without Gaussians."""
     count = len(scene.gaussians)
     if count == 0:
         raise ValueError("expected at least one Gaussian, got none")

@@ -1,4 +1,4 @@
-"""Pool sets of Gaussians into single ones with the same moments, and turn moments back into Gaussians."""
+"""Pool groups of Gaussians into moments, and convert moments back into Gaussians."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from gsmerge.types import FeatureGaussians, Gaussians, Pixels, Scene
 Rule = Literal["depth", "paper"]
 
 MIN_SCALE = 1e-12
-MAX_OPACITY = 0.999  # of a merged Gaussian: finite as a logit, and still differentiable for a later fit
-ROWS_PER_TASK = 4096
+MAX_OPACITY = 0.999  # of a merged Gaussian, so that its logit is finite and a later fit can still change it
+ROWS_PER_TASK = 4096  # groups that one task pools
 ROWS = 65536  # Gaussians whose footprints one task computes
 
 
@@ -31,7 +31,7 @@ class Members:
     scales: np.ndarray  # [n,3]
     opacities: np.ndarray  # [n]
     sh0: np.ndarray  # [n,1,3]
-    shN: np.ndarray  # [n,k-1,3], separate: most of a scene of degree 4, read by pooling alone
+    shN: np.ndarray  # [n,k-1,3], separate because they are most of a scene of degree 4 and only pooling reads them
     footprints: np.ndarray  # [n] size of the own view's pixel at the member's depth, world units
     pixels: np.ndarray  # [n] int, the pixel (view-major, row-major over all views) of each member, -1 for none
     fronts: np.ndarray  # [v,h,w] int32, the member that each pixel shows, -1 for none
@@ -42,7 +42,11 @@ def _array(values: np.ndarray) -> np.ndarray:
 
 
 def scene_members(scene: Scene) -> Members:
-    """Return the Gaussians of a canonical scene with pixels as members, with footprints in the views of these."""
+    """Return the Gaussians of a canonical scene with pixels as members.
+
+    Footprints are measured in the view of each Gaussian's pixel, or for Gaussians without a pixel in the view with the
+    smallest footprint.
+    """
     g, cameras, homes = scene.gaussians, scene.cameras, scene.get_pixels().homes
     means, footprints = _array(g.means), np.empty(len(g), np.float32)
     viewmats, Ks = cameras.viewmats.astype(np.float32), cameras.Ks
@@ -65,7 +69,7 @@ def scene_members(scene: Scene) -> Members:
 
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray) -> Members:
-    """Return Gaussians that no view shows as members, with the given footprints ``[n]``."""
+    """Return Gaussians without pixels as members, with the given footprints ``[n]``."""
     nowhere = np.full(len(g), -1, np.int32), np.zeros((0, 1, 1), np.int32)
     return _make_members(g, footprints, Pixels(*nowhere, own=False))
 
@@ -77,28 +81,24 @@ def _make_members(g: Gaussians, footprints: np.ndarray, pixels: Pixels) -> Membe
 
 @dataclass(frozen=True)
 class Moments:
-    """Pooled moments of g groups, float64 except for float32 sh.
+    """Pooled moments of g groups, float64 except for float32 ``sh``; see :class:`FeatureGaussians`."""
 
-    ``means [g,3]``, ``covars [g,3,3]``, ``weights``, ``masses``, ``extinctions``, ``footprints
-    [g]`` and ``sh [g,k,3]``, see :class:`FeatureGaussians`.
-    """
-
-    means: np.ndarray
-    covars: np.ndarray
-    weights: np.ndarray
-    masses: np.ndarray
-    extinctions: np.ndarray
-    footprints: np.ndarray
-    sh: np.ndarray
+    means: np.ndarray  # [g,3]
+    covars: np.ndarray  # [g,3,3]
+    weights: np.ndarray  # [g]
+    masses: np.ndarray  # [g]
+    extinctions: np.ndarray  # [g]
+    footprints: np.ndarray  # [g]
+    sh: np.ndarray  # [g,k,3]
 
 
 def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Rule = "depth") -> Moments:
     """Pool every group of members into moments, weighted by opacity.
 
-    ``ids [m]`` int32 are rows of ``members``, ``starts [g+1]`` int64 point into them. With the ``rule`` ``"depth"`` the
-    members' own covariances are added to the spread of their means, and their integrated optical depths are summed.
-    ``"paper"`` is the paper's moment matching (eq. teacher_mean, teacher_cov); the paper states no opacity, so the mean
-    of the members is used.
+    ``ids [m]`` int32 are rows of ``members``, group after group. ``starts [g+1]`` int64 are the starts of the groups in
+    ``ids``. The ``rule`` ``"depth"`` adds the members' own covariances to the covariance of their means, and sums their
+    integrated optical depths. ``"paper"`` is the paper's moment matching (eq. teacher_mean, teacher_cov). The paper
+    states no opacity, so the mean opacity of the members is used.
     """
     num_groups = len(starts) - 1
     geometry = np.zeros((num_groups, 13))
@@ -122,7 +122,7 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
 
 
 def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return standard deviations ``[g,3]``, rising, and unit quaternions ``[g,4]`` of covariances ``[g,3,3]``."""
+    """Return standard deviations ``[g,3]``, ascending, and unit quaternions ``[g,4]`` of covariances ``[g,3,3]``."""
     covars = np.ascontiguousarray(covars, dtype=np.float64)
     scales, quats = np.empty((len(covars), 3)), np.empty((len(covars), 4))
 
@@ -135,7 +135,7 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:
-    """Convert moments to Gaussians; the opacity spreads the conserved optical depth over the Gaussian's disc."""
+    """Convert moments to Gaussians; the opacity follows from the optical depth spread over the Gaussian's disc."""
     scales, quats = principal_axes(covars)
     opacities = 1 - exp(-extinctions / (scales[:, 1] * scales[:, 2]))
     return Gaussians(

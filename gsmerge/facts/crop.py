@@ -10,8 +10,8 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.holes import usual_opacity
 from gsmerge.facts.views import take_rows
 from gsmerge.frame import canonicalise
-from gsmerge.geometry import lies_inside, rgb_to_sh0, turn_by
-from gsmerge.raster import render_in_turn
+from gsmerge.geometry import Region, rgb_to_sh0, turn_by
+from gsmerge.raster import render_in_batches
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import parse_crop
@@ -67,7 +67,7 @@ def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:
     with use_threads() as threads:
         return np.stack(
             list(
-                render_in_turn(
+                render_in_batches(
                     gaussians,
                     canonical.cameras,
                     at_once=threads,

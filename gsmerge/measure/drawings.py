@@ -35,7 +35,7 @@ from gsmerge.measure.clip import (
 )
 from gsmerge.measure.preview import Picture, contact_sheet, outside_pictures, save_picture, to_picture, view_pictures
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
-from gsmerge.raster import render, render_in_turn
+from gsmerge.raster import render, render_in_batches
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
@@ -147,7 +147,7 @@ class DrawnScenes:
             return ((picture,) for picture in _draw_layers(gaussians, cameras, options, near))
         settings: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
         drawn = (
-            render_in_turn(
+            render_in_batches(
                 gaussians,
                 cameras,
                 options.grey,

@@ -35,7 +35,7 @@ class _Render(torch.autograd.Function):
         drawn = draw_views(tile_one, (len(cameras), cameras.height, cameras.width), background, with_depths)
         ctx.views = tiled
         images, alphas = torch.from_numpy(drawn.images), torch.from_numpy(drawn.alphas)
-        # kept through autograd, so that it notices when one of them was overwritten in the meantime
+        # saved through autograd, so that it notices if one of them is overwritten before the backward pass
         ctx.save_for_backward(*tensors, images, alphas)
         if drawn.depths is None:
             return images, alphas
@@ -50,20 +50,27 @@ class _Render(torch.autograd.Function):
         lefts = 1 - alphas[..., 0]
         totals = [np.zeros(tensor.shape, np.float32) for tensor in tensors[:-1]]
         poses = np.zeros(tensors[-1].shape)
-        shade: ColorGradients | None = None
+        color_grads: ColorGradients | None = None
         for view, tiled in sorted(ctx.views.items()):
             image, left, grad_image, grad_alpha = (
                 np.ascontiguousarray(tensor.numpy())
                 for tensor in (images[view], lefts[view], grad_images[view], grad_alphas[view, ..., 0])
             )
-            colors, moves = view_colors(tiled), ctx.needs_input_grad[-1]
-            shape = gradients_of(tiled, colors, image, left, grad_image, -grad_alpha, moves)
-            shade = color_gradients(tiled, shape.colors, colors, used=shade)
-            rows = [shape.means + shade.means, shape.quats, shape.scales, shape.opacities, shade.sh0, shade.shN]
+            colors, with_pose = view_colors(tiled), ctx.needs_input_grad[-1]
+            shape = gradients_of(tiled, colors, image, left, grad_image, -grad_alpha, with_pose)
+            color_grads = color_gradients(tiled, shape.colors, colors, used=color_grads)
+            rows = [
+                shape.means + color_grads.means,
+                shape.quats,
+                shape.scales,
+                shape.opacities,
+                color_grads.sh0,
+                color_grads.shN,
+            ]
             for total, row in zip(totals, rows, strict=True):
                 add_rows(tiled.ids, row.reshape(len(row), total[:1].size), total.reshape(len(total), total[:1].size))
-            if moves:
-                poses[view] = pose_gradient(tiled, shape, shade)
+            if with_pose:
+                poses[view] = pose_gradient(tiled, shape, color_grads)
         gradients = [
             torch.from_numpy(total).to(tensor.dtype) if needed else None
             for total, tensor, needed in zip([*totals, poses], tensors, ctx.needs_input_grad[4:], strict=True)

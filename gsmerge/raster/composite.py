@@ -1,4 +1,4 @@
-"""Blending along tile lists, its transpose, and images of several views."""
+"""Blend Gaussians along tile lists, apply the transpose of blending, and draw several views."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from gsmerge.raster.tiled_view import Array, Splats, TiledView, make_splats, pie
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras, Gaussians
 
-TINY = 1e-6  # least opacity that depths are divided by
-SHOWN = 4  # views of a rendering that a notebook shows
+TINY = 1e-6  # least opacity that blended depths are divided by
+SHOWN = 4  # number of views that a notebook shows of a rendering
 
 
 def background_color(background: ArrayLike) -> Array:
@@ -59,7 +59,10 @@ def depth_colors(tiled: TiledView, farthest: float = np.inf) -> Array:
 
 
 def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Array]:
-    """Blend the mean of the depths ``[h,w]``, each at most ``farthest``, that a view sees, and the transmittance."""
+    """Blend the mean depth ``[h,w]`` of a view; also return the transmittance ``[h,w]``.
+
+    Depths of Gaussians are clipped at ``farthest``.
+    """
     blended, left = blend(tiled, depth_colors(tiled, farthest), np.zeros(3, np.float32))
     return blended[..., 0] / np.maximum(1 - left, np.float32(TINY)), left
 
@@ -67,9 +70,9 @@ def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Arr
 def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
     """Blend the Gaussians of a view front to back into an image.
 
-    ``colors [n,3]`` of all Gaussians may have any sign; None: their spherical harmonics seen from
-    this view, not below 0. ``background``: 1 or 3 numbers. Returns the image ``[h,w,3]`` and the
-    remaining transmittance ``[h,w]``, float32; raises ValueError for other shapes.
+    ``colors [n,3]`` of all Gaussians may have any sign. By default they are the spherical harmonics as seen from this
+    view, clipped at 0. ``background`` has 1 or 3 numbers. Returns the image ``[h,w,3]`` and the remaining transmittance
+    ``[h,w]``, float32. Raises ValueError for other shapes.
     """
     if colors is None:
         return blend(tiled, view_colors(tiled), background_color(background))
@@ -81,7 +84,7 @@ def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLi
 def splat_adjoint(tiled: TiledView, image: Array) -> Array:
     """Sum blending weight times ``image [h,w,c]`` over the pixels, for each Gaussian: ``[n,c]`` float32.
 
-    This is the transpose of :func:`composite` (without background) as a linear map from colours to images. Four
+    This map is the transpose of :func:`composite` (without background), which maps colours linearly to images. Four
     channels cost little more than one. Raises ValueError if the image has another size than the view.
     """
     if image.ndim != 3 or image.shape[:2] != (tiled.height, tiled.width):
@@ -101,7 +104,10 @@ def splat_adjoint(tiled: TiledView, image: Array) -> Array:
 
 
 def survey(tiled: TiledView, colors: Array | None = None) -> tuple[Array, Array, Array]:
-    """Return the image of :func:`composite` over black, and sums and maxima of :func:`contributions`, ``[m]`` each."""
+    """Return the image of :func:`composite` over black, and the sums and maxima ``[m]`` of :func:`contributions`.
+
+    ``colors [n,3]`` are as in :func:`composite`.
+    """
     drawn = view_colors(tiled) if colors is None else np.ascontiguousarray(colors.take(tiled.ids, 0), np.float32)
     image, totals = np.empty((tiled.height, tiled.width, 3), np.float32), np.zeros((len(tiled.ids), 2), np.float32)
     kernels.survey(*tiled.lists, drawn, image, totals)
@@ -109,7 +115,7 @@ def survey(tiled: TiledView, colors: Array | None = None) -> tuple[Array, Array,
 
 
 def contributions(tiled: TiledView) -> tuple[Array, Array]:
-    """Return the sum (pixels) and the maximum of each Gaussian's blending weights, ``[n]`` float32; 0 if unseen."""
+    """Return the sum (pixels) and the maximum ``[n]`` float32 of each Gaussian's blending weights; 0 if unseen."""
     totals = np.zeros((len(tiled.ids), 2), np.float32)
     kernels.contributions(*tiled.lists, tiled.height, tiled.width, totals)
     mass, peak = np.zeros((2, len(tiled.splats)), np.float32)
@@ -124,7 +130,7 @@ class Rendering:
     Args:
         images: ``[c,h,w,3]`` float32 over the background, not clamped at 1.
         alphas: ``[c,h,w,1]`` float32, 1 less the remaining transmittance.
-        depths: ``[c,h,w,1]`` float32 mean camera z of what was blended, 0 where nothing was; None if not asked for.
+        depths: ``[c,h,w,1]`` float32 mean camera z of the blended Gaussians, 0 without any; None if not requested.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -177,5 +183,5 @@ def draw_views(
         if depths is not None:
             depths[view, ..., 0] = blend_depths(tiled)[0]
 
-    parallel_map(one, range(shape[0]))  # of one view alone, the pieces share the pool
+    parallel_map(one, range(shape[0]))  # if there is a single view, its pieces use the pool
     return Rendering(images, alphas, depths)

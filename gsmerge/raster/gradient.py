@@ -1,4 +1,4 @@
-"""Gradients of a loss on the image of a view with respect to its Gaussians.
+"""Compute gradients of a loss on the image of a view with respect to its Gaussians.
 
 :func:`gsmerge.render` is differentiable with the same kernels. Results do not depend on the number of threads.
 """
@@ -17,23 +17,24 @@ from gsmerge.kernels.raster.project import BLOCK, POSE, SUMS, project_backward
 from gsmerge.raster.tiled_view import Array, TiledView, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
-WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another thread: they take longer than forward
+# Least number of intersections or Gaussians for another thread; less than in the forward pass, which is faster per item
+MIN_PER_THREAD = 1 << 12
 
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
     """Gradients of a loss with respect to the Gaussians of a view."""
 
-    ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
-    means: Array  # [m,3] float32, through geometry alone (colours seen from elsewhere: color_gradients)
-    quats: Array  # [m,4] float32, with respect to the quaternions as they are, of whatever length
+    ids: Array  # [m] int32, ascending: the Gaussians of the rows; all other Gaussians have a gradient of zero
+    means: Array  # [m,3] float32, through geometry only; see color_gradients for the part through the viewing direction
+    quats: Array  # [m,4] float32, with respect to the quaternions as stored, which may have any length
     scales: Array  # [m,3] float32, with respect to linear scales
     opacities: Array  # [m] float32
-    colors: Array  # [m,3] float32, with respect to the colours in this view, as they are blended
-    viewmat: Array | None  # [4,4] float64, last row 0; None if not asked for
+    colors: Array  # [m,3] float32, with respect to the colours that are blended in this view
+    viewmat: Array | None  # [4,4] float64, last row 0; None if not requested
 
     def __getitem__(self, rows: Array) -> Gradients:
-        """Return the gradients of the Gaussians ``rows`` (mask or indices); that of the view matrix stays."""
+        """Return the gradients of the Gaussians ``rows`` (mask or indices), with that of the whole view matrix."""
         names = ("ids", "means", "quats", "scales", "opacities", "colors")
         return replace(self, **{name: np.ascontiguousarray(getattr(self, name)[rows]) for name in names})
 
@@ -42,16 +43,16 @@ class Gradients:
 class ColorGradients:
     """Gradients of a loss through the colours of the Gaussians of a view."""
 
-    ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
+    ids: Array  # [m] int32, ascending: the Gaussians of the rows; all other Gaussians have a gradient of zero
     sh0: Array  # [m,1,3] float32
     shN: Array  # [m,k-1,3] float32
-    means: Array  # [m,3] float32, through the viewing direction alone
+    means: Array  # [m,3] float32, through the viewing direction only
 
 
 def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
-    """Return ranges of Gaussians, each of whole blocks of the kernels."""
+    """Split Gaussians into ranges for the threads; each range consists of whole blocks of the kernels."""
     num_blocks = -(-count // BLOCK)
-    num = max(1, min(threads, count // WORTH))
+    num = max(1, min(threads, count // MIN_PER_THREAD))
     edges = [BLOCK * (num_blocks * i // num) for i in range(num)] + [count]
     return list(pairwise(edges))
 
@@ -67,15 +68,15 @@ def gradients_of(
 ) -> Gradients:
     """Return the gradients of a loss on the image that :func:`gsmerge.raster.composite` made of a view.
 
-    All arrays are float32 and contiguous. ``grad_image [h,w,3]`` and ``grad_left [h,w]`` (None: zero) are those of the
-    loss by the image and by the transmittance; ``image [h,w,3]``, with its background, and ``transmittance [h,w]`` are
-    what ``composite`` returned, ``colors [m,3]`` those of the view's Gaussians. Gradients are zero where alpha is
-    clamped at 0.99, and through what decides which weights are drawn at all.
+    All arrays are float32 and contiguous. ``image [h,w,3]``, with its background, and ``transmittance [h,w]`` are the
+    results of ``composite``. ``colors [m,3]`` are the colours of the view's Gaussians. ``grad_image [h,w,3]`` and
+    ``grad_left [h,w]`` (None: zero) are the gradients of the loss with respect to image and transmittance. Where alpha
+    is clamped at 0.99 its gradient is zero. Thresholds that decide whether a Gaussian is drawn have no gradient.
     """
     m, splats = len(tiled.ids), tiled.splats
     slots = np.empty((len(tiled.flatten_ids), SUMS), np.float32)
     sums = np.zeros((m, SUMS), np.float32)
-    means, quats, scales, tints = (np.empty((m, size), np.float32) for size in (3, 4, 3, 3))
+    means, quats, scales, color_sums = (np.empty((m, size), np.float32) for size in (3, 4, 3, 3))
     opacities = np.empty(m, np.float32)
     num_blocks = -(-m // BLOCK)
     poses = np.empty((num_blocks, POSE), np.float32) if with_viewmat else None
@@ -89,13 +90,18 @@ def gradients_of(
             splats.means, splats.quats, splats.scales, tiled.opacities, tiled.ids, sums, tiled.camera, *span,
             means, quats, scales, opacities, poses,
         )  # fmt: skip
-        tints[slice(*span)] = sums[slice(*span), :3]
+        color_sums[slice(*span)] = sums[slice(*span), :3]
 
     with use_threads() as threads:
-        parallel_map(tiles, tile_ranges(tiled, threads, WORTH))
+        parallel_map(tiles, tile_ranges(tiled, threads, MIN_PER_THREAD))
         parallel_map(project, _blocks(m, threads))
-    viewmat = None if poses is None else viewmat_gradient(poses, splats.origin)
-    return Gradients(tiled.ids, means, quats, scales, opacities, tints, viewmat)
+    viewmat = None
+    if poses is not None:
+        pose = poses.sum(0, dtype=np.float64)
+        viewmat = np.zeros((4, 4))
+        viewmat[:3, 3] = pose[9:]
+        viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], splats.origin)
+    return Gradients(tiled.ids, means, quats, scales, opacities, color_sums, viewmat)
 
 
 def viewmat_gradient(poses: Array, origin: Array) -> Array:
@@ -114,10 +120,10 @@ def color_gradients(
 ) -> ColorGradients:
     """Return the gradients of a loss through the spherical harmonics of the Gaussians of a view.
 
-    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours; no
-    gradient passes where they are clipped at 0. ``used``: a result with as many coefficients that is no
-    longer needed, whose memory is reused if large enough, since new memory costs a quarter of the time or more. The
-    gradient of the eye is minus the sum of those of the means.
+    ``grad_colors [m,3]`` are :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours; no gradient passes
+    where they are clipped at 0. ``used`` is a result that is no longer needed. Its memory is reused if it has as many
+    coefficients and enough rows, since new memory costs a quarter of the time or more. The gradient of the eye is minus
+    the sum of the gradients of the means.
     """
     m, splats = len(tiled.ids), tiled.splats
     rest = splats.shN.shape[1:]
@@ -135,13 +141,16 @@ def color_gradients(
     return ColorGradients(tiled.ids, sh0, shN, means)
 
 
-def pose_gradient(tiled: TiledView, gradients: Gradients, shade: ColorGradients | None = None) -> Array:
-    """Return the gradient ``[4,4]`` float64 of the viewmat, through geometry and, with ``shade``, through colours."""
+def pose_gradient(tiled: TiledView, gradients: Gradients, color_grads: ColorGradients | None = None) -> Array:
+    """Return the gradient ``[4,4]`` float64 with respect to the view matrix.
+
+    It passes through the geometry and, if ``color_grads`` is given, through the colours.
+    """
     assert gradients.viewmat is not None
     viewmat = gradients.viewmat.copy()
-    if shade is not None:
+    if color_grads is not None:
         # the eye is -R^T t, and moves against the means
-        eye = -shade.means.sum(0, dtype=np.float64)
+        eye = -color_grads.means.sum(0, dtype=np.float64)
         viewmat[:3, :3] -= np.outer(tiled.viewmat[:3, 3], eye)
         viewmat[:3, 3] -= matmul(tiled.viewmat[:3, :3], eye)
     return viewmat

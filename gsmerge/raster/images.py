@@ -1,4 +1,4 @@
-"""Rendering of Gaussians into every camera, and what a scene's views see: weights, depths, tile lists."""
+"""Render Gaussians into every camera, and compute blending weights, depths and tile lists of a scene's views."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from gsmerge.raster.tiled_view import FAR_PLANE, TiledView, make_splats, tile_vi
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
-ONE_AT_A_TIME = 4_000_000  # Gaussians; a tiled view is as large as they are
-BAND_PIXELS = 1 << 22  # of a picture that are in memory as floating-point numbers; larger ones are drawn in bands
-MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
+ONE_AT_A_TIME = 4_000_000  # above so many Gaussians views are tiled one at a time, since a tiled view is as large
+BAND_PIXELS = 1 << 22  # pixels of an image that are in memory as floating-point numbers; larger images take bands
+MIN_ALPHA = 0.5  # least opacity of a pixel that counts when superpixels are merged
 
 
 def _needs_gradient(gaussians: Gaussians, cameras: Cameras) -> bool:
@@ -50,26 +50,26 @@ def render(
 ) -> Rendering:
     """Render Gaussians into every camera.
 
-    Arrays give arrays, tensors give tensors. The CPU renders: tensors on a GPU are copied to it, and
-    the results, and gradients, back.
+    Arrays give arrays, and tensors give tensors. Rendering runs on the CPU: tensors on a GPU are copied to the CPU, and
+    results and gradients are copied back.
 
-    Of tensors, images and alphas are differentiable with respect to the Gaussians and the view matrices;
-    depths and intrinsics are not. No gradient passes where alpha is clamped at 0.99 or a colour at 0.
+    For tensors, images and alphas are differentiable with respect to the Gaussians and the view matrices. Depths and
+    intrinsics have no gradient. No gradient passes where alpha is clamped at 0.99 or a colour at 0.
 
     Args:
         gaussians: n Gaussians, SH degrees 0 to 4.
-        cameras: c cameras; their intrinsics' skew is ignored.
-        background: What shines through, 1 or 3 numbers.
-        antialiased: Lower the opacity of small Gaussians by what the dilation adds to them.
+        cameras: c cameras; the skew of their intrinsics is ignored.
+        background: Colour behind the Gaussians, 1 or 3 numbers.
+        antialiased: Lower the opacity of small Gaussians to compensate for the dilation.
         near: Nearest depth drawn, world units, above 0.
         far: Farthest depth drawn.
         with_depths: Also render the mean depth.
 
     Returns:
-        Images, alphas and, if asked for, depths.
+        Images, alphas and, if requested, depths.
 
     Raises:
-        ValueError: If the background or the depth range makes no sense.
+        ValueError: If the background has another number of values, or if near and far are no valid range.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -80,10 +80,10 @@ def render(
     options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}
     values = (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)
     tensors = [value for value in values if not isinstance(value, np.ndarray)]
-    if tensors:  # torch is imported only for those who have tensors
+    if tensors:  # torch is imported only if there are tensors
         gaussians, cameras = gaussians.to("cpu"), cameras.to("cpu")
     if tensors and _needs_gradient(gaussians, cameras):
-        from gsmerge.raster.autograd import render_tensors  # only for those who train
+        from gsmerge.raster.autograd import render_tensors  # here because only training needs it
 
         drawn = render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
     else:
@@ -95,7 +95,7 @@ def render(
     return Rendering(*parts)
 
 
-def render_in_turn(
+def render_in_batches(
     gaussians: Gaussians,
     cameras: Cameras,
     background: float | Sequence[float] = 0.0,
@@ -105,16 +105,17 @@ def render_in_turn(
     convert: Callable[[np.ndarray], np.ndarray] = np.asarray,
     columns: Sequence[tuple[int, int]] | None = None,
 ) -> Iterator[np.ndarray]:
-    """Yield the images ``[h,w,3]`` of :func:`render`, bit for bit, each changed pixel by pixel by ``convert``.
+    """Yield the images ``[h,w,3]`` of :func:`render`, equal to the bit, each after ``convert``.
 
-    At most ``at_once`` images are in memory; large images are drawn and converted in bands. Of each image at least
-    its ``columns`` of pixels, first and last + 1, are drawn; the background is in the others.
+    At most ``at_once`` images are in memory. Large images are drawn and converted in bands, so ``convert`` has to work
+    pixel by pixel. ``columns`` are for each image the first and last + 1 column of pixels to draw; other tiles may have
+    the background only.
     """
     under = background_color(background)
     tile_one = _tiler(gaussians, cameras, {"near": near}, columns)
-    lines, tall = -(-cameras.height // TILE), max(1, BAND_PIXELS // (cameras.width * TILE))
-    if lines > tall:
-        bands = [(first, min(first + tall, lines)) for first in range(0, lines, tall)]
+    lines, band_lines = -(-cameras.height // TILE), max(1, BAND_PIXELS // (cameras.width * TILE))
+    if lines > band_lines:
+        bands = [(first, min(first + band_lines, lines)) for first in range(0, lines, band_lines)]
         for view in range(len(cameras)):
             parts = (tile_one(view, band) for band in bands)
             yield np.concatenate([convert(blend(part, view_colors(part), under)[0]) for part in parts])
@@ -128,7 +129,7 @@ def render_in_turn(
 def _tiler(
     gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any], columns: Sequence[tuple[int, int]] | None = None
 ) -> Callable[..., TiledView]:
-    """Prepare the Gaussians for cameras, and return what tiles each view by its number, or a band of it."""
+    """Prepare the Gaussians for cameras, and return a function that tiles a view, or a band of it, by its number."""
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
     spans = None if columns is None else [(left // TILE, -(-right // TILE)) for left, right in columns]  # of tiles
 
@@ -153,7 +154,7 @@ def seen_weights(scene: Scene) -> np.ndarray:
 
 
 def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Sequence[int] | None = None) -> None:
-    """Call ``use(view, tiled)`` with every view, or some ``views``, tiled, in parallel if memory allows."""
+    """Tile all views, or only ``views``, and call ``use(view, tiled)`` for each, in parallel if memory allows."""
     splats, cameras = make_splats(scene.gaussians), scene.cameras
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
@@ -176,7 +177,7 @@ def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def thin_out(gaussians: Gaussians, count: int) -> Gaussians:
-    """Return every k-th Gaussian, at most ``count``, enlarged so that the total area stays the same."""
+    """Sample every k-th Gaussian, at most ``count``, enlarged so that their total area is about that of all."""
     step = max(1, -(-len(gaussians) // count))
-    few = gaussians[::step]
-    return Gaussians(few.means, few.quats, few.scales * math.sqrt(step), few.opacities, few.sh0, few.shN)
+    some = gaussians[::step]
+    return Gaussians(some.means, some.quats, some.scales * math.sqrt(step), some.opacities, some.sh0, some.shN)

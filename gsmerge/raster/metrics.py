@@ -1,4 +1,4 @@
-"""Image metrics on sRGB values in [0, 1], of arrays or tensors."""
+"""Compute image metrics on sRGB values in [0, 1] of arrays or tensors, and describe them in messages."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from gsmerge.arrays import Array, as_array
 from gsmerge.kernels.elementary import log10
 from gsmerge.kernels.pictures import blur
 
-WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard deviation in pixels
-C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data range of 1
-MAX_LOSS = 0.5  # dB that a result may show its own photos worse than its input without a word about it
-WORSE = "worse than the input does"  # by which commands tell warnings from notes
-MAX_PSNR = 120.0  # dB of equal pictures, whose PSNR is infinite
-POOR = 30.0  # dB from its input below which the views of a result look different, where there are no photos
+WINDOW, SIGMA = 11, 1.5  # side of the windows of SSIM and their standard deviation, pixels
+C1, C2 = 0.01**2, 0.03**2  # stabilisers of SSIM (K1 = .01, K2 = .03) for a data range of 1
+MAX_LOSS = 0.5  # dB of PSNR that a result may lose against its input without a warning
+WORSE = "worse than the input does"  # words of the warning, by which commands tell it from notes
+MAX_PSNR = 120.0  # dB that replace the infinite PSNR of equal pictures
+POOR = 30.0  # dB of PSNR between the views of a result and its input, below which they look different
 
 
 def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
@@ -25,7 +25,7 @@ def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
 
 
 def pixel_mask(mask: Array, image: Array) -> Array:
-    """Convert a mask to ``[h,w]`` bool; raise ValueError if its shape differs from the image's or it is empty."""
+    """Convert a mask to ``[h,w]`` bool; raise ValueError if it is empty or has another size than the image."""
     chosen = as_array(mask).astype(bool)
     if chosen.ndim == 3 and chosen.shape[2] == 1:
         chosen = chosen[..., 0]
@@ -39,7 +39,7 @@ def pixel_mask(mask: Array, image: Array) -> Array:
 def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
     """Return the PSNR (dB) of images ``[h,w,c]`` in [0, 1], within ``mask [h,w]`` if given."""
     first, second = image_pair(image, reference)
-    if mask is not None:  # first, as float64 of a whole photo is more than all else that is known of it
+    if mask is not None:  # before the conversion, since a whole photo in float64 takes much memory
         chosen = pixel_mask(mask, first)
         first, second = first[chosen], second[chosen]
     errors = np.subtract(first, second, dtype=np.float64)
@@ -53,14 +53,14 @@ def decibels(error: float) -> float:
 
 
 def psnr_words(psnr: float) -> str:
-    """Write a PSNR (dB) for people: of equal pictures there is none."""
+    """Describe a PSNR (dB) in words."""
     return "no difference" if psnr >= MAX_PSNR else f"{psnr:.1f} dB"
 
 
 def describe_loss(name: str, before: float | None, after: float | None, pictures: str) -> str | None:
     """Describe that a result shows the scene's own ``pictures`` worse than the input does; None up to ``MAX_LOSS``.
 
-    ``before``, ``after``: PSNR (dB) of the pictures from the input and from the result; None without any.
+    ``before`` and ``after`` are the PSNR (dB) of the pictures from the input and from the result, or None.
     """
     if before is None or after is None or not before - after > MAX_LOSS:  # the difference of infinities is NaN
         return None
@@ -69,7 +69,7 @@ def describe_loss(name: str, before: float | None, after: float | None, pictures
 
 
 def describe_distance(psnr: float | None) -> str | None:
-    """Describe that a result is ``psnr`` dB from its input, which is poor; None from ``POOR`` on."""
+    """Describe that a result with a ``psnr`` (dB) against its input looks different; None from ``POOR`` on."""
     if psnr is None or psnr >= POOR:
         return None
     return f"the result looks different from its input: {psnr:.1f} dB, below {POOR:g} dB"
@@ -78,14 +78,14 @@ def describe_distance(psnr: float | None) -> str | None:
 def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
     """Return the structural similarity, at most 1, over Gaussian windows of 11 x 11 pixels (Wang et al. 2004).
 
-    The mean over channels and over the windows that lie wholly inside the image, as scikit-image's
-    ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
-    channel_axis=-1, data_range=1)`` computes it. For measuring only; the losses of the full fit
-    and of training use uniform windows, see :mod:`gsmerge.kernels.raster.image_loss`.
+    It is the mean over channels and over the windows that lie wholly inside the image, as computed by scikit-image's
+    ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1,
+    data_range=1)``. This function is for measuring only. The loss of the full fit and of training has its own
+    definition, :func:`gsmerge.fit.loss.loss_ssim`.
 
-    Images are ``[h,w,c]`` with at most 4 channels; ``mask [h,w]``: centres of the windows that
-    count, which also contain the pixels around. Raises ValueError if the shapes differ, the image
-    is too small or no window counts.
+    Images are ``[h,w,c]`` with at most 4 channels. ``mask [h,w]`` selects windows by their centres; a window also
+    contains the pixels around its centre. Raises ValueError if shapes differ, the image is too small or no window is
+    selected.
     """
     first, second = image_pair(image, reference)
     if min(first.shape[:2]) < WINDOW:
@@ -93,7 +93,7 @@ def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
     border = WINDOW // 2
     inner = slice(border, -border), slice(border, -border)
     chosen = None if mask is None else pixel_mask(pixel_mask(mask, first)[inner], first[inner])
-    # Variances are small differences of large numbers: float32 does when values are centred first.
+    # Variances are small differences of large numbers. With centred values float32 is exact enough.
     x, y = first.astype(np.float32) - np.float32(0.5), second.astype(np.float32) - np.float32(0.5)
 
     def mean(values: Array) -> Array:

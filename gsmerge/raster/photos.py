@@ -1,4 +1,4 @@
-"""Input photos with their cameras, at full or reduced size, for rendering against them."""
+"""Hold photos with their cameras at full or reduced size, and score renders against them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 Score = TypeVar("Score")
 
-LEAST_OPACITY = 1 / 255  # below which no rasterizer draws anything
+LEAST_OPACITY = 1 / 255  # rasterizers draw no smaller opacity
 NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
-ONE_AT_A_TIME = 400_000  # Gaussians; a tiled view is as large as they are, so threads share one view instead
+# Above so many Gaussians views are tiled one at a time, since a tiled view is as large; threads then share the view
+ONE_AT_A_TIME = 400_000
 BLOCK = 2  # tiles per side of the blocks that scored_tiles chooses among
-MASKED = np.float32(0.1)  # weight of pixels outside masks, which show the Gaussians' colours: none would let them drift
-COVERED = np.float32(0.5)  # transmittance below which a pixel shows Gaussians
-WHOLE = 0.98  # share of the pixels from which on Gaussians cover a view as a whole
+MASKED = np.float32(0.1)  # weight of pixels outside masks; with a weight of 0 the Gaussians there would drift
+COVERED = np.float32(0.5)  # transmittance below which a pixel counts as covered by Gaussians
+WHOLE = 0.98  # share of covered pixels from which on the whole view counts as covered
 EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
 
@@ -35,8 +36,8 @@ class RenderScore(NamedTuple):
     """Score of one render against a photo."""
 
     psnr: float  # dB over the pixels that count
-    covered_psnr: float  # dB over those of them that are covered; of nearly all, over all of them, NaN of none
-    share: float  # of the pixels that count, covered
+    covered_psnr: float  # dB over the covered ones of them; over all if nearly all are covered, NaN if none is
+    share: float  # share of covered pixels among those that count
     covered: np.ndarray  # [h,w] bool, the pixels that count and are covered
 
 
@@ -45,16 +46,16 @@ class PhotoScore:
     """Mean score of renders against photos; see :class:`RenderScore`."""
 
     psnr: float  # dB
-    covered_psnr: float  # dB; NaN where nothing is covered
-    share: float  # covered
+    covered_psnr: float  # dB; NaN if no view has covered pixels
+    share: float  # mean share of covered pixels
     covered: tuple[np.ndarray, ...]  # [h,w] bool for each view
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Pixels of a photo at equal distances: each ``stride``-th of its columns and rows from ``column`` and ``row`` on.
+    """Pixels of a photo at equal distances: each ``stride``-th column and row from ``column`` and ``row`` on.
 
-    They are drawn as a photo of their number by a camera that looks at their middles, with the low-pass of the whole.
+    They form a smaller photo. Its camera projects to the centres of these pixels, with the low-pass of the full photo.
     """
 
     stride: int = 1
@@ -77,8 +78,8 @@ class Photos:
     images: np.ndarray  # [v,h,w,3] float32, sRGB in [0, 1]; uint8 of photos larger than the grid, see image()
     viewmats: np.ndarray  # [v,4,4] world to camera
     Ks: np.ndarray  # [v,3,3] intrinsics at this size
-    # Low-pass variance in square pixels of this size: it stays that of the full-size image, so that scales are judged
-    # against the filter that they will be rendered with
+    # Low-pass variance in square pixels of this size. It equals that of the full-size image, so that Gaussians are
+    # fitted with the filter that they will be rendered with
     eps2d: float
     weights: np.ndarray | None = None  # [v,h,w] float32 of the pixels, in [0, 1]; None: all 1
     empty: np.ndarray | None = None  # [v,h,w] float32 share of each pixel that shows the background; None: 0
@@ -107,7 +108,7 @@ class Photos:
         return self.images.shape[2]
 
     def image(self, view: int, background: np.ndarray | None = None, sample: Sample = WHOLE_PHOTO) -> np.ndarray:
-        """Return the photo of a view ``[h,w,3]``, sRGB in [0, 1], before a ``background [3]``; None: black."""
+        """Return the photo ``[h,w,3]`` of a view, sRGB in [0, 1], over a ``background [3]``; None: black."""
         image = self.images[view][sample.pixels]
         image = np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
         if self.empty is None or background is None:
@@ -117,7 +118,7 @@ class Photos:
     def camera(self, view: int, sample: Sample = WHOLE_PHOTO) -> dict[str, Any]:
         """Return the arguments of :func:`gsmerge.raster.tile_view` for rendering into a photo, or a sample of it."""
         K, stride, offset = self.Ks[view], sample.stride, np.array([sample.column, sample.row])
-        if stride > 1:  # column i stands for stride * i + offset, which are counted from their middles
+        if stride > 1:  # column i of the sample is column stride * i + offset of the photo; both have centres at +0.5
             K = K / np.array([[stride], [stride], [1.0]])
             K[:2, 2] += ((stride - 1) / 2 - offset) / stride
         return {
@@ -130,18 +131,18 @@ class Photos:
 
 
 def scene_pictures(scene: Scene) -> np.ndarray:
-    """Return the photos ``[v,h,w,3]``, or, without photos, the base colours of the Gaussians in front."""
+    """Return the photos ``[v,h,w,3]`` of a scene, or without photos the base colours of the Gaussians in front."""
     return row_pictures(scene) if scene.images is None else scene.images
 
 
 def row_pictures(scene: Scene) -> np.ndarray:
-    """Return the base colours ``[v,h,w,3]`` of the Gaussians in front of a scene's pixels, 0 where there is none."""
+    """Return the base colours ``[v,h,w,3]`` of the Gaussians in front of a scene's pixels; 0 for pixels without any."""
     colors, pixels = sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1), scene.get_pixels()
     return np.where(pixels.shown[..., None], colors[pixels.fronts], np.float32(0))
 
 
 def scene_photos(scene: Scene, level: float = 1) -> Photos:
-    """Return the scene's photos with sides divided by ``level`` (area averages)."""
+    """Return the scene's photos with sides divided by ``level``, as area averages."""
     if scene.images is None:
         raise ValueError("expected a scene with images")
     photos = photos_of(scene.images, scene.cameras, level)
@@ -149,14 +150,14 @@ def scene_photos(scene: Scene, level: float = 1) -> Photos:
 
 
 def with_pixel_values(photos: Photos, scene: Scene) -> Photos:
-    """Return photos of a scene, of any size, with the weights and the importance of their pixels."""
+    """Add the scene's pixel weights and importance to its photos, which may have any size."""
     size = photos.width, photos.height
     important = None if scene.importance is None else shrink_pictures(scene.importance, *size)
     return replace(photos, weights=pixel_weights(scene.masks, *size), importance=important)
 
 
 def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
-    """Convert masks ``[v,h,w]`` to pixel weights ``[v,height,width]`` float32: 1 inside, little outside."""
+    """Convert masks ``[v,h,w]`` to pixel weights ``[v,height,width]`` float32: 1 inside, ``MASKED`` outside."""
     if masks is None:
         return None
     size = width, height
@@ -165,7 +166,7 @@ def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarr
 
 
 def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
-    """Return photos ``[v,h,w,3]`` with their cameras, sides divided by ``level`` (area averages)."""
+    """Combine photos ``[v,h,w,3]`` with their cameras, with sides divided by ``level``, as area averages."""
     blank = blank_photos(cameras, level)
     return replace(blank, images=images if level == 1 else shrink_pictures(images, blank.width, blank.height))
 
@@ -182,7 +183,7 @@ def shrink_pictures(pictures: np.ndarray, width: int, height: int) -> np.ndarray
 
 
 def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
-    """Return black photos that take no memory, if only their cameras matter; sides divided by ``level``."""
+    """Return black photos that take no memory, for their cameras; sides are divided by ``level``."""
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     w, h = cameras.width, cameras.height
     width, height = max(1, round(w / level)), max(1, round(h / level))
@@ -202,12 +203,12 @@ def photo_errors(
     keep: Callable[[int], np.ndarray] | None = None,
     tiles: Callable[[int], np.ndarray | None] | None = None,
 ) -> list[Score]:
-    """Render Gaussians into the photos' cameras and score every picture, several views at once.
+    """Render Gaussians into the photos' cameras and score every render, several views at once.
 
     ``score`` is called with the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance ``[h,w]``.
-    ``views``: views of the photos, in the order of the result; None: all. ``near`` is in the unit of the Gaussians.
-    ``colors [n,3]`` replace the harmonics. ``keep`` returns for a view the mask ``[n]`` of the Gaussians to draw, and
-    ``tiles`` the mask ``[tile_height,tile_width]`` of the tiles to complete; None: all.
+    ``views`` are views of the photos, in the order of the result; None: all. ``near`` is in the unit of the Gaussians.
+    ``colors [n,3]`` replace the harmonics. ``keep(view)`` returns the mask ``[n]`` of the Gaussians to draw, and
+    ``tiles(view)`` the mask ``[tile_height,tile_width]`` of the tiles that must be complete; None: all.
     """
     splats = gaussians if isinstance(gaussians, Splats) else make_splats(gaussians)
 
@@ -231,9 +232,10 @@ def score_photos(
     covered: Sequence[np.ndarray] | None = None,
     **settings: Any,
 ) -> PhotoScore:
-    """Score renders against the photos of ``views``, or a ``quarter`` of each; see :func:`photo_errors`.
+    """Score renders against the photos of ``views``, or a ``quarter`` of the tiles of each; see :func:`photo_errors`.
 
-    ``covered``: a mask ``[h,w]`` for each of the views; None: the pixels with an opacity of at least a half.
+    ``covered`` is a mask ``[h,w]`` for each of the views. By default a pixel with an opacity of at least a half is
+    covered.
     """
     masks = {} if covered is None else dict(zip(views, covered, strict=True))
 
@@ -247,7 +249,7 @@ def score_photos(
 
 
 def _mean_score(scores: Sequence[RenderScore]) -> PhotoScore:
-    """Average the scores of views, at most MAX_PSNR each, so that one view of equal pictures does not hide others."""
+    """Average the scores of views, each clipped at MAX_PSNR, so that a view with equal pictures does not dominate."""
     inside = [min(score.covered_psnr, MAX_PSNR) for score in scores if score.share > 0]
     share = float(np.mean([score.share for score in scores]))
     mean = float(np.mean([min(score.psnr, MAX_PSNR) for score in scores]))
@@ -255,7 +257,10 @@ def _mean_score(scores: Sequence[RenderScore]) -> PhotoScore:
 
 
 def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> RenderScore:
-    """Score a render ``[h,w,3]``, clipped in place, also over ``covered [h,w]``; see :func:`score_photos`."""
+    """Score a render ``[h,w,3]`` over all pixels that count and over ``covered [h,w]``; the render is clipped in place.
+
+    ``quarter`` is as in :func:`score_photos`.
+    """
     tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
     mask = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
     if photos.weights is not None:
@@ -271,7 +276,7 @@ def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: in
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
-    """Return a mask ``[tile_height,tile_width]`` of a quarter of a view's tiles; None for small views."""
+    """Select a quarter of a view's tiles as a mask ``[tile_height,tile_width]``; None for small views."""
     tile_height, tile_width = -(-height // TILE), -(-width // TILE)
     if min(tile_height, tile_width) <= 3 * BLOCK:
         return None
@@ -281,5 +286,5 @@ def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
 
 
 def render_photos(gaussians: Gaussians | Splats, photos: Photos, **settings: Any) -> list[np.ndarray]:
-    """Render every photo ``[h,w,3]``, not clipped; ``settings``: see :func:`photo_errors`."""
+    """Render every view ``[h,w,3]``, not clipped; ``settings`` are options of :func:`photo_errors`."""
     return photo_errors(gaussians, photos, lambda _, image, __: image, **settings)

@@ -1,4 +1,4 @@
-"""A view, tiled: projection, depth order and tile lists."""
+"""Tile a view: project Gaussians, sort them by depth and list them by tile."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from gsmerge.types import Gaussians
 
 Array = NDArray[Any]
 
-PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
-MANY, MANY_EACH = 1 << 24, 16  # intersections of a view, and of each Gaussian on average: above both, most are hidden
+PIECE = 1 << 13  # least number of Gaussians or intersections for another thread
+# Intersections of a view, and of each Gaussian on average. Above both, most Gaussians are hidden, and lists are cut off
+MANY, MANY_EACH = 1 << 24, 16
 EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
 NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
 
@@ -29,7 +30,7 @@ NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
 class Splats:
     """Gaussians as contiguous float32 arrays for the kernels."""
 
-    means: Array  # [n,3] world positions less `origin`
+    means: Array  # [n,3] world positions minus `origin`
     quats: Array  # [n,4] wxyz
     scales: Array  # [n,3] linear
     opacities: Array  # [n] in [0, 1]
@@ -46,27 +47,27 @@ class TiledView:
     """Gaussians projected into one view, sorted by depth and listed by tile."""
 
     splats: Splats
-    ids: Array  # [m] int32, ascending: the Gaussians that may touch the image. (A few at its border may miss it.)
+    ids: Array  # [m] int32, ascending: the Gaussians that may touch the image; a few at its border may not
     conics: Array  # [m,8] float32, see gsmerge.kernels.raster.project
     depths: Array  # [m] float32, camera z
     flatten_ids: Array  # [intersections] int32 rows of `ids`, tile after tile, nearest first
     isect_offsets: Array  # [tiles+1] int64 starts of the tiles' lists
-    eye: Array  # [3] float32, the camera's centre less `splats.origin`
-    opacities: Array  # [n] float32, those that are drawn
-    camera: Array  # The view's numbers in the order of gsmerge.kernels.raster.project, float32
+    eye: Array  # [3] float32, the camera's centre minus `splats.origin`
+    opacities: Array  # [n] float32, as they are drawn
+    camera: Array  # float32 numbers of the camera in the order of gsmerge.kernels.raster.project
     viewmat: Array  # [4,4] float64, world to camera
     width: int  # pixels
     height: int  # pixels
-    top: int = 0  # row of the view at which a band of it begins, `height` rows that blending alone draws
+    top: int = 0  # first row of a band of the view; the band has `height` rows and can only be blended
 
     @property
     def lists(self) -> tuple[Array, Array, Array, int]:
-        """First arguments of the kernels that walk the tiles' lists; the last is the number of tiles per row."""
+        """First arguments of the kernels that read the lists of tiles; the last one is the number of tiles per row."""
         return self.conics, self.flatten_ids, self.isect_offsets, -(-self.width // projection.TILE)
 
 
 def _spread_origin(means: Array) -> Array:
-    """Return zero, or the centre of Gaussians that are too far from zero for float32."""
+    """Return zero, or the centre of Gaussians if they are too far from zero for float32."""
     sample = means[:: max(1, len(means) // 4096)].astype(np.float64)
     sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
@@ -77,9 +78,9 @@ def _spread_origin(means: Array) -> Array:
 
 
 def _shift(means: Array, start: Array) -> Array:
-    """Return ``means [n,3]`` less ``start [3]``, subtracted in float64 and rounded to float32."""
+    """Subtract ``start [3]`` from ``means [n,3]`` in float64 and round to float32."""
     shifted = np.empty(means.shape, np.float32)
-    for axis in range(3):  # axis by axis NumPy takes a third of the time
+    for axis in range(3):  # one axis at a time takes NumPy a third of the time
         np.subtract(means[:, axis], start[axis], out=shifted[:, axis], dtype=np.float64, casting="unsafe")
     return shifted
 
@@ -87,9 +88,8 @@ def _shift(means: Array, start: Array) -> Array:
 def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
     """Convert Gaussians to float32 splats for the kernels, copying only what needs conversion.
 
-    Means may be float64, for scenes in geographic coordinates: ``origin [3]`` is the world point
-    that becomes the arrays' zero. None: the world's zero, unless the scene is far away from it
-    compared with its size.
+    Means may be float64, for scenes in geographic coordinates. ``origin [3]`` is the world point that becomes the zero
+    of the arrays. By default it is the zero of the world, unless that is far away compared with the size of the scene.
     """
     gaussians = gaussians.numpy()
     start = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
@@ -98,18 +98,18 @@ def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats
 
 
 def num_pieces(count: int, threads: int, least: int = PIECE) -> int:
-    """Return the number of pieces to split work into: several per thread, each of about ``least`` items or more."""
+    """Return the number of pieces to split work into: several per thread, each with about ``least`` items or more."""
     return 1 if threads == 1 else max(1, min(4 * threads, count // least))
 
 
 def pieces(count: int, threads: int) -> list[tuple[int, int]]:
-    """Split ``count`` items into ranges for the pool; results do not depend on the cuts."""
+    """Split ``count`` items into ranges for the threads; results do not depend on the ranges."""
     num = num_pieces(count, threads)
     return [(count * i // num, count * (i + 1) // num) for i in range(num)]
 
 
 def tile_ranges(tiled: TiledView, threads: int, least: int = PIECE) -> list[tuple[int, int]]:
-    """Split tiles into ranges with about equally many intersections, at least about ``least``, for the pool."""
+    """Split tiles into ranges for the threads with about equal numbers of intersections, at least about ``least``."""
     count = len(tiled.flatten_ids)
     num = num_pieces(count, threads, least)
     cuts = np.searchsorted(tiled.isect_offsets, count * np.arange(1, num) / num)
@@ -121,9 +121,9 @@ def camera_numbers(
     viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool,
     near: float = NEAR_PLANE, far: float = FAR_PLANE,
 ) -> Array:  # fmt: skip
-    """Return the numbers of a camera in the kernels' order."""
+    """Return the numbers of a camera in the order of the kernels."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    # Directions are clamped 15 % of the image outside it, where the first-order projection breaks down (gsplat).
+    # As in gsplat, directions are clamped 15 % of the image outside it, where the first-order projection is too inexact
     spare_x, spare_y = 0.15 * width / fx, 0.15 * height / fy
     camera = np.zeros(projection.CAMERA, np.float32)
     camera[projection.ROTATION : projection.SHIFT] = viewmat[:3, :3].ravel()
@@ -138,22 +138,22 @@ def camera_numbers(
 
 
 def _corner_sums(tiles: Array, tile_height: int, tile_width: int) -> Array:
-    """Count the marked ``tiles`` above and left of each corner, ``[tile_height+1,tile_width+1]`` int32."""
+    """Count the True ``tiles`` above and to the left of each corner, ``[tile_height+1,tile_width+1]`` int32."""
     if tiles.shape != (tile_height, tile_width):
         raise ValueError(f"tiles: expected shape {[tile_height, tile_width]}, got {list(tiles.shape)}")
     return np.pad(tiles.astype(np.int32).cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
 
 
 def _visible(
-    splats: Splats, opacities: Array, keep: Array | None, wanted: Array | None, camera: Array, threads: int
+    splats: Splats, opacities: Array, keep: Array | None, corner_sums: Array | None, camera: Array, threads: int
 ) -> Array:
-    """Return the ascending ids of the Gaussians that may touch the image."""
+    """Return the ascending ids of the Gaussians that may touch the image, or its selected tiles."""
 
     def cull(span: tuple[int, int]) -> Array:
         part, ids = slice(*span), np.empty(span[1] - span[0], np.int32)
-        kept = None if keep is None else keep[part]
+        keep_part = None if keep is None else keep[part]
         count = projection.cull(
-            splats.means[part], splats.scales[part], opacities[part], kept, wanted, camera, span[0], ids
+            splats.means[part], splats.scales[part], opacities[part], keep_part, corner_sums, camera, span[0], ids
         )
         return ids[:count].copy()
 
@@ -161,7 +161,7 @@ def _visible(
 
 
 def cache_line_rows(count: int, width: int) -> Array:
-    """Allocate ``[count,width]`` float32 from the start of a cache line, so that no short row spans two."""
+    """Allocate ``[count,width]`` float32 at the start of a cache line, so that short rows do not span two lines."""
     line = 16
     buffer = np.empty(count * width + line, np.float32)
     start = -(buffer.ctypes.data // buffer.itemsize) % line
@@ -169,7 +169,7 @@ def cache_line_rows(count: int, width: int) -> Array:
 
 
 def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, threads: int) -> tuple[Array, Array, Array]:
-    """Return conics, depths and tile boxes of the listed Gaussians."""
+    """Return conics, depths and tile boxes of the Gaussians ``ids``."""
     m = len(ids)
     conics, depths = cache_line_rows(m, projection.CONIC), np.empty(m, np.float32)
     boxes = np.empty((m, 4), np.int16)
@@ -194,7 +194,7 @@ def _bin(
     order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
 ) -> tuple[Array, Array]:
     """Return the tile lists and their starts."""
-    # One gather in advance, 8 bytes a box: in the loops below every miss would be paid in full.
+    # Boxes are gathered once in advance, 8 bytes each, since the loops below would wait for every cache miss
     boxes = boxes.view(np.uint64).reshape(-1).take(order).view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], tile_height, tile_width), spans))
@@ -215,7 +215,7 @@ def _bin(
 def _bin_open(
     order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
 ) -> tuple[Array, Array]:
-    """Return the lists of :func:`_bin`, each cut off behind the last visible Gaussian, so that they stay short."""
+    """Return the lists of :func:`_bin`, each cut off behind its last visible Gaussian to keep it short."""
     num = min(tile_height, 4 * threads)
     spans = [(tile_height * i // num, tile_height * (i + 1) // num) for i in range(num)]
 
@@ -262,15 +262,17 @@ def tile_view(
 ) -> TiledView:
     """Project Gaussians into one view, sort them by depth and bin them into tiles.
 
-    ``viewmat [4,4]`` is world to camera, ``K [3,3]`` in pixels without skew; ``near`` and ``far``
-    are exclusive, in world units; ``eps2d`` is the dilation in the image, pixels squared.
-    ``antialiased`` lowers the opacity by what the dilation adds to a Gaussian (Mip-Splatting's
-    2D filter). ``opacities [n]`` replace the Gaussians' own, where ``keep [n]`` is False they are
-    left out, and only ``tiles [tile_height,tile_width]`` of 16 x 16 pixels have to be complete.
-    Of a ``band`` only these lines of tiles, first and last + 1, are tiled, as a picture of their own; of
-    ``columns`` only these columns of tiles, and nothing is in the others.
-    The size of the result goes with what is visible, not with n. Raises ValueError if a size or a
-    number is out of range.
+    ``viewmat [4,4]`` is world to camera, and ``K [3,3]`` is in pixels without skew. ``near`` and ``far`` are exclusive,
+    in world units. ``eps2d`` is the dilation in the image, square pixels. ``antialiased`` lowers the opacity of a
+    Gaussian to compensate for the dilation (the 2D filter of Mip-Splatting). ``opacities [n]`` replace the opacities of
+    the Gaussians. Gaussians with a False ``keep [n]`` are left out.
+
+    Only tiles of 16 x 16 pixels with a True ``tiles [tile_height,tile_width]`` have to be complete. ``band``, first and
+    last + 1 line of tiles, tiles only these lines, as an image of their own. ``columns``, first and last + 1 column of
+    tiles, leaves all other tiles empty.
+
+    The size of the result depends on the number of visible Gaussians, not on n. Raises ValueError if a size or a number
+    is out of range.
     """
     viewmat, K = np.asarray(viewmat, np.float64).copy(), np.asarray(K, np.float64)
     _check_view(viewmat, K, width, height)
@@ -291,9 +293,9 @@ def tile_view(
     if is_part:
         tiles = np.zeros((tile_height, tile_width), bool)
         tiles[first:last, left:right] = True
-    wanted = None if tiles is None else _corner_sums(tiles, tile_height, tile_width)
+    corner_sums = None if tiles is None else _corner_sums(tiles, tile_height, tile_width)
     with use_threads() as threads:
-        ids = _visible(splats, opacities, keep, wanted, camera, threads)
+        ids = _visible(splats, opacities, keep, corner_sums, camera, threads)
         conics, depths, boxes = _project(splats, opacities, ids, camera, threads)
         if is_part:
             boxes[:, :2] = boxes[:, :2].clip(left, right)

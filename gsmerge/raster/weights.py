@@ -1,7 +1,7 @@
-"""Blending weights of a view as a sparse matrix, for stages that apply one geometry many times.
+"""Store the blending weights of a view as a sparse matrix, for stages that render one geometry many times.
 
-Image = W colors, with one row per pixel and one column per Gaussian. Twenty-odd entries per pixel:
-a product costs a small part of walking the tiles again.
+The image is W times the colours. W has one row per pixel and one column per Gaussian. With some twenty entries per
+pixel, a product takes a small part of the time that blending along the tile lists takes.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class ViewWeights:
     flatten_ids: Array  # [intersections] int32 rows of `ids`
     isect_offsets: Array  # [tiles + 1] int64 starts of the tiles' lists in `flatten_ids`
     tile_width: int  # Tiles per row
-    starts: Array  # [intersections + 1] int64 into `lanes` and `weights`
-    lanes: Array  # Pixel of each entry within its tile, row-major, uint8
-    weights: Array  # Blending weight of each entry, float32
+    starts: Array  # [intersections + 1] int64 starts of the entries in `lanes` and `weights`
+    lanes: Array  # uint8 pixel of each entry within its tile, row by row
+    weights: Array  # float32 blending weight of each entry
     height: int  # pixels
     width: int  # pixels
 
@@ -45,7 +45,7 @@ def view_weights(tiled: TiledView) -> ViewWeights:
 
 
 def apply(view: ViewWeights, colors: Array) -> Array:
-    """Render ``colors [n,c]``, up to four channels, by the stored weights: image ``[h,w,c]`` float32."""
+    """Render ``colors [n,c]``, up to four channels, with the stored weights to an image ``[h,w,c]`` float32."""
     channels = colors.shape[1]
     rows = np.zeros((len(view.ids), kernels.LANES), np.float32)
     rows[:, :channels] = colors[view.ids]
@@ -55,7 +55,10 @@ def apply(view: ViewWeights, colors: Array) -> Array:
 
 
 def apply_transposed(view: ViewWeights, image: Array) -> Array:
-    """Multiply the transpose of W with ``image [h,w,c]``, up to four channels: ``[m,c]`` float64 by ``view.ids``."""
+    """Multiply the transpose of W with ``image [h,w,c]``, up to four channels; return ``[m,c]`` float64.
+
+    The rows of the result are those of ``view.ids``.
+    """
     channels = image.shape[2]
     padded = np.zeros((view.height, view.width, kernels.LANES), np.float32)
     padded[..., :channels] = image

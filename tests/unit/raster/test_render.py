@@ -8,7 +8,7 @@ import pytest
 from messages import refuse_all
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.raster import composite, contributions, make_splats, render, render_in_turn, splat_adjoint, tile_view
+from gsmerge.raster import composite, contributions, make_splats, render, render_in_batches, splat_adjoint, tile_view
 from gsmerge.types import SH_C0
 
 FOCAL = 100.0
@@ -180,11 +180,11 @@ def many_balls() -> Gaussians:
 def test_many_views_are_drawn_in_turn_as_they_are_together(at_once: int) -> None:
     gaussians, cameras = many_balls(), camera(41, 31, 5)
     cameras.viewmats[:, 0, 3] = np.linspace(-0.3, 0.37, 5)
-    images = list(render_in_turn(gaussians, cameras, 0.3, at_once=at_once))
+    images = list(render_in_batches(gaussians, cameras, 0.3, at_once=at_once))
     whole = render(gaussians, cameras, 0.3).images
     np.testing.assert_array_equal(images, whole)
     for left, right in ((0, 10), (10, 30), (20, 20)):
-        some = list(render_in_turn(gaussians, cameras, 0.3, at_once=at_once, columns=[(left, right)] * 5))
+        some = list(render_in_batches(gaussians, cameras, 0.3, at_once=at_once, columns=[(left, right)] * 5))
         np.testing.assert_array_equal(np.stack(some)[:, :, left:right], whole[:, :, left:right])
         assert np.ptp(np.stack(some)[:, :, -(-right // 16) * 16 :]) == 0  # the background alone
 
@@ -198,7 +198,7 @@ def test_bands_of_a_large_picture_are_those_of_the_whole(band: int, monkeypatch:
         shapes.append(part.shape[0])
         return part * 2
 
-    drawn = list(render_in_turn(gaussians, cameras, 0.3, at_once=2, convert=convert))
+    drawn = list(render_in_batches(gaussians, cameras, 0.3, at_once=2, convert=convert))
     np.testing.assert_array_equal(drawn, 2 * render(gaussians, cameras, 0.3).images)
     tall = max(1, band // (41 * 16)) * 16
     assert shapes == [*[tall] * (61 // tall), 61 % tall] * 2
