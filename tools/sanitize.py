@@ -4,7 +4,7 @@ Three runs, each on a library of its own in a temporary folder:
 
 - The kernels' tests under the address and undefined-behaviour sanitizers, with the plugin ``mutated_calls``: every
   function is also called with changed arguments.
-- All commands, hostile inputs, and compacting in three ways, under the same.
+- All commands, damaged files, and compacting in three ways, under the same.
 - The three ways under the thread sanitizer, on four threads. Its library is loaded before Python's, and only the
   kernels are made for it: it sees their reads and writes, and the locks of all others. So that silence means something,
   two threads first write one array, which it has to report.
@@ -26,7 +26,7 @@ sys.path.insert(0, str(ROOT))
 from gsmerge.kernels import build  # noqa: E402
 
 KERNELS = ("-p", "mutated_calls", "tests/kernels", "--ignore=tests/kernels/test_build.py")
-COMMANDS = ("tests/e2e/test_every_command.py", "tests/e2e/test_hostile_input.py")
+COMMANDS = ("tests/e2e/test_every_command.py", "tests/e2e/test_damaged_files.py")
 FLAGS = ("-fno-omit-frame-pointer", "-g", "-O1", "-w")
 MEMORY = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", *FLAGS)
 THREADS = ("-fsanitize=thread", *FLAGS)

@@ -104,6 +104,8 @@ def _read(path: Path) -> FileCheck:
     if suffix in CAMERAS:
         return _read_cameras(path)
     check_file(path)
+    if suffix in SCENE_SUFFIXES:
+        find_scene_files(path)  # which says what a file without Gaussians holds
     endings = ", ".join(dict.fromkeys((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX)))
     raise SceneError(path, f"expected one of {endings}, found another kind of file")
 

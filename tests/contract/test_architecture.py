@@ -16,7 +16,7 @@ INTERNALS = sorted((ROOT / "docs" / "internals").glob("*.md"))
 PAGES = [*INTERNALS, ROOT / "CONTRIBUTING.md", ROOT / "docs" / "reference" / "conventions.md"]
 ARCHITECTURE = ROOT / "docs" / "internals" / "architecture.md"
 # Made by a run, in folders that are not there before
-MADE = {"tests/fuzz/findings"}
+MADE = {"tests/damage/findings"}
 # Of other repositories
 FOREIGN = {"tests/data/set1_lund_door", "colmap_ground_truth"}
 SOURCES = (".py", ".c", ".h", ".toml", ".js", ".html", ".yml", ".sh")

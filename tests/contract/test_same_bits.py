@@ -62,7 +62,7 @@ def test_nothing_depends_on_the_processor(root: Path) -> None:
 
 
 # What makes data: tests' own helpers, the generator, the example that makes a scene
-MAKERS = ("tests/helpers", "tests/hostile", "gsmerge/research/generate", "examples/01_make_scene.py")
+MAKERS = ("tests/helpers", "tests/damage", "gsmerge/research/generate", "examples/01_make_scene.py")
 ALLOWED_MAKERS = {
     ("gsmerge/research/generate/photograph.py", "cv2.remap"),  # bilinear: the same without AVX2 and AVX-512
     ("gsmerge/research/generate/textures.py", "cv2.remap"),

@@ -18,24 +18,13 @@ BRACKETS = 100_000
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 63327587\n"
 PAGE = b"\n<!doctype HTML>\n<head><title>\n Virus scan\n warning</title></head>"
 
-# Formats by what their files begin with, or what they are read as
-GAUSSIANS = (
-    *("rows", "ply", "ply, big", "ply, text", "ply, faces", "ply, faces first", "compressed ply", "spz", "spz 4"),
-    *("sog", "splat", "glb", "glb of spz"),
-)
-JSON = (
-    *("transforms", "INRIA", "Long-LRM", "WorldMirror", "frames", "bare frames", "Blender", "GlobalSplat", "OpenSfM"),
-    *("moved Long-LRM", "levels", "levels of a tree", "crop"),
-)
-ARRAYS = ("views.npz", "results.npz", "predictions.npz", "depth maps", "depth frames")
-TENSORS = ("gsm", "gsm of two batches", "gsm of features", "checkpoint")
-PICTURES = ("photos", *(kind for kind in SOUNDS if kind.startswith(("photo.", "photo of", "mask."))))
-TEXTS = ("COLMAP text", "pose list", "TUM", "RealEstate10K", "Tanks and Temples")
-# Kinds of which a part may be sound, as a file is that is read line by line
-PARTS_MAY_BE_SOUND = {*TEXTS, "ply, text", "splat"}
-FOLDERS = ("scene", "Polycam", "pose folder")
-LINES = ("list", "set")  # each a value, which is damaged at random alone
-FILES = tuple(kind for kind in SOUNDS if kind not in (*FOLDERS, *LINES))
+# Endings of kinds
+WITH_JSON, ZIPPED, TEXTS = (".json", ".sog", ".glb"), (".sog", ".npz"), (".txt", ".log")
+SCENES = (".ply", ".spz", ".splat", ".sog", ".npz", ".glb", ".gsm", ".safetensors")
+PARTS_MAY_BE_SOUND = (*TEXTS, ".splat")  # rows that are read one by one
+ASKED = ("SHARP", "dataparser")  # readers that are asked whether a file has what they know
+LINES = ("list", "set")  # whose lines are damaged at random alone
+FILES = [kind for kind, sound in SOUNDS.items() if PurePath(sound.name).suffix and kind not in LINES]
 
 
 def _archive(add: str) -> bytes:
@@ -66,7 +55,7 @@ OWN = {"a zip": (".sog", ".npz"), "a gzip": (".spz",), "a PLY file": (".ply", ".
 
 def _pieces(kind: str) -> dict[str, Damage]:
     """Damages of a file as bytes."""
-    outcome = either if kind in PARTS_MAY_BE_SOUND else refused
+    outcome = either if kind == "ply, text" or PurePath(SOUNDS[kind].name).suffix in PARTS_MAY_BE_SOUND else refused
     damages = {f"the first {share:.2%}": outcome(cut(share)) for share in (0.0001, 0.05, 0.3, 0.5, 0.9)}
     damages |= {
         "all but the end": either(cut(0.999)),
@@ -78,24 +67,24 @@ def _pieces(kind: str) -> dict[str, Damage]:
         "1 TB of zeros": refused(zeros(TERABYTE)),
         "1 TB of zeros behind it": either(zeros(TERABYTE, None)),
     }
-    if kind == "SHARP":  # which is asked of every file whether it has a camera
-        damages = {name: either(damage.change) for name, damage in damages.items()}
     return damages
 
 
-def _other_content(kind: str) -> dict[str, Damage]:
-    suffix = PurePath(SOUNDS[kind].name).suffix
-    chosen = OTHER_CONTENT if kind in (*GAUSSIANS, *TENSORS, *ARRAYS) else {}
-    if suffix in (".json", ".png"):
-        chosen = {name: OTHER_CONTENT[name] for name in ("a pointer of LFS", "a web page")}
-    few = kind == "photos"  # of several, one is left out in fewer words
-    return {
-        name: refused(content(data), *(() if few or suffix in OWN.get(name, ()) else said))
-        for name, (data, said) in chosen.items()
-    }
+def _other_content(kind: str, suffix: str) -> dict[str, Damage]:
+    """Other files in the place of one; the line says what they are, except where a kind's own reader refuses them."""
+    if suffix in SCENES:
+        names = list(OTHER_CONTENT)
+    else:
+        names = ["a pointer of LFS", "a web page"] if suffix in (".json", ".png") else []
+    damages = {}
+    for name in names:
+        data, said = OTHER_CONTENT[name]
+        own = kind == "photos" or suffix in OWN.get(name, ())  # of several photos, one is left out in fewer words
+        damages[name] = refused(content(data), *(() if own else said))
+    return damages
 
 
-def _json(kind: str) -> dict[str, Damage]:
+def _json() -> dict[str, Damage]:
     """Damages of a document of JSON."""
     return {
         "JSON of brackets": refused(text(b"[" * BRACKETS)),
@@ -107,7 +96,7 @@ def _json(kind: str) -> dict[str, Damage]:
     }
 
 
-def _archives(kind: str) -> dict[str, Damage]:
+def _archives() -> dict[str, Damage]:
     """Damages of a zip that holds the file's parts."""
     return {
         "encrypted": either(of_entries(6, 8, lambda flags: flags | 1)),
@@ -117,11 +106,12 @@ def _archives(kind: str) -> dict[str, Damage]:
 
 
 def _all(kind: str) -> dict[str, Damage]:
-    damages = _pieces(kind) | _other_content(kind)
-    if kind in (*JSON, "sog", "glb", "glb of spz"):
-        damages |= _json(kind)
-    if kind in ("sog", *ARRAYS):
-        damages |= _archives(kind)
+    suffix = PurePath(SOUNDS[kind].name).suffix
+    damages = _pieces(kind) | _other_content(kind, suffix)
+    damages |= _json() if suffix in WITH_JSON else {}
+    damages |= _archives() if suffix in ZIPPED else {}
+    if kind in ASKED:
+        damages = {name: either(damage.change) for name, damage in damages.items()}
     return slow(damages) if SOUNDS[kind].rare else damages
 
 
