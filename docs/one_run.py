@@ -414,8 +414,9 @@ def result_section(run: Run) -> str:
     return "\n\n".join([
         "## 5. make_result: what comes out",
         text(
-            "[`compaction/result.py`](../../gsmerge/compaction/result.py) moves the Gaussians back into the world of",
-            "the file, and measures both.",
+            "[`compaction/candidate.py`](../../gsmerge/compaction/candidate.py) moves the Gaussians back into the",
+            "world of the file and scores them. [`compaction/result.py`](../../gsmerge/compaction/result.py) scores",
+            "the input and makes the report.",
         ),
         "\n".join([
             entry("result.gaussians.means", gaussians.means, child),

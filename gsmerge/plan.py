@@ -358,7 +358,7 @@ def _whole_needed(options: CompactOptions) -> list[str]:
 def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     """Return whether the count is the fewest that keep the input, as neither options nor the scene's density decide it.
 
-    Without photos the result has to be ``FIDELITY_PSNR`` from the input; with photos it may show them ``FIDELITY_LOSS``
+    Without photos the result has to be ``FIDELITY_PSNR`` from the input. With photos it may show them ``FIDELITY_LOSS``
     worse. A share of the Gaussians says little where they are fewer than pixels: a scene that is compact already needs
     most of its Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
     """

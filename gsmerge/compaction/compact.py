@@ -1,26 +1,30 @@
-"""The top: compact a scene in one piece or in blocks, for one count or for several until a quality is met."""
+"""The top: compact a scene in one piece or in blocks.
+
+In one piece it is built once for one number of Gaussians, or several times until a quality is met.
+"""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from os import PathLike
 from typing import TYPE_CHECKING
 from weakref import ReferenceType, ref
 
 import numpy as np
 
 from gsmerge.arguments import check_arguments
-from gsmerge.compaction.file_size import meet_bytes
+from gsmerge.compaction.candidate import Candidate, score
+from gsmerge.compaction.file_size import Rebuild, meet_bytes
 from gsmerge.compaction.forecast import RunForecast
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import trial_part, try_new_views
-from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
-from gsmerge.compaction.search import add_target, build_left_out, level_counts, meet, search_count
+from gsmerge.compaction.report import CompactReport
+from gsmerge.compaction.result import CompactResult, make_result
+from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, meet, search_count
 from gsmerge.errors import DoubtWarning
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
@@ -50,7 +54,8 @@ if TYPE_CHECKING:
 
     from gsmerge.settings.keywords import CompactKeywords
 
-MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count after clean-up; more than it by so much at first
+# A count has to remain after clean-up: the scene is built at most so often, first with so many times the count
+MAX_BUILDS, SURPLUS = 3, 1.05
 
 
 @check_arguments
@@ -64,16 +69,17 @@ def compact(
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
 
     Args:
-        scene: What :func:`gsmerge.read_scene` returns, or the path that it reads. Tensors give tensors.
+        scene: What :func:`gsmerge.read_scene` returns, or a path that it can read. A scene of tensors gives a result of
+            tensors.
         options: Settings of all stages; None: the defaults.
-        progress: Called with (stage, done, stages), and from within longer ones with ("fit: ...", step, steps).
-        **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, superpixels="1%")``.
+        progress: Called with (stage, done, stages); long stages also call it with ("fit: ...", step, steps).
+        **settings: Single settings by name that override ``options``: ``compact(scene, k=2, superpixels="1%")``.
 
     Raises:
         SceneError: If a path cannot be read.
         ValueError: If a setting is unknown or out of range.
 
-    Doubts are warned of as :class:`gsmerge.DoubtWarning`, notes go to the logger ``gsmerge``.
+    Doubts about the result are warnings of the class :class:`gsmerge.DoubtWarning`. Notes go to the logger ``gsmerge``.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget=400)
@@ -82,56 +88,56 @@ def compact(
     """
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):
-        asked, scene = scene, as_scene(scene)
-        given: StrPath | ReferenceType[Scene] = asked if isinstance(asked, str | PathLike) else ref(asked)
-        del asked  # which may be freed
+        # a reference, so that the result does not keep the scene in memory
+        source: StrPath | ReferenceType[Scene] = ref(scene) if isinstance(scene, Scene) else scene
+        scene = as_scene(scene)
         if options.clean.crop is not None:
             scene = crop_scene(scene.numpy(), options.clean.crop)
-        size = measure_size(scene)
-        choices = choose_for_scene(size, options)  # what needs no work to decide
-        note_engine(size, options, choices.blocks)
-        note_surplus(size, options.budget)
-        if choices.blocks > 1:
-            from gsmerge.compaction.blocks import compact_in_blocks, cut_views
-
-            blocks, covisibility = cut_views(scene, options, choices.blocks)
-            if len(blocks) > 1:
-                return _finish(compact_in_blocks(scene, options, choices, blocks, covisibility), scene, given)
-        method = choose_method(options, scene)  # ours, that for scenes without cameras, or a baseline
-        prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
-        return _finish(compact_prepared(prepared, method, options).to(scene.gaussians.device), scene, given)
+        result = _compact_scene(scene, options)
+        _warn_of_doubts(result.report)
+        if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
+            result = result.to_single()
+        return replace(result, scene=source, names=scene.names)
 
 
-def _finish(result: CompactResult, scene: Scene, given: StrPath | ReferenceType[Scene]) -> CompactResult:
-    """Return a result with the precision of the scene's means, and warn of what makes it doubtful."""
-    report, agreement = result.report, result.report.choices.get("agreement") or {}
+def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
+    """Compact a scene: in blocks if its views are cut into several, otherwise in one piece."""
+    size = measure_size(scene)
+    choices = choose_for_scene(size, options)  # the decisions that need no computation
+    note_engine(size, options, choices.blocks)
+    note_surplus(size, options.budget)
+    if choices.blocks > 1:
+        from gsmerge.compaction.blocks import compact_in_blocks, cut_views
+
+        blocks, covisibility = cut_views(scene, options, choices.blocks)
+        if len(blocks) > 1:
+            return compact_in_blocks(scene, options, choices, blocks, covisibility)
+    method = choose_method(options, scene)  # ours, ours for scenes without cameras, or a baseline
+    prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
+    return compact_prepared(prepared, method, options).to(scene.gaussians.device)
+
+
+def _warn_of_doubts(report: CompactReport) -> None:
+    """Warn the caller of :func:`compact` of everything that makes the result doubtful."""
+    agreement = report.choices.get("agreement") or {}
     doubts = [report.worse, report.unmet, *(text for text in report.notes if text == agreement.get("doubt"))]
     for text in dict.fromkeys(filter(None, doubts)):
-        warnings.warn(text, DoubtWarning, stacklevel=4)
-    if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
-        result = result.to_single()
-    return replace(result, scene=given, names=scene.names)
+        warnings.warn(text, DoubtWarning, stacklevel=4)  # above here, compact, and its check of the arguments
 
 
 def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
-    """Compact a scene of which the facts are known."""
-    plan = add_target(make_plan(prepared, options), prepared)  # options end here
+    """Compact a prepared scene with a method: plan, search, levels of detail, trial, result."""
+    plan = make_plan(prepared, options)  # options end here
+    plan = add_target(plan, prepared)
 
     def rebuild(count: int | None) -> Candidate:
         candidate = build_scored(method.build, prepared, plan, count)
-        add_seconds(candidate.record.seconds)  # beside those of the search
+        add_seconds(candidate.record.seconds)  # in addition to those of the search
         return candidate
 
     forecast = RunForecast(prepared, plan, trial_part(prepared, plan))
     search = search_count(prepared, plan, method.build, forecast)  # one count, or counts until a quality is met
-    if search.left_out is None:
-        uncleaned = replace(plan, clean=CleanOptions()) if plan.cleans_last else plan
-        search.run(partial(build_scored, method.build, prepared, uncleaned), forecast)
-        best = clean_last(search.best, prepared, plan)
-    else:
-        search.run(partial(build_left_out, method.build, search.left_out, search.left_out.plan(plan)), forecast)
-        forecast.expect_builds(search.count)
-        best = rebuild(search.count)
+    best = run_search(search, method.build, rebuild, prepared, forecast)
     best = meet_bytes(best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     counts = level_counts(len(best.gaussians), plan)
@@ -142,6 +148,23 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
     return make_result(best, levels, prepared, plan, search.facts(best), trial)
 
 
+def run_search(
+    search: CountSearch, build: Build, rebuild: Rebuild, prepared: Prepared, forecast: RunForecast
+) -> Candidate:
+    """Run a search for the number of Gaussians; return its best candidate, built from all views and cleaned up."""
+    plan = search.plan
+    if search.left_out is not None:  # its candidates lack views, so the best count is built again
+        search.run(partial(build_left_out, build, search.left_out, search.left_out.plan(plan)), forecast)
+        forecast.expect_builds(search.count)
+        return rebuild(search.count)
+    if plan.cleans_last:
+        uncleaned = replace(plan, clean=CleanOptions())
+        search.run(partial(build_scored, build, prepared, uncleaned), forecast)
+        return clean_best(search.best, prepared, plan)
+    search.run(partial(build_scored, build, prepared, plan), forecast)
+    return search.best
+
+
 @record_part()
 def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
     """Build ``count`` Gaussians with a method, clean them up as the plan says, and score them."""
@@ -150,20 +173,28 @@ def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None
 
 
 @record_part()
-def clean_last(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
-    """Clean up a candidate that was searched for without, and score it again; any other stays as it is."""
-    if not plan.cleans_last:
-        return candidate
+def clean_best(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
+    """Clean up a candidate of a search without clean-up, and score it again."""
     adopt(candidate.record)
-    gaussians, counts = _clean(candidate.fitted, prepared, plan)
-    _note_clean(counts, len(gaussians), None, prepared)
+    gaussians, dropped = _clean(candidate.fitted, prepared, plan)
+    _note_clean(dropped, len(gaussians), None, prepared)
     return score(None, replace(candidate.fitted, gaussians=gaussians), prepared, plan)
 
 
-def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-    """Build Gaussians and clean them up so that exactly ``count`` remain, if the scene holds that many.
+@dataclass(frozen=True, eq=False)
+class CleanedBuild:
+    """Gaussians that were built for a count and cleaned up."""
 
-    More Gaussians are built than requested, and the faintest surplus ones are dropped.
+    count: int | None  # Gaussians that were built; None: as many as `superpixels` and K give
+    fitted: Fitted  # What remains after clean-up
+    dropped: dict[str, int]  # Numbers of dropped Gaussians by reason
+    record: Record  # Seconds, choices and notes
+
+
+def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+    """Build Gaussians and clean them up, so that exactly ``count`` remain if the scene has that many.
+
+    More Gaussians than ``count`` are built. Of those that remain after clean-up, the faintest surplus is dropped.
     """
     options = plan.clean
     if not options.asked:
@@ -172,50 +203,50 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
 
     most = len(prepared.scene.gaussians)
 
-    def build_more(asked: int | None) -> tuple[int | None, Fitted, dict[str, int], Record]:
+    def build_once(built_count: int | None) -> CleanedBuild:
         with record_part() as record:
-            fitted = build(prepared, plan, asked)
-            gaussians, counts = _clean(fitted, prepared, plan)
+            fitted = build(prepared, plan, built_count)
+            gaussians, dropped = _clean(fitted, prepared, plan)
         add_seconds(record.seconds)
-        return asked, replace(fitted, gaussians=gaussians), counts, record
+        return CleanedBuild(built_count, replace(fitted, gaussians=gaussians), dropped, record)
 
-    def ask_for_more(built: Sequence[tuple[int | None, Fitted, dict[str, int], Record]]) -> int | None:
-        asked, left = built[-1][0], len(built[-1][1].gaussians)
-        if count is None or asked in (None, most) or left >= count or len(built) == MAX_BUILDS:
+    def choose_next(built: Sequence[CleanedBuild]) -> int | None:
+        last, remaining = built[-1].count, len(built[-1].fitted.gaussians)
+        if count is None or last in (None, most) or remaining >= count or len(built) == MAX_BUILDS:
             return None
-        return min(most, math.ceil(SURPLUS * asked * count / max(1, left)))
+        return min(most, math.ceil(SURPLUS * last * count / max(1, remaining)))
 
     first = None if count is None else min(most, math.ceil(SURPLUS * count))
-    built = meet(build_more, build_more(first), ask_for_more)
-    _, fitted, counts, record = max(built, key=lambda each: len(each[1].gaussians))
-    gaussians = fitted.gaussians
+    built = meet(build_once, build_once(first), choose_next)
+    best = max(built, key=lambda each: len(each.fitted.gaussians))
+    gaussians, dropped = best.fitted.gaussians, best.dropped
     if count is not None and len(gaussians) > count:
-        gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}
-    adopt(record)
-    _note_clean(counts, len(gaussians), count, prepared)
-    return replace(fitted, gaussians=gaussians)
+        gaussians, dropped = faintest_dropped(gaussians, count), dropped | {"surplus": len(gaussians) - count}
+    adopt(best.record)
+    _note_clean(dropped, len(gaussians), count, prepared)
+    return replace(best.fitted, gaussians=gaussians)
 
 
 def _clean(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gaussians, dict[str, int]]:
-    """Clean up fitted Gaussians as :func:`gsmerge.stages.clean.clean`."""
+    """Clean up fitted Gaussians; return those that remain, and the numbers of dropped ones by reason."""
     from gsmerge.stages.clean import clean
 
-    cameras = None if prepared.reference.placed else fitted.cameras  # placed ones judge a scene, and do not show it all
-    rows, counts = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
-    return fitted.gaussians[rows], counts
+    # the few placed cameras that results are scored on do not show all of the scene: without cameras, clean places more
+    cameras = None if prepared.reference.placed else fitted.cameras
+    rows, dropped = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
+    return fitted.gaussians[rows], dropped
 
 
-def _note_clean(counts: dict[str, int], left: int, count: int | None, prepared: Prepared) -> None:
-    """Record what clean-up left out, and whether fewer than ``count`` are left."""
+def _note_clean(dropped: dict[str, int], remaining: int, count: int | None, prepared: Prepared) -> None:
+    """Note which Gaussians clean-up dropped, and whether fewer than ``count`` remain."""
     from gsmerge.stages.clean import describe_counts
 
-    choose(clean=counts)
-    shown = {
-        name: number for name, number in counts.items() if number or name != "cropped"
-    }  # by the fit, over a border
+    choose(clean=dropped)
+    # the scene itself was cropped before: Gaussians count as cropped here if the fit moved them over the border
+    shown = {name: number for name, number in dropped.items() if number or name != "cropped"}
     if shown:
         note(f"left out by clean-up: {describe_counts(shown, placed=prepared.reference.placed)}")
-    if counts.get("sky"):
-        note("PSNR of the input views counts what is left out as errors")
-    if count is not None and left < count:
-        note(f"budget: {count:,} Gaussians were asked for, {left:,} are left after clean-up")
+    if dropped.get("sky"):
+        note("PSNR of the input views counts the sky that was left out as errors")
+    if count is not None and remaining < count:
+        note(f"budget: {count:,} Gaussians were asked for, {remaining:,} remain after clean-up")

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from gsmerge.budget import largest_count
+from gsmerge.compaction.curve import DROP_SHARES, DROP_STEPS, KNEE_SHARES, KNEE_STEPS, curve_counts
 from gsmerge.compaction.files import Outputs, check_cameras, sized
 from gsmerge.compaction.make_plan import load_networks
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.partition import gaussians_at_once
-from gsmerge.compaction.search import AUTO_RUNGS, LONG, RUNGS, SHORT, rungs
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.place_cameras import count_placed, placed_views
@@ -112,8 +112,8 @@ def _search(size: SceneSize, options: CompactOptions, choices: SceneChoices, ins
         return {"tries": TRIED_BY_PHOTOS + coarser}
     if size.rendered or not (budget.auto or budget.max_drop is not None):
         return {"tries": 1 + coarser}
-    shares, steps = (RUNGS, LONG) if budget.max_drop is not None else (AUTO_RUNGS, SHORT)
-    counts = rungs(shares, limits.default, limits.min_count, limits.max_count)
+    shares, steps = (KNEE_SHARES, KNEE_STEPS) if budget.max_drop is None else (DROP_SHARES, DROP_STEPS)
+    counts = curve_counts(shares, limits.default, limits.min_count, limits.max_count)
     return {"short_steps": steps, "short_drawn": [count * inside for count in counts]}
 
 

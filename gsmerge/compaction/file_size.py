@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from gsmerge.compaction.result import Candidate, shrink
+from gsmerge.compaction.candidate import Candidate, shrink
 from gsmerge.compaction.search import meet
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
@@ -20,7 +20,7 @@ ENOUGH = 0.985  # share of the size from which on no further one is put back
 SURPLUS = 1.02  # times the Gaussians that the size seems to have room for
 TRIES, MAX_REBUILDS = 8, 2
 
-Rebuild = Callable[[int], Candidate]
+Rebuild = Callable[[int | None], Candidate]  # a count -> a candidate of all views, built, cleaned up and scored
 
 
 def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras) -> int:

@@ -31,6 +31,13 @@ class Covered:
     after: float
 
 
+def compared_psnr(
+    covered: Covered | None, before: float | None, after: float | None
+) -> tuple[float | None, float | None]:
+    """Return the PSNR (dB) of input and result that are compared: over covered pixels, if the input lacks some."""
+    return (before, after) if covered is None else (covered.before, covered.after)
+
+
 @dataclass(frozen=True)
 class PhotoFiles:
     """PSNR on the photos as their files have them, where a run changed their colours or what covers them.

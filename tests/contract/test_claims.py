@@ -19,7 +19,7 @@ from gsmerge import plan, types
 from gsmerge.alignment import cameras as cameras_off
 from gsmerge.alignment import layouts, rows_first, score
 from gsmerge.alignment.registration import register
-from gsmerge.compaction import blocks, left_out, new_views, partition, search
+from gsmerge.compaction import blocks, curve, left_out, new_views, partition, seams, search
 from gsmerge.evidence import colors
 from gsmerge.facts import compare_photos, confirm_depths, exposure, holes, move_poses, scene_size, views
 from gsmerge.fit import outside, photo_sizes, schedule, stage
@@ -106,9 +106,9 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f" cut at most a {part(partition.MOST_CUT)}",
         f"Each block also takes views of its neighbours, a {part(partition.SHARED)} of the number of its own",
         f"A block asks for up to {'twice' if blocks.MOST_DENSITY == 2 else blocks.MOST_DENSITY} as many superpixels",
-        f"at {blocks.SEAM_RATE:g} times the usual ones, and fall to a tenth",
-        f"{word(blocks.SEAM_LOOKS)} for each photo that shows many of them, or {word(blocks.ROOM_LOOKS)} if at least"
-        f" {part(blocks.MOSTLY_SEAMS)} of all Gaussians are at seams",
+        f"at {seams.SEAM_RATE:g} times the usual ones, and fall to a tenth",
+        f"{word(seams.SEAM_VIEW_STEPS)} for each photo that shows many of them, or {word(seams.ROOM_VIEW_STEPS)} if at"
+        f" least {part(seams.ROOM_SHARE)} of all Gaussians are at seams",
         f"The default takes {plan.EFFORTS['default'].steps} steps for up to {plan.USUAL_VIEWS} views",
         f"A lost block is done again, up to {word(work.RETRIES)} times",
         f"| GB per million | {' | '.join(map(degree, range(5)))} |",
@@ -165,7 +165,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"gsmerge keeps at most {SHARE.replace('%', ' %')} of a scene",
         f"at most what the device draws fluidly: {', '.join(f'{count:,}' for count in DEVICES.values())}",
         f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {plan.LONE_K} for a single",
-        f"counts PSNR plus {search.SSIM_DB:g} dB times SSIM",
+        f"counts PSNR plus {curve.SSIM_DB:g} dB times SSIM",
         f"That is {percent(confirm_depths.MOST)} of the input if other views confirm at least"
         f" {percent(confirm_depths.SOUND)} of the depth. It falls to {percent(confirm_depths.FEWEST)} if they confirm"
         f" {percent(confirm_depths.WRONG)} or less",

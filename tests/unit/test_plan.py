@@ -14,9 +14,9 @@ from messages import noted
 from scenes import psnr_of
 
 from gsmerge import CompactOptions, Scene, compact
+from gsmerge.compaction.candidate import score
 from gsmerge.compaction.estimate import estimate
 from gsmerge.compaction.make_plan import make_plan
-from gsmerge.compaction.result import score
 from gsmerge.compaction.search import MAX_RUNS, add_target
 from gsmerge.errors import UsageError
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths

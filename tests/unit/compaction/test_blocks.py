@@ -12,7 +12,7 @@ from messages import refuses
 from sweeps import sweep
 
 from gsmerge import CompactOptions, compact
-from gsmerge.compaction.blocks import join_views
+from gsmerge.compaction.seams import join_views
 from gsmerge.errors import UsageError
 from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.facts.scene_size import measure_size

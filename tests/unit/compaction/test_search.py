@@ -12,20 +12,9 @@ import pytest
 from messages import noted, refuses
 
 from gsmerge.budget import exact_count, max_allowed
+from gsmerge.compaction.curve import CurvePoint, count_within, curve_counts, curve_knee
 from gsmerge.compaction.left_out import LeftOut
-from gsmerge.compaction.search import (
-    CLOSE,
-    MAX_RUNS,
-    MAX_TRIED,
-    CountSearch,
-    CurvePoint,
-    count_within,
-    curve_knee,
-    level_counts,
-    meet,
-    rungs,
-    search_count,
-)
+from gsmerge.compaction.search import CLOSE, MAX_RUNS, MAX_TRIED, CountSearch, level_counts, meet, search_count
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.fit import FitOptions
@@ -119,9 +108,9 @@ def test_shares_are_exact(share: float) -> None:
 
 
 def test_rungs_rise_within_their_limits() -> None:
-    assert rungs((0.25, 0.5, 1.0, 2.0), 1000, 10, 5000) == [250, 500, 1000, 2000]
-    assert rungs((0.25, 0.5, 1.0, 2.0), 1000, 300, 900) == [300, 500, 900]
-    assert rungs((0.25, 1.0), 1000, 100, 100) == [100]
+    assert curve_counts((0.25, 0.5, 1.0, 2.0), 1000, 10, 5000) == [250, 500, 1000, 2000]
+    assert curve_counts((0.25, 0.5, 1.0, 2.0), 1000, 300, 900) == [300, 500, 900]
+    assert curve_counts((0.25, 1.0), 1000, 100, 100) == [100]
 
 
 def test_levels_end_where_a_view_would_have_none() -> None:
@@ -191,7 +180,7 @@ def test_search_finds_the_fewest(start: int, target: float) -> None:
     actual = search(rises, target, start, 10, 100_000)
     fewest = 1000 * 2 ** ((target - 20) / 2)
     best = actual.best
-    assert actual.facts(actual.best)["unmet"] is None
+    assert actual.facts(actual.best).unmet is None
     assert best.psnr == rises(best.count) >= target
     assert best.count <= max(2.5 * fewest, 10)
     assert len(actual.tried) <= MAX_RUNS
@@ -205,13 +194,13 @@ def test_search_near_the_answer_ends_close_to_it() -> None:
 def test_search_says_when_it_is_out_of_reach() -> None:
     actual = search(rises, 40.0, 1000, 10, 5000)
     reached = f"the input views reach {rises(5000):.2f} dB with 5,000 Gaussians"
-    assert actual.facts(actual.best)["unmet"] == f"quality: 40 dB was asked for; {reached}, the best that was tried"
+    assert actual.facts(actual.best).unmet == f"quality: 40 dB was asked for; {reached}, the best that was tried"
     assert (actual.best.count, actual.best.psnr) == (5000, rises(5000))
 
 
 def test_search_keeps_the_best_of_a_curve_that_falls() -> None:
     actual = search(lambda count: 20 - abs(log2(count / 1000)), 25.0, 1000, 10, 5000)
-    assert actual.facts(actual.best)["unmet"] is not None
+    assert actual.facts(actual.best).unmet is not None
     assert actual.best.count == 1000
 
 
@@ -256,7 +245,7 @@ def test_what_is_compact_already_is_kept() -> None:
     actual = keep(lambda count: 120.0 if count == 5000 else 25.0, 220, 5000)
     assert actual.best.count == 5000
     assert noted(actual.notes, "compact already", "5,000 of 5,000")
-    assert actual.facts(actual.best)["unmet"] is None
+    assert actual.facts(actual.best).unmet is None
 
 
 @pytest.mark.parametrize("slope", [0.5, 1.0, 2.0])
@@ -275,7 +264,7 @@ def test_photos_that_no_count_shows_end_the_search(curve: Callable[[int], float]
     """As of another scene. The best is kept, even if it is the usual count."""
     actual = keep(curve, 1000, 20_000, rendered=False)
     assert len(actual.tried) <= MAX_RUNS
-    assert (actual.best.count, actual.met, actual.facts(actual.best)["unmet"]) == (1000, False, None)
+    assert (actual.best.count, actual.met, actual.facts(actual.best).unmet) == (1000, False, None)
     assert actual.notes == []
 
 
@@ -314,8 +303,8 @@ def test_photos_left_out_take_no_more_than_they_gain_from() -> None:
     actual = judge_left_out(lambda count: 20 + log2(count / 1000), 30.0, most=1600)
     assert max(actual.tried) == actual.count == 1600
     facts, reached = actual.facts(actual.best), "photos left out reach 20.68 dB with 1,600 Gaussians"
-    assert facts["unmet"] == f"quality: 30 dB was asked for; {reached}, the best that was tried"
-    assert facts["choices"]["search"]["left_out"] == 2
+    assert facts.unmet == f"quality: 30 dB was asked for; {reached}, the best that was tried"
+    assert facts.choices["search"]["left_out"] == 2
 
 
 def test_a_search_builds_until_nothing_is_next() -> None:

@@ -1,0 +1,83 @@
+"""A block of views -> its start: its views are merged, and the Gaussians that belong to the block are kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.compaction.make_plan import make_plan
+from gsmerge.compaction.partition import Block, Covisibility, owning_views
+from gsmerge.compaction.scores import InputScores, score_input
+from gsmerge.facts.prepare import Prepared, prepare
+from gsmerge.frame import Frame
+from gsmerge.pipeline import decode_views
+from gsmerge.plan import Plan
+from gsmerge.runtime.memory import free_pages, make_array
+from gsmerge.runtime.record import begin_part
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.types import Gaussians, Scene, SceneT
+
+IN_FILE = 1 << 24  # bytes from which on the photos of a block are kept in a file
+
+
+@dataclass(frozen=True, eq=False)
+class BlockStart:
+    """A block whose views are merged but whose Gaussians are not fitted yet."""
+
+    block: Block
+    gaussians: Gaussians  # Canonical Gaussians that belong to the block
+    count: int  # Gaussians that the block is to have in the end
+    prepared: Prepared  # Its views, without the Gaussians of their pixels
+    plan: Plan
+    before: InputScores
+
+
+def start_block(
+    piece: Scene, block: Block, covisibility: Covisibility, options: CompactOptions, frame: Frame
+) -> BlockStart:
+    """Merge the views of a block, and keep the merged Gaussians that belong to the block.
+
+    ``piece`` is the scene of the block's views, ``frame`` the canonical frame of all blocks.
+    """
+    begin_part()
+    prepared = prepare(piece, options.prepare, frame)
+    plan = make_plan(prepared, options)
+    decoded = decode_views(prepared, plan, plan.limits.count)
+    keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
+    before = score_input(prepared, plan)
+    count, prepared = round(keep.sum() / max(1, len(keep)) * decoded.count), without_gaussians(prepared)
+    return BlockStart(block, decoded.gaussians[keep], count, prepared, plan, before)
+
+
+def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
+    """Return a mask ``[n]`` of means ``[n,3]`` whose owner is one of the block's own views.
+
+    The owner is found among the views that share surfaces with the block.
+    """
+    is_candidate = covisibility.weights[list(block.own)].sum(0) > 0
+    is_candidate[list(block.own)] = True
+    owners = owning_views(means, covisibility, np.flatnonzero(is_candidate).tolist())
+    return np.isin(owners, block.own)
+
+
+def without_gaussians(prepared: Prepared) -> Prepared:
+    """Return a prepared scene without Gaussians and with photos in a file, to free their memory."""
+    moved: dict[int, np.ndarray] = {}  # arrays in files by the id of their photos, which both scenes may share
+
+    def move(images: np.ndarray) -> np.ndarray:
+        if id(images) not in moved:
+            moved[id(images)] = make_array(images.shape, images.dtype.type, IN_FILE)
+            moved[id(images)][:] = images
+            free_pages([moved[id(images)]])
+        return moved[id(images)]
+
+    def empty(scene: SceneT) -> SceneT:
+        images = move(np.asarray(scene.images))  # views with Gaussians of their own always have pictures
+        return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=images, pixels=None)
+
+    reference = prepared.reference
+    if reference.photo_files is not None:
+        reference = replace(reference, photo_files=move(reference.photo_files))
+    scene, input_scene = empty(prepared.scene), empty(prepared.input_scene)
+    return replace(prepared, reference=reference, scene=scene, input_scene=input_scene)

@@ -1,0 +1,112 @@
+"""Seams between blocks: Gaussians that views of several blocks show are fitted again, to all of these views."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+
+from gsmerge.alignment.registration.join import concat_scenes
+from gsmerge.compaction.block_start import BlockStart
+from gsmerge.facts.views import in_float64, subset
+from gsmerge.fit import fit_scene, peak_weights
+from gsmerge.raster import contributions, make_splats, tile_view
+from gsmerge.raster.photos import Photos, blank_photos
+from gsmerge.raster.tiled_view import Splats
+from gsmerge.runtime.memory import free_pages, make_array
+from gsmerge.runtime.record import add_seconds, begin_part, choose, record_part, stage
+from gsmerge.runtime.threads import in_turn
+from gsmerge.types import Decoded, Gaussians, PicturedScene
+
+FOREIGN = 0.1  # share of a Gaussian's weights in views of other blocks from which on it is at a seam
+SEAM_SHARE = 0.1  # share of a view's weights on Gaussians at seams from which on these are fitted to the view
+SEAM_STEPS = 100  # fewest steps of the fit
+SEAM_VIEW_STEPS = 2  # steps for each view
+# Share of Gaussians at seams from which on the blocks are one room, and the steps for each view then
+ROOM_SHARE, ROOM_VIEW_STEPS = 0.5, 4
+SEAM_RATE = (
+    0.6  # step sizes, relative to the usual first ones: the Gaussians are fitted already, beside older neighbours
+)
+SEAM_DECAY = 0.1  # factor on the step sizes at the end
+
+
+def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart], seed: int) -> Gaussians:
+    """Fit the Gaussians at seams again, to the photos of all blocks that show them.
+
+    All other Gaussians stay unchanged. ``owners [n]``: the block of each Gaussian. Each block fitted its Gaussians
+    beside its own version of the neighbouring Gaussians; here they are fitted beside the final version.
+    """
+    plan = next((start.plan for start in starts if start.plan.fit.fit != "none"), None)
+    if plan is None:
+        return joined
+    begin_part()
+    with stage("join"):
+        at_seam, views = find_seams(joined, owners, starts)
+        if not any(views):
+            return joined
+        scene = join_views([(start.prepared.scene, ids) for start, ids in zip(starts, views, strict=True) if ids])
+    rows = np.flatnonzero(peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution)
+    tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=SEAM_DECAY)
+    view_steps = SEAM_VIEW_STEPS if at_seam.mean() < ROOM_SHARE else ROOM_VIEW_STEPS
+    options = replace(
+        plan.fit, fit_steps=max(SEAM_STEPS, view_steps * len(scene)), photo_scale=1.0, scored=False, dropout=0.0,
+        half_res_share=0.0, min_contribution=0.0, beyond=True, tuning=tuning,
+    )  # fmt: skip
+    decoded = Decoded(joined[rows], len(rows), exact=True, fixed=~at_seam[rows])
+    with record_part(title="seams") as record:
+        fitted = fit_scene(decoded, scene, range(len(scene)), options, seed)
+    add_seconds(record.seconds)
+    choose(seams={"views": len(scene), "num_gaussians": int(at_seam.sum()), "steps": options.steps})
+    columns = {f.name: np.array(getattr(joined, f.name)) for f in fields(Gaussians)}
+    moved = at_seam[rows]  # the fit also returns the fixed Gaussians, but rounded
+    for name, column in columns.items():
+        column[rows[moved]] = getattr(fitted.gaussians, name)[moved]
+    return Gaussians(**columns)
+
+
+def find_seams(
+    joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart]
+) -> tuple[np.ndarray, list[list[int]]]:
+    """Return a mask ``[n]`` of Gaussians at seams and, for each block, its own views that show many of them."""
+    total, foreign, splats = np.zeros(len(joined)), np.zeros(len(joined)), make_splats(joined)
+    views: list[list[int]] = [[] for _ in starts]
+    for number, _, weights in _view_weights(splats, starts):
+        total += weights
+        foreign += np.where(owners == number, 0, weights)
+    at_seam = foreign > FOREIGN * total
+    for number, view, weights in _view_weights(splats, starts):  # again: those of all views would not fit into memory
+        seam_weight, weight = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam], weights))
+        if view in starts[number].prepared.reference.fit_views and seam_weight > SEAM_SHARE * weight:
+            views[number].append(view)
+    return at_seam, views
+
+
+def join_views(chosen: Sequence[tuple[PicturedScene, list[int]]]) -> PicturedScene:
+    """Join the ``chosen`` views of several scenes without Gaussians into one scene; many photos are kept in a file."""
+    total, cameras = sum(len(ids) for _, ids in chosen), chosen[0][0].cameras
+    images, first = make_array((total, cameras.height, cameras.width, 3), np.float32), 0
+    for scene, ids in chosen:
+        for view in ids:
+            images[first] = scene.images[view]
+            first += 1
+        free_pages([scene.images, images])
+    joined = concat_scenes([subset(scene.without_pictures(), ids) for scene, ids in chosen], images)
+    return PicturedScene.with_pictures(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
+
+
+def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Yield block, view, and the blending weights ``[n]`` of all Gaussians in it, for each block's own views.
+
+    Views are numbered within the prepared scene of their block.
+    """
+    for number, start in enumerate(starts):
+        own_views, repeated = set(start.block.own), start.prepared.repeated
+        views = sorted({repeated[place] for place, view in enumerate(start.block.views) if view in own_views})
+        photos = blank_photos(start.prepared.scene.cameras[views], 2)
+
+        def weights_of(view: int, photos: Photos = photos) -> np.ndarray:
+            return contributions(tile_view(splats, **photos.camera(view)))[0]
+
+        for view, weights in zip(views, in_turn(weights_of, range(len(photos))), strict=True):
+            yield number, view, weights
