@@ -159,8 +159,8 @@ def packed(contents: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> byte
 
 
 def with_member(data: bytes, name: str, content: bytes) -> bytes:
-    """The archive with other content of a member, which may be new."""
-    return packed(members(data) | {name: content}, zipfile.ZIP_DEFLATED)
+    """The archive, stored, with other content of a member, which may be new."""
+    return packed(members(data) | {name: content})
 
 
 def of_member(name: str, change: Callable[[bytes], bytes]) -> Change:

@@ -86,20 +86,20 @@ RECORDS = {
 
 def of_spz() -> dict[str, Damage]:
     return RECORDS | {
-        "40 bytes": refused(of_bytes(lambda data: data[:40])),
-        "a stream of a byte less": refused(unpacked(lambda data: data[:-1])),
-        "another magic": refused(header(magic=1)),
-        "the start of version 4": refused(content(b"NGSP\4\0\0\0")),
-        "version 9": refused(header(version=9)),
+        "40 bytes": refused(of_bytes(lambda data: data[:40]), 174, 9),
+        "a stream of a byte less": refused(unpacked(lambda data: data[:-1]), 174, 173),
+        "another magic": refused(header(magic=1), "another file"),
+        "the start of version 4": refused(content(b"NGSP\4\0\0\0"), "end of file"),
+        "version 9": refused(header(version=9), "version 9"),
         "version 1 of version 3": either(header(version=1)),
-        "another degree": refused(header(degree=4)),
-        "a fraction of 200 bits": refused(header(fraction=200)),
-        "none": refused(header(count=0)),
-        "2^32 - 1": refused(header(count=2**32 - 1)),
-        "one more": refused(header(count=len(SOME) + 1)),
+        "another degree": refused(header(degree=4), 552, 174),
+        "a fraction of 200 bits": refused(header(fraction=200), "version 1 to 4"),
+        "none": refused(header(count=0), "none promised"),
+        "2^32 - 1": refused(header(count=2**32 - 1), "64 MB"),
+        "one more": refused(header(count=len(SOME) + 1), 203, 174),
         "1,000,001 equal ones": refused(content(equal_bytes(1_000_001)), "1,000,001"),
         "1,000,001 equal ones in version 4": refused(content(equal_4(1_000_001)), "1,000,001"),
-        "half a million of degree 4": refused(content(equal_bytes(500_000, 4))),
+        "half a million of degree 4": refused(content(equal_bytes(500_000, 4)), "500,000"),
         "the first bytes of a stream": refused(content(gzip.compress(bytes(9), 1))),
     }
 
@@ -119,19 +119,19 @@ def stream(data: bytes) -> bytes:
 def of_spz4() -> dict[str, Damage]:
     frame = b"\x28\xb5\x2f\xfd\xe0" + b"\xff" * 7 + b"\0"
     return RECORDS | {
-        "15 bytes": refused(of_bytes(lambda data: data[:15])),
-        "60 bytes": refused(of_bytes(lambda data: data[:60])),
-        "three bytes less": refused(of_bytes(lambda data: data[:-3])),
-        "none": refused(at(PLACE_OF_COUNT, "<I", 0)),
-        "2^32 - 1": refused(at(PLACE_OF_COUNT, "<I", 2**32 - 1)),
-        "degree 5": refused(at(12, "B", 5)),
-        "three streams": refused(at(15, "B", 3)),
-        "a table far away": refused(at(16, "<I", 2**31 - 1)),
-        "a stream of 2^63": refused(at(SIZES.start, "<Q", 2**63)),
-        "a stream that unpacks to 2^40": refused(at(SIZES.start + 8, "<Q", 2**40)),
-        "no stream": refused(at(SIZES.stop, "4s", b"none")),
-        "a frame of another size": refused(at(SIZES.stop, f"{len(frame)}s", frame)),
-        "a longer stream": refused(of_bytes(stream)),
+        "15 bytes": refused(of_bytes(lambda data: data[:15]), "end of file"),
+        "60 bytes": refused(of_bytes(lambda data: data[:60]), "end of file"),
+        "three bytes less": refused(of_bytes(lambda data: data[:-3]), "truncated"),
+        "none": refused(at(PLACE_OF_COUNT, "<I", 0), "none promised"),
+        "2^32 - 1": refused(at(PLACE_OF_COUNT, "<I", 2**32 - 1), "64 MB"),
+        "degree 5": refused(at(12, "B", 5), "degree 5"),
+        "three streams": refused(at(15, "B", 3), "columns"),
+        "a table far away": refused(at(16, "<I", 2**31 - 1), "end of file"),
+        "a stream of 2^63": refused(at(SIZES.start, "<Q", 2**63), "truncated"),
+        "a stream that unpacks to 2^40": refused(at(SIZES.start + 8, "<Q", 2**40), "columns"),
+        "no stream": refused(at(SIZES.stop, "4s", b"none"), "Zstandard"),
+        "a frame of another size": refused(at(SIZES.stop, f"{len(frame)}s", frame), "Zstandard"),
+        "a longer stream": refused(of_bytes(stream), "another size"),
     }
 
 
@@ -208,7 +208,7 @@ def of_glb() -> dict[str, Damage]:
             damages[f"{part} of {value}"] = either(place("nodes", 0, part, value=[value] * 3))
     accessor, view = ("accessors", 2), ("bufferViews", 0)
     return damages | {
-        "another length in the header": refused(at(8, "<I", 2**32 - 1)),
+        "another length in the header": refused(at(8, "<I", 2**32 - 1), "cut"),
         "the same document": read(of_bytes(lambda data: document(data)[1](document(data)[0]))),
         "no splats": refused(primitive(lambda p: p["extensions"].clear()), SPLATTING, "mesh"),
         "linear colours": refused(splats(colorSpace="lin_rec709_display"), "lin_rec709_display"),
@@ -221,8 +221,8 @@ def of_glb() -> dict[str, Damage]:
         "another file": refused(place("buffers", 0, "uri", value="b.bin"), "another file"),
         "sparse values": refused(place(*accessor, "sparse", value={}), "sparse"),
         "a count of 10^12": refused(place(*accessor, "count", value=10**12), "cut"),
-        "a count of 400 digits": refused(place("accessors", 0, "count", value=10**400)),
-        "a count of 10^9": refused(place("accessors", 0, "count", value=10**9)),
+        "a count of 400 digits": refused(place("accessors", 0, "count", value=10**400), "count"),
+        "a count of 10^9": refused(place("accessors", 0, "count", value=10**9), "cut"),
         "fewer of one attribute": refused(place(*accessor, "count", value=5), "others"),
         "a length of 2^62": either(place(*view, "byteLength", value=2**62)),
         "a stride of 2^62": either(place(*view, "byteStride", value=2**62)),
@@ -233,7 +233,7 @@ def of_glb() -> dict[str, Damage]:
         "nodes in one another": refused(edit(chain), slow=True),
         "copies without end": refused(edit(copies), slow=True),
         "200,000 empty nodes": refused(edit(empty), slow=True),
-        "values for many attributes": refused(edit(shared)),
+        "values for many attributes": refused(edit(shared), "same values"),
     }
 
 

@@ -7,7 +7,7 @@ import io
 import json
 import pickle
 import tarfile
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 from .case import Damage, either, refused, slow
 from .changes import content, cut, of_bytes, of_entries, packed, text, zeros
@@ -60,6 +60,7 @@ def _pieces(kind: str) -> dict[str, Damage]:
     damages |= {
         "all but the end": either(cut(0.999)),
         "empty": refused(content(b"")),
+        **({} if SOUNDS[kind].scene else {"missing": refused(Path.unlink, "no such file")}),
         "zeros": refused(content(bytes(5000))),
         "a pickle": refused(content(pickle.dumps({"a": 1}) * 9)),
         "bytes that are no text": outcome(content(bytes(range(256)))),

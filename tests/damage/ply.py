@@ -140,9 +140,9 @@ def _counts() -> dict[str, Damage]:
     return {
         **{f"count {str(n)[:20]}": refused(swap(VERTEX, f"element vertex {n}\n"), *said) for n, said in wrong.items()},
         "ascii count 2^62": refused(text_rows("1 2 3\n", 2**62)),
-        "further element of 2^40 rows": refused(before("end_header\n", huge, "property double a")),
-        "first element of 2^40 rows": refused(before(VERTEX, huge, "property double a")),
-        "rows without columns": refused(before(VERTEX, huge)),
+        "further element of 2^40 rows": refused(before("end_header\n", huge, "property double a"), "'more'"),
+        "first element of 2^40 rows": refused(before(VERTEX, huge, "property double a"), "'more'"),
+        "rows without columns": refused(before(VERTEX, huge), "columns"),
     }
 
 
@@ -152,9 +152,9 @@ def _headers() -> dict[str, Damage]:
     return {
         "another name": refused(swap("element vertex", "element points"), "'vertex'", "'points'"),
         "name with an escape sequence": refused(swap("element vertex", "element \x1b[31mvertex")),
-        "name of a megabyte": refused(swap(LAST, "property float " + "a" * 2**20 + "\n")),
-        "name that is not ascii": refused(swap("f_dc_0", "f_dc_\xe9")),
-        "keyword that is not ascii": refused(swap("comment", "c\xe9mment")),
+        "name of a megabyte": refused(swap(LAST, "property float " + "a" * 2**20 + "\n"), "1 MiB"),
+        "name that is not ascii": refused(swap("f_dc_0", "f_dc_\xe9"), "column f_dc_0"),
+        "keyword that is not ascii": refused(swap("comment", "c\xe9mment"), "line 3"),
         "no end": refused(swap("end_header\n", ""), "end of file"),
         "another first line": refused(swap("ply\n", "plywood\n"), "'ply'"),
         "a column missing": refused(rename("scale_1", "scale_2"), "column scale_1"),
@@ -165,13 +165,13 @@ def _headers() -> dict[str, Damage]:
         "f_rest with a gap": refused(with_rest(*range(8), 9), "9 f_rest"),
         "a list of floats": refused(swap(LAST, "property list uchar float rot_3\n"), "list"),
         "20,000 columns": refused(before(LAST, *(f"property uchar p{i}" for i in range(20_000)))),
-        "20,000 elements": refused(before("end_header\n", *elements)),
+        "20,000 elements": refused(before("end_header\n", *elements), "steps"),
         "f_rest of 3000 columns": refused(before(LAST, *(f"property float f_rest_{i}" for i in range(3000)))),
-        "list of 2^32": refused(before("property float x\n", "property list uint double many")),
-        "list of a negative length": refused(before("property float x\n", "property list char double many")),
-        "million empty lists": refused(before(VERTEX, *lists)),
-        "million empty lists after the vertices": refused(of_bytes(empty_lists)),
-        "100,000 comments": refused(before(VERTEX, *(["comment nothing"] * 100_000))),
+        "list of 2^32": refused(before("property float x\n", "property list uint double many"), "list"),
+        "list of a negative length": refused(before("property float x\n", "property list char double many"), "list"),
+        "million empty lists": refused(before(VERTEX, *lists), "140 MB"),
+        "million empty lists after the vertices": refused(of_bytes(empty_lists), "140 MB"),
+        "100,000 comments": refused(before(VERTEX, *(["comment nothing"] * 100_000)), "1 MiB"),
         "comment that is not ascii": read(before(VERTEX, "comment \xff\xfe")),
         "comment with an escape sequence": read(before(VERTEX, "comment \x1b[2J\x07")),
         "a line of a megabyte": refused(text_rows("1" * 2**20)),
@@ -195,9 +195,9 @@ def _values() -> dict[str, Damage]:
         "random bits": either(rows(random_bits), slow=True),
         f"{MANY} rows of one place": either(of_bytes(repeated), slow=True),
         "packed noise": either(noise(), slow=True),
-        "packed between infinities": refused(noise(-np.inf, np.inf)),
+        "packed between infinities": refused(noise(-np.inf, np.inf), "NaN"),
         "packed between 3e38": either(noise(-3e38, 3e38), slow=True),
-        "packed with 2^50 chunks": refused(noise(chunks=2**50)),
+        "packed with 2^50 chunks": refused(noise(chunks=2**50), "'chunk'"),
         "packed with no chunks": refused(noise(chunks=0), "1 chunks", COUNT, 0),
     }
 
@@ -205,7 +205,7 @@ def _values() -> dict[str, Damage]:
 def _huge() -> dict[str, Damage]:
     lists = ("element face 100000000", "property list uchar uchar vertex_index")
     return {
-        "8 GB of zeros after ply": refused(zeros(2**33, b"ply\n")),
+        "8 GB of zeros after ply": refused(zeros(2**33, b"ply\n"), "1 MiB"),
         "8 GB of zeros in the header": refused(cut_header, slow=True),
         "8 GB of zeros as ascii rows": refused(header_of(2**26, "ascii"), slow=True),
         "8 GB of zeros as lists": refused(header_of(COUNT, "binary_little_endian", *lists), slow=True),

@@ -468,6 +468,7 @@ SOUNDS: dict[str, Sound] = {
     # States and networks
     "gsm": Sound("a.gsm", write_state(), load_state, INSPECT),
     "gsm of two batches": Sound("a.gsm", write_state(batches=2), load_state, INSPECT, rare=True),
+    "gsm to extend": Sound("a.gsm", write_state(), load_state, (), rare=True, fuzzed=False),
     "gsm of features": Sound("a.gsm", write_state("paper"), load_state, INSPECT),
     "checkpoint": Sound("a.safetensors", lambda folder: written(folder / "a.safetensors", noisy()), load_checkpoint,
                         INSPECT),
@@ -476,6 +477,7 @@ SOUNDS: dict[str, Sound] = {
     **{f"photo of {kind}": Sound("a.png", write_photo("png", kind), check_photo, (), rare=True)
        for kind in ("grey", "alpha", "16 bits")},
     **{f"mask.{ending}": Sound("a.png", write_photo(ending), check_mask, (), rare=True) for ending in PHOTO_ENDINGS},
+    "mask of alpha": Sound("a.png", write_photo("png", "alpha"), check_mask, (), rare=True),
     "crop": Sound("a.json", write_text("a.json", BOX), read_crop, ()),
     "list": Sound("list.txt", write_text("list.txt", "a.ply\n# b\nscene c\n\nd.spz\n"), check_list, ()),
     "set": Sound("pairs.txt", write_text("pairs.txt", PAIRS), check_pairs, ()),

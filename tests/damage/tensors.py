@@ -13,6 +13,8 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
+from gsmerge.io.formats import gsm
+
 from .case import Change, Damage, refused
 from .changes import at, of_bytes, packed, put, zeros
 
@@ -22,16 +24,16 @@ WEIGHT = "encoder.latent.weight"
 
 
 def entry(path: Path) -> tuple[str, dict[str, Any]]:
-    """The one entry of a file's metadata: its name, which says the format, and the header in it, without checksums.
-
-    Whoever makes a hostile file makes no checksums, or right ones.
-    """
+    """The one entry of a file's metadata: its name, which says the format, and the header in it, without checksums."""
     size = int.from_bytes(path.read_bytes()[:8], "little")
     ((form, text),) = json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"].items()
     return form, {name: value for name, value in json.loads(text).items() if name != "checksums"}
 
 
 def save(path: Path, arrays: dict[str, np.ndarray], form: str, header: Any) -> None:
+    """Write a file whose checksums are right, as whoever makes a hostile file makes them."""
+    if form == gsm.HEADER and isinstance(header, dict):
+        header = header | {"checksums": gsm._checksums(header, arrays)}
     save_file(arrays, path, {form: header if isinstance(header, str) else json.dumps(header)})
 
 
@@ -136,12 +138,12 @@ def of_each(arrays: Iterable[str], floats: Iterable[str]) -> dict[str, Damage]:
     """Each array missing, of another type and of another shape; those of numbers with a NaN."""
     damages: dict[str, Damage] = {}
     for name in arrays:
-        damages[f"no {name}"] = refused(without_array(name))
+        damages[f"no {name}"] = refused(without_array(name), name)
         damages[f"{name} of another type"] = refused(
-            of_array(name, lambda a: a.astype(np.float32 if a.dtype == np.float64 else np.float64))
+            of_array(name, lambda a: a.astype(np.float32 if a.dtype == np.float64 else np.float64)), name
         )
-        damages[f"{name} of another shape"] = refused(of_array(name, lambda a: a[None]))
-    return damages | {f"NaN in {name}": refused(fill(name, float("nan"))) for name in floats}
+        damages[f"{name} of another shape"] = refused(of_array(name, lambda a: a[None]), name)
+    return damages | {f"NaN in {name}": refused(fill(name, float("nan")), name) for name in floats}
 
 
 def of_results() -> dict[str, Damage]:
@@ -153,8 +155,6 @@ def of_results() -> dict[str, Damage]:
         "views without pixels": with_header(width=0),
         "views of 65536 x 65536": with_header(width=65536, height=65536),
         "a width of true": with_header(width=True),
-        "batches by number": with_about(batches=5),
-        "batches of numbers": with_about(batches=[5]),
         "about in a list": with_header(about=[]),
         "a name less": with_header(names=["a"]),
         "names by number": with_header(names=[1, 2]),
@@ -174,7 +174,7 @@ def of_results() -> dict[str, Damage]:
         **of_each(RESULTS, ("viewmats", "Ks")),
         "the schema before": refused(with_header(schema=2), "run extend again"),
         "a schema to come": refused(with_header(schema=9, gsmerge="9.9"), "update gsmerge"),
-        "a million objects": refused(with_about(notes=[[]] * 3_000_000), slow=True),
+        "three million objects": refused(with_about(notes=[[]] * 3_000_000), slow=True),
         "a changed sign": refused(negated("sh0"), "expected the checksum", place="a.gsm: sh0"),
     }
 
@@ -225,4 +225,17 @@ def of_checkpoint() -> dict[str, Damage]:
     return {name: refused(d.change, *(d.says or ("expected",)), slow=d.slow) for name, d in damages.items()}
 
 
-DAMAGES = {"gsm": of_any() | of_results(), "gsm of features": of_features(), "checkpoint": of_checkpoint()}
+def of_batches() -> dict[str, Damage]:
+    """What ``extend`` alone reads."""
+    return {
+        "batches by number": refused(with_about(batches=5), "batches"),
+        "batches of numbers": refused(with_about(batches=[5]), "batches"),
+    }
+
+
+DAMAGES = {
+    "gsm to extend": of_batches(),
+    "gsm": of_any() | of_results(),
+    "gsm of features": of_features(),
+    "checkpoint": of_checkpoint(),
+}
