@@ -24,7 +24,7 @@ from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_distance, describe_loss
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record
-from gsmerge.types import Cameras, Gaussians, Scene, StrPath
+from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene
 
 if TYPE_CHECKING:
     import torch

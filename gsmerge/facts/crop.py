@@ -10,7 +10,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.holes import usual_opacity
 from gsmerge.facts.views import take_rows
 from gsmerge.frame import canonicalise
-from gsmerge.geometry import Region, rgb_to_sh0, turn_by
+from gsmerge.geometry import lies_inside, rgb_to_sh0, turn_by
 from gsmerge.raster import render_in_batches
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
