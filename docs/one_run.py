@@ -392,8 +392,8 @@ def build_section(run: Run) -> str:
         text(
             "**`fit_scene`** compares renders with the photos and changes all parameters. Half way it splits the",
             "Gaussians with the largest errors, and later it drops those that fade.",
-            f"{len(fitted.gaussians):,} are left; {len(children)} of these come from the pixel's Gaussian.",
-            "As a test, patches of the photos stay out of the first steps, which draw a quarter of the pixels:",
+            f"{len(fitted.gaussians):,} are left; {len(children)} of them come from the pixel's.",
+            "As a test, patches of the photos stay out of the first steps, which draw a quarter of all pixels:",
             f"the PSNR of the patches rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
             say(
                 "so the fit is accepted.",
