@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 
 
 def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
-    """Make all decisions that the options leave open, and what they need: networks, and merged Gaussians out of sight.
+    """Make all decisions that the options leave open.
 
+    This also loads the networks and merges the Gaussians that no view sees, because decisions need them.
     ``checkpoint``: networks to use instead of those that the options name. Raises UsageError if the scene or the
     networks do not allow what the options ask for.
     """
@@ -42,14 +43,14 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
 
 def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
-    """Load the networks that a run uses; None: it uses closed formulas alone.
+    """Load the networks that a run uses; None: the run uses closed formulas alone.
 
     Raises SceneError if networks are required and cannot be used, UsageError if they do not fit the options.
     """
     from gsmerge.networks.checkpoint import find_checkpoint, load_checkpoint
 
     if not cuts_views(options, size):
-        if options.checkpoint not in CHECKPOINTS:  # a damaged file is refused, although nothing uses it
+        if options.checkpoint not in CHECKPOINTS:  # refuse a damaged file, although nothing would use it
             load_checkpoint(options.checkpoint)
         return None
     checkpoint, notes = find_checkpoint(choose_networks(options, size), required=options.require_checkpoint)
@@ -63,7 +64,7 @@ def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None
 
 
 def merge_hidden(prepared: Prepared, settled: Settled) -> Gaussians:
-    """Merge the Gaussians that no view sees into their share of the result, and clean them up."""
+    """Merge the Gaussians that no view sees, so that they keep their share of the result, and clean them up."""
     scene, unseen = prepared.scene, prepared.unseen
     visible = unseen[unseen.opacities >= settled.options.decode.min_opacity]
     count = min(len(visible), count_unseen(prepared, settled))
