@@ -64,7 +64,7 @@ def test_gaussians_of_two_scales_are_marked_as_flat(tmp_path: Path) -> None:
 def test_files_of_different_modes_are_joined_without_one(tmp_path: Path) -> None:
     inputs = [marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z"), marked(tmp_path / "b.ply")]
     document = convert_files(ConvertOptions(inputs, tmp_path / "both.ply"))
-    assert [note for note in document["notes"] if note.startswith("not all files are marked")] == [
+    assert [note for note in document["notes"] if note.startswith("not all files have the mark")] == [
         "not all files have the mark 'SplatRenderMode: mip', so the joined file has not",
         "not all files have the mark 'Vertical axis: z', so the joined file has not",
     ]
