@@ -1,4 +1,4 @@
-"""Numbers of Gaussians: what superpixels and K give, and what budgets, file sizes and devices ask for or allow."""
+"""Numbers of Gaussians that superpixels and K give, and that budgets, file sizes and devices ask for or allow."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, 
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 
 LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
-MAX_ADAPTED = 4  # most times more or fewer superpixels than bass-adaptive starts with
-FEW_PIXELS = 1 << 18  # of a few small photos
-FEW = 0.5  # times the photos' pixels, up to those: of fewer Gaussians a share is one of pixels, and this one at most
+MAX_ADAPTED = 4  # bass-adaptive comes to at most so many times more, or fewer, superpixels than it starts with
+FEW_PIXELS = 1 << 18  # pixels of a few small photos
+# Gaussians per pixel of the photos, counting at most FEW_PIXELS pixels, below which a scene has few Gaussians. Then a
+# share of superpixels is a share of pixels, and at most this share of the Gaussians
+FEW = 0.5
 
 
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
     """Return the number of Gaussians that a budget or a file size asks for; None without either."""
     device = DEVICES.get(str(options.budget))
-    if device is not None:  # a limit alone, until it is known how many the scene bears, unless it is to be filled
-        known = [num_input] if options.fill else [] if options.most is None else [options.most]
-        return min(device, *known) if known else None
+    if device is not None:  # only a limit, unless it is to be filled, or the useful number for the scene is known
+        most = num_input if options.fill else options.most
+        return None if most is None else min(device, most)
     if options.budget in (None, AUTO):
         return None
     most = num_input if options.most is None else options.most
@@ -32,19 +34,22 @@ def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int |
 
 @dataclass(frozen=True)
 class FileSize:
-    """A size in bytes that the output may have."""
+    """Largest size of the output in bytes."""
 
     num_bytes: int
-    file: Format  # of the output
+    file: Format  # Format of the output
 
     @property
     def packed(self) -> bool:
-        """Whether the bytes depend on the content, so that only trials tell them."""
+        """Whether the number of bytes depends on the content, so that files have to be made to measure it."""
         return self.file.count is None
 
 
 def file_size(options: BudgetOptions) -> FileSize | None:
-    """Return the size that a budget in bytes asks for; None for any other, UsageError where no format counts them."""
+    """Return the size that a budget in bytes asks for; None for any other budget.
+
+    Raises UsageError if the format of the output has no size that follows from its Gaussians.
+    """
     if not options.in_bytes:
         return None
     file = output_format(options.output or PLY.ending, levels=True, cameras=True)
@@ -54,7 +59,7 @@ def file_size(options: BudgetOptions) -> FileSize | None:
 
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
-    """Return the largest number of Gaussians that budget, file size or device allow, at most that of the input."""
+    """Return the largest number of Gaussians that budget, file size and device allow, at most that of the input."""
     limits = DEVICES.get(str(options.budget)), exact_count(options, num_input, sh_degree), options.most
     return min([num_input, *(limit for limit in limits if limit is not None)])
 
@@ -68,9 +73,9 @@ class CountLimits:
     min_count: int  # Fewest Gaussians that the scene can be cut to: one for each view
     max_count: int  # Most Gaussians that a budget, a size or a device allows
     exact: int | None  # Gaussians that a budget or a size asks for; None without either
-    num_pixels: int  # Of all views
-    num_input: int  # Gaussians that the count is one of
-    most: int  # Most Gaussians of those that the scene bears, where that is known
+    num_pixels: int  # Pixels of all views
+    num_input: int  # Gaussians of the scene
+    most: int  # Most Gaussians that are useful for the scene; as many as it has, if that is not known
 
     @property
     def count(self) -> int | None:
@@ -96,9 +101,9 @@ def count_limits(
 ) -> CountLimits:
     """Compute the limits on the number of Gaussians.
 
-    ``num_input``: number that shares of a budget refer to; None: that of the scene. ``num_reserved``: Gaussians of the
-    result that are fixed already, such as those that no view sees. Raises UsageError if more superpixels are requested
-    than there are pixels, or fewer Gaussians than views.
+    ``num_input``: the number of Gaussians that shares of a budget refer to; None: that of the scene. ``num_reserved``:
+    the number of Gaussians of the result that exist already, such as those that no view sees. Raises UsageError if more
+    superpixels are requested than there are pixels, or fewer Gaussians than views.
     """
     count, views = scene.num_gaussians, scene.num_views
     exact = exact_count(budget, count if num_input is None else num_input, scene.sh_degree)
@@ -106,8 +111,8 @@ def count_limits(
         exact = min(max(1, exact - num_reserved), count)
     max_count = min(max_allowed(budget, count, scene.sh_degree), count if exact is None else exact)
     if max_count < min(views, count):
-        perhaps = f'; {max_count} % is "{max_count}%"' if max_count <= 100 else ""
-        raise UsageError(f"budget: expected at least {views}, one for each view, got {max_count}{perhaps}")
+        remedy = f'; for {max_count} % pass "{max_count}%"' if max_count <= 100 else ""
+        raise UsageError(f"budget: expected at least {views}, one for each view, got {max_count}{remedy}")
     return CountLimits(
         per_view=superpixels_per_view(scene, segment) if views else 0,
         default=default_count(scene, segment, decode),
@@ -121,7 +126,11 @@ def count_limits(
 
 
 def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
-    """Return the superpixels per view; a share is one of the Gaussians if they are fewer than pixels, but not few."""
+    """Return the number of superpixels per view.
+
+    A share is a share of the pixels. If views have no Gaussians of their own, it is a share of the Gaussians if these
+    are fewer, unless the scene has only few Gaussians.
+    """
     per_view = count_for(segment, scene.height, scene.width)
     if scene.has_own_pixels or segment.per_view is not None:
         return per_view
@@ -133,11 +142,12 @@ def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
 
 def has_few_rows(scene: SceneSize) -> bool:
     """Return whether Gaussians without pixels, such as tokens, are too few for a share of them to show the photos."""
-    shown = scene.pictures == "photos" and not scene.has_own_pixels
-    return shown and scene.num_gaussians < FEW * _few_pixels(scene)
+    has_photos = scene.pictures == "photos" and not scene.has_own_pixels
+    return has_photos and scene.num_gaussians < FEW * _few_pixels(scene)
 
 
 def _few_pixels(scene: SceneSize) -> int:
+    """Return the number of pixels of all views, at most ``FEW_PIXELS``."""
     return min(FEW_PIXELS, scene.num_views * scene.pixels_per_view)
 
 
@@ -152,7 +162,7 @@ def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptio
 
 
 def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:
-    """Return the largest number of Gaussians that a run can give; adaptive superpixels may exceed the request."""
+    """Return the largest number of Gaussians that a run can give; adaptive superpixels may give more than requested."""
     if limits.count is not None:
         return limits.count
     return min(MAX_ADAPTED * limits.default, limits.max_count) if segment.adapts else limits.default

@@ -1,4 +1,7 @@
-"""The arrows: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> pruned -> filled."""
+"""The stages in their order, from a prepared scene to the Gaussians of a result.
+
+scene -> groups -> Feature Gaussians -> merged -> refined -> decoded -> fitted -> pruned -> filled
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from gsmerge.stages.prune import split_unseen
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded, Gaussians
 
-# Prepared scene, plan and count -> canonical Gaussians, as many as the count; None: as many as the plan gives
+# Prepared scene, plan and count -> fitted canonical Gaussians; a count of None: as many as the plan gives
 Build = Callable[[Prepared, Plan, int | None], Fitted]
 
 
@@ -42,12 +45,14 @@ def decode_pairs(prepared: Prepared, plan: Plan, count: int | None) -> list[Deco
 
 def decode_views(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
     """Merge the superpixels of all views, and decode them into the Gaussians that a fit starts from."""
-    whole = keep_all(prepared.scene, count)
-    return whole or decode_merged(merge_views(prepared, plan, count), prepared.scene, plan.decode, grows=plan.fit.grows)
+    unchanged = keep_all(prepared.scene, count)
+    if unchanged is not None:
+        return unchanged
+    return decode_merged(merge_views(prepared, plan, count), prepared.scene, plan.decode, grows=plan.fit.grows)
 
 
 def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedViews:
-    """Merge the superpixels of all views; compacting and adding views to a state share this part."""
+    """Merge the superpixels of all views; used to compact a scene and to add views to a state."""
     scene = prepared.scene
     segmentation = segment_scene(scene, plan.superpixels, count)
     members = assign(scene, segmentation.groups, by_contribution=plan.by_contribution)
@@ -60,7 +65,7 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
 
 
 def fit(starts: list[Decoded], prepared: Prepared, plan: Plan) -> Fitted:
-    """Fit Gaussians to the pictures of the views; of several ``starts``, return the one with the best result."""
+    """Fit Gaussians to the pictures of the views; of several ``starts``, return the best result."""
     if plan.merges_pairs:
         return fit_pairs(starts, prepared, plan.fit, plan.seed, plan.target_psnr or 0.0)
     [start] = starts
@@ -70,10 +75,10 @@ def fit(starts: list[Decoded], prepared: Prepared, plan: Plan) -> Fitted:
 
 
 def prune_and_fill(fitted: Fitted, start: Decoded, prepared: Prepared, plan: Plan) -> Fitted:
-    """Drop the Gaussians that nobody sees, and fill what lies between the views with others in their place.
+    """Drop the Gaussians that no view sees, and fill gaps between the views with new Gaussians instead.
 
-    Gaps are filled after a long fit that was accepted, where the whole scene counts. Merged pairs and an unchanged
-    input stay whole.
+    Gaps are filled only after a long fit that was accepted, and only if all of the scene counts, not a region of it.
+    Merged pairs and an unchanged input stay complete.
     """
     is_unchanged = start.is_input and fitted.report is None
     if not plan.prunes or is_unchanged:
@@ -81,11 +86,11 @@ def prune_and_fill(fitted: Fitted, start: Decoded, prepared: Prepared, plan: Pla
     scene = prepared.scene
     seen, unseen = split_unseen(fitted.gaussians, fitted.cameras)
     is_long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
-    is_whole = scene.empty is None and scene.region is None and prepared.reference.of_views  # placed views see all
+    is_whole = scene.empty is None and scene.region is None and prepared.reference.of_views
     added = seen[:0]
     if is_long and is_whole:
         added = fill_between(seen, fitted.cameras, fitted.outside, len(unseen), beyond=plan.fit.beyond)
-    if plan.fit.fills:  # the budget is used up with what nobody sees
+    if plan.fit.fills:  # the rest of the budget goes to Gaussians that no view sees
         added = Gaussians.concat([unseen[: len(unseen) - len(added)], added])
     written = Gaussians.concat([seen, added])
     most = start.count if plan.fit.grows else len(start.gaussians)

@@ -1,7 +1,7 @@
 """The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
 
-:func:`settle` and :func:`decide` make every choice once. Each stage is handed its own part of the plan, and no
-stage knows the options of another.
+:func:`fill_options` and :func:`decide` make every choice once. Each stage gets its own part of the plan, and no stage
+knows the options of another.
 """
 
 from __future__ import annotations
@@ -42,23 +42,27 @@ if TYPE_CHECKING:
     from gsmerge.networks.weights import NetworkWeights
     from gsmerge.raster.photos import PhotoScore
 
-AUTO_STEPS = 2  # times the usual steps with budget auto: fewer Gaussians cost less, and need them for detail
-SHORT_STEPS = 60  # of a fit that a better start still matters to
-MOST_STEPS = 2.0  # times the steps, for more than the usual share of Gaussians in the pixels
-USUAL_VIEWS = 12  # that the steps of an effort are for; more need more
-FIDELITY_PSNR = (
-    32.5  # dB from the input in its views that results keep by default where there are no photos and no pixels
-)
-FIDELITY_LOSS = 0.3  # dB that they may show the photos worse than the input where there are photos and no pixels
-# Gaussians of a scene without views for each step of its fit, more of them the more it draws; up to those of an effort
+AUTO_STEPS = 2  # steps with budget auto, relative to the usual: fewer Gaussians cost less, and need them for detail
+SHORT_STEPS = 60  # up to so many steps, a fit still gains from a better start
+MOST_STEPS = 2.0  # most steps for more than the usual share of Gaussians per pixel, relative to the usual steps
+USUAL_VIEWS = 12  # views up to which the steps of an effort are enough
+# By default, results without photos and pixels have at least this PSNR (dB) against the input in its views
+FIDELITY_PSNR = 32.5
+# By default, results with photos but without pixels show the photos at most so many dB worse than the input
+FIDELITY_LOSS = 0.3
+# A scene without views gets one step for every PER_STEP of its Gaussians, of a larger result for every PER_STEP plus
+# one for each PER_DRAWN Gaussians of the result; at most the steps of the effort
 PER_STEP, PER_DRAWN = 700, 40
-RENDERS_STEPS = 0.35  # times the step sizes of a fit where renders stand for photos: it begins near to them
-PLACED_STEPS = 0.2  # the same where views are placed, which show other views less
-NO_FIT = "nothing is fitted to placed views: that takes --effort best, or the default effort with a --budget"
-BLOCK_GAUSSIANS = 8_000_000  # of a block's own views, of an automatic number of blocks
-WHOLE_GAUSSIANS = 20_000_000  # up to which a scene is in one piece, unless it has many views
-BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same in views, where those of different blocks see little of each other
-LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
+RENDERS_STEPS = 0.35  # step sizes of a fit to renders instead of photos, relative to the usual: it begins near to them
+PLACED_STEPS = 0.2  # the same for placed views, which say less about other views
+NO_FIT = "without cameras there is no fit to placed views unless --effort best, or the default effort with a --budget"
+BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic
+WHOLE_GAUSSIANS = 20_000_000  # Gaussians up to which a scene is compacted in one piece, unless it has many views
+BLOCK_VIEWS, WHOLE_VIEWS = (
+    42,
+    168,
+)  # the same two limits in views, if views of different blocks see little of each other
+LONE_K = 4  # K if all views have one camera, because no other view adds Gaussians of its own to a surface
 
 
 @dataclass(frozen=True)
@@ -68,10 +72,10 @@ class Effort:
     steps: int  # Steps of the full fit
     rectangles: float  # Rectangles per superpixel of `rdseg`
     early_sweeps: int  # Sweeps of `rdseg` before rectangles are merged
-    merges: bool = True  # Whether Gaussians of different views are merged
-    refines: bool = True  # Whether `checkpoint="auto"` runs more of the networks than the heads
-    prunes: bool = True  # Whether Gaussians in no photo are left out where nothing is fitted
-    large_photos: bool = True  # Whether `photo_scale="auto"` may look at larger photos
+    merges: bool = True  # Merge Gaussians of different views
+    refines: bool = True  # With `checkpoint="auto"`, run all networks, not only the heads
+    prunes: bool = True  # Without a fit, leave out Gaussians that no photo shows
+    large_photos: bool = True  # With `photo_scale="auto"`, allow photos larger than the views
     report_views: int = REPORT_VIEWS  # Views that input and result are scored on for the report alone
 
 
@@ -91,24 +95,25 @@ class Plan:
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
-    merges_pairs: bool  # Whether neighbours are merged pair by pair, not superpixels
+    merges_pairs: bool  # Merge neighbours pair by pair instead of superpixels
     clean: CleanOptions  # What is left out of the result
     unseen: Gaussians  # Merged canonical Gaussians that no view sees
-    target_psnr: float | None  # PSNR (dB) that the input's views have to reach; None: no target, or not known yet
-    keeps_fidelity: bool  # see :func:`keeps_fidelity`
+    target_psnr: float | None  # PSNR (dB) that the result has to reach; None: no target, or not known yet
+    keeps_fidelity: bool  # See :func:`keeps_fidelity`
     max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
-    auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
+    auto_count: bool  # The scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
-    output: str  # Name of the output's file, which may round what it keeps; "": none
-    size: FileSize | None  # What the output's file may have at most; None: any
+    output: str  # Name of the output's file, whose format may round values; "": no file
+    size: FileSize | None  # Largest size of the output's file; None: any
     scored_views: tuple[int, ...]  # Given views that input and result are scored on
     seed: int  # Everything random depends on it alone
     checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
-    free_poses: bool = False  # Whether cameras are asked to move, and not only where that is needed
-    new_views: bool = False  # Whether the quality of new views is estimated
-    before: PhotoScore | None = None  # Of the input, where photos and not pixels decide the count
-    # [h,w] bool of each scored view: the pixels that the input covers, where renders of it judge; None: nearly all
+    free_poses: bool = False  # The options ask for moved cameras, even where the scene does not need it
+    new_views: bool = False  # Estimate the quality of new views
+    before: PhotoScore | None = None  # Score of the input, if photos and not pixels decide the count
+    # [h,w] bool for each scored view, if renders of the input stand for photos: the pixels that the input covers; None:
+    # nearly all
     covered: tuple[np.ndarray, ...] | None = None
 
     @property
@@ -128,12 +133,12 @@ class Plan:
 
     @property
     def weakens(self) -> bool:
-        """Whether groups that other views see through start with less opacity, because a long fit follows."""
+        """Whether groups that other views see through start with less opacity; a long fit follows and closes holes."""
         return self.superpixels.start_share < 1 and self.checkpoint is None
 
     @property
     def cleans_last(self) -> bool:
-        """Whether the number is searched for without clean-up: what that leaves out would count as errors."""
+        """Whether clean-up follows the search for the count: what it leaves out would count as errors in the search."""
         return self.keeps_fidelity and self.clean.asked
 
     @property
@@ -147,7 +152,7 @@ class Plan:
         return self.superpixels.limits
 
     def with_fixed_cameras(self) -> Plan:
-        """Return the plan with cameras that the fit leaves in place."""
+        """Return the plan with a fit that does not move cameras."""
         return replace(self, fit=replace(self.fit, move_cameras=False))
 
     def with_fit(self, fit: FitOptions) -> Plan:
@@ -156,23 +161,23 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Settled:
-    """Options in which the scene has filled what they left open."""
+class FilledOptions:
+    """Options whose open settings were filled in from facts about the scene."""
 
-    asked: CompactOptions  # As they were given
-    options: CompactOptions  # With the budget that the scene bears, and K
+    asked: CompactOptions  # The options as they were given
+    options: CompactOptions  # With K, and a budget that the scene can make use of
     segment: SegmentOptions  # With numbers that depend on effort and scene
-    clean: CleanOptions  # Without what no photo can decide
+    clean: CleanOptions  # Without the sky, if no photo shows where it is
 
     @property
     def counted(self) -> CompactOptions:
-        """The options by which Gaussians are counted."""
+        """The options that decide the number of Gaussians."""
         superpixels = replace(self.options.segment, superpixels=self.segment.superpixels)
         return replace(self.options, segment=superpixels)
 
 
-def settle(prepared: Prepared, options: CompactOptions) -> Settled:
-    """Fill in what options leave open and the scene decides; notes give the reasons."""
+def fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
+    """Fill in the settings that the options leave open and the scene decides; notes give the reasons."""
     size, agreement = prepared.size, prepared.agreement
     filled = resolve_budget(size, options, agreement)
     segment = _resolve_superpixels(filled.segment, agreement, EFFORTS[options.effort])
@@ -180,23 +185,23 @@ def settle(prepared: Prepared, options: CompactOptions) -> Settled:
     decode = resolve_decode(filled, size)
     if decode.k != filled.decode.k and decode.max_k > USUAL_K:
         note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
-    return Settled(options, replace(filled, decode=decode), segment, clean)
+    return FilledOptions(options, replace(filled, decode=decode), segment, clean)
 
 
-def decide(prepared: Prepared, settled: Settled, checkpoint: Checkpoint | None, unseen: Gaussians) -> Plan:
+def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | None, unseen: Gaussians) -> Plan:
     """Make all decisions about a run; ``unseen`` are the merged Gaussians that no view sees."""
-    size, asked, options, segment = prepared.size, settled.asked, settled.options, settled.segment
+    size, asked, options, segment = prepared.size, filled.asked, filled.options, filled.segment
     keeps = keeps_fidelity(size, asked)
     target = FIDELITY_PSNR if keeps and size.rendered else asked.budget.target_psnr
     choices = choose_for_scene(
-        size, settled.counted, num_input=count_input(prepared), num_reserved=len(unseen), keeps=keeps
+        size, filled.counted, num_input=count_input(prepared), num_reserved=len(unseen), keeps=keeps
     )
     limits, pairs = choices.limits, checkpoint is None and choices.may_merge_pairs
     fit = _fit_photos(prepared, options, choices.fit)
     fit = _fit_renders(prepared, options, fit) if pairs else fit
     if keeps and has_few_rows(size):
-        few = f"superpixels: the {size.num_gaussians:,} Gaussians are few, so {segment.superpixels} is a share of"
-        note(f"{few} the photos' pixels, up to half of the Gaussians")
+        few = f"superpixels: the scene has only {size.num_gaussians:,} Gaussians"
+        note(f"{few}, so {segment.superpixels} is a share of the photos' pixels, at most half of the Gaussians")
     budget = options.budget
     searches = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
     shares_tree = cuts_views(options, size) and not pairs and (searches or limits.count is not None)
@@ -206,7 +211,7 @@ def decide(prepared: Prepared, settled: Settled, checkpoint: Checkpoint | None, 
         decode=options.decode,
         fit=fit,
         merges_pairs=pairs,
-        clean=settled.clean,
+        clean=filled.clean,
         unseen=unseen,
         target_psnr=target,
         keeps_fidelity=keeps,
@@ -220,46 +225,48 @@ def decide(prepared: Prepared, settled: Settled, checkpoint: Checkpoint | None, 
         checkpoint=checkpoint,
         settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
         free_poses=options.prepare.poses == "free",
-        # without a fit no photo has been seen, and what own photos say is true of others
+        # without a fit no photo has been seen, so the score on own photos holds for new views, too
         new_views=fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views,
     )
 
 
 def cuts_views(options: CompactOptions, size: SceneSize) -> bool:
-    """Return whether a run cuts views into superpixels, which networks can correct; baselines learn nothing."""
+    """Return whether a run cuts views into superpixels, which networks can correct; baselines use no networks."""
     return options.method == OURS and size.num_views > 0
 
 
 def count_input(prepared: Prepared) -> int | None:
-    """Return the number of Gaussians that shares of a budget refer to; None: those of the prepared scene."""
+    """Return the number of Gaussians that shares of a budget refer to; None: that of the prepared scene."""
     if len(prepared.unseen):
         return prepared.size.num_gaussians + len(prepared.unseen)
     return prepared.input_scene.num_gaussians if len(prepared.scene) < len(prepared.input_scene) else None
 
 
-def count_unseen(prepared: Prepared, settled: Settled) -> int:
-    """Return the number of Gaussians of the result that no view sees, at their share of the input."""
-    options, num_unseen = settled.options, len(prepared.unseen)
+def count_unseen(prepared: Prepared, filled: FilledOptions) -> int:
+    """Return the number of Gaussians that no view sees in the result; their share is the same as in the input."""
+    options, num_unseen = filled.options, len(prepared.unseen)
     if num_unseen == 0:
         return 0
     num_input = prepared.size.num_gaussians + num_unseen
     exact = exact_count(options.budget, num_input, prepared.unseen.sh_degree)
-    rate = settled.segment.share * options.decode.mean_k if exact is None else exact / num_input
+    rate = filled.segment.share * options.decode.mean_k if exact is None else exact / num_input
     return int(rate * num_unseen)
 
 
 @dataclass(frozen=True)
 class SceneChoices:
-    """Decisions about a whole scene that cost no computation; a run, its estimate and its blocks share them."""
+    """Decisions about a whole scene that need no computation; a run, its estimate and its blocks share them."""
 
-    blocks: int  # Parts in which the scene is compacted; at most, where many views alone ask for them
+    blocks: (
+        int  # Blocks in which the scene is compacted; at most so many, if they follow from the number of views alone
+    )
     decode: DecodeOptions  # Gaussians per group
     limits: CountLimits  # Limits of the number of Gaussians
-    match: MatchMethod  # Of merging across views
-    checkpoint: str  # Name of the networks to load; "none"
-    fit: FitOptions  # With the steps that are taken
-    keeps_fidelity: bool  # see :func:`keeps_fidelity`
-    may_merge_pairs: bool  # Whether neighbours are merged pair by pair unless networks are handed to the plan
+    match: MatchMethod  # How Gaussians are merged across views
+    checkpoint: str  # Name of the networks to load, or "none"
+    fit: FitOptions  # With the number of steps
+    keeps_fidelity: bool  # See :func:`keeps_fidelity`
+    may_merge_pairs: bool  # Merge neighbours pair by pair, unless the plan is given networks
 
     def settings(self, options: CompactOptions) -> dict[str, Any]:
         """Return all settings by flat name, with the values that the plan chose."""
@@ -276,15 +283,15 @@ def choose_for_scene(
 ) -> SceneChoices:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
-    ``num_input``, ``num_reserved``: as of :func:`gsmerge.budget.count_limits`. ``keeps``: of options as they
-    were given, None: of these.
+    ``num_input``, ``num_reserved``: see :func:`gsmerge.budget.count_limits`. ``keeps``: the result of
+    :func:`keeps_fidelity` for the options as they were given; None: for these options.
     """
     keeps = keeps_fidelity(scene, options) if keeps is None else keeps
     if scene.num_views == 0 and (keeps or resolve_fit(options).steps <= SHORT_STEPS) and options.effort != "best":
-        # too few steps for views that have to be placed, or too many counts to be tried
+        # a fit needs placed views, which are not worth it for few steps, or for the many counts of a search
         options = replace(options, fit=replace(options.fit, fit="none"))
     segment, decode = options.segment, resolve_decode(options, scene)
-    if segment.superpixels == AUTO_SHARE:  # which work on the scene decides
+    if segment.superpixels == AUTO_SHARE:  # only computation on the scene could decide it
         segment = replace(segment, superpixels=SHARE)
     limits = count_limits(scene, segment, decode, options.budget, num_input=num_input, num_reserved=num_reserved)
     fit = resolve_fit(options)
@@ -301,7 +308,7 @@ def choose_for_scene(
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
-    """Return the number of blocks for a scene; UsageError if the scene cannot be cut into as many as asked."""
+    """Return the number of blocks for a scene; UsageError if it cannot be cut into the number that was asked for."""
     problems = blocks_problems(scene, options)
     asked = wanted_blocks(options, scene.num_gaussians, scene.num_views)
     if options.blocks.blocks == "auto":
@@ -323,48 +330,52 @@ def usual_blocks(num_gaussians: int, num_views: int) -> int:
 
 
 def note_surplus(size: SceneSize, budget: BudgetOptions) -> None:
-    """Note where a budget is more Gaussians than there are."""
+    """Note that a budget is larger than the number of Gaussians, if it is."""
     if budget.number is not None and budget.number > size.num_gaussians:
-        note(f"budget {budget.budget}: the input has {size.num_gaussians:,} Gaussians, and the result no more")
+        note(f"budget {budget.budget}: the input has only {size.num_gaussians:,} Gaussians, so the result has no more")
 
 
 def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
-    """Note that a cluster has no use for a scene that is compacted in one piece."""
+    """Note that a cluster is not used for a scene that is compacted in one piece, if the options ask for one."""
     if blocks == 1 and options.blocks.engine.engine != "local":
         problems = blocks_problems(scene, options)
-        remedy = f"which {problems[0]} needs" if problems else "--set blocks=NUMBER makes several"
-        note(f"engine ray: the scene is compacted in one piece, on this machine; {remedy}")
+        reason = f"{problems[0]} needs that" if problems else "--set blocks=NUMBER makes several"
+        note(f"engine ray: the scene is compacted in one piece, on this machine; {reason}")
 
 
 def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
-    """List the reasons why a scene cannot be cut into blocks."""
+    """List the settings and facts that prevent cutting a scene into blocks."""
     shared = [] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]
-    return [*_whole_needed(options), *shared]
+    return [*_uncut_settings(options), *shared]
 
 
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
-    """Return the largest number of blocks that the options ask for; 1: one piece. ``num_views``: 0 for few."""
+    """Return the largest number of blocks that the options ask for; 1: one piece.
+
+    ``num_views``: 0 if there are few views.
+    """
     asked = options.blocks.blocks
     if asked == "auto":
-        return 1 if _whole_needed(options) else usual_blocks(num_gaussians, num_views)
+        return 1 if _uncut_settings(options) else usual_blocks(num_gaussians, num_views)
     return 1 if asked == "none" else int(asked)
 
 
-def _whole_needed(options: CompactOptions) -> list[str]:
+def _uncut_settings(options: CompactOptions) -> list[str]:
     """Name the settings in use that prevent cutting a scene into blocks."""
     return [*options.whole_only, *options.uncut]
 
 
 def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
-    """Return whether the count is the fewest that keep the input, as neither options nor the scene's density decide it.
+    """Return whether the run searches for the fewest Gaussians that keep the quality of the input.
 
-    Without photos the result has to be ``FIDELITY_PSNR`` from the input. With photos it may show them ``FIDELITY_LOSS``
-    worse. A share of the Gaussians says little where they are fewer than pixels: a scene that is compact already needs
-    most of its Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
+    It does if neither the options nor the scene's density decide the number. Without photos the PSNR of the result
+    against the input has to be ``FIDELITY_PSNR``. With photos the result may show them ``FIDELITY_LOSS`` worse. A share
+    of the Gaussians would say little if there are fewer Gaussians than pixels: a scene that is compact already needs
+    most of them, a scene of many small ones only a few. Measurements are in docs/internals/notebook.md.
     """
     budget = options.budget
-    asked = options.decides_count or options.replaces_stages  # which seldom come so near
-    return not asked and (scene.rendered or not (scene.is_dense or budget.auto))
+    is_decided = options.decides_count or options.replaces_stages  # other stages seldom keep the quality
+    return not is_decided and (scene.rendered or not (scene.is_dense or budget.auto))
 
 
 def check_pictures(prepared: Prepared, options: CompactOptions) -> None:
@@ -372,31 +383,32 @@ def check_pictures(prepared: Prepared, options: CompactOptions) -> None:
     if prepared.reference.name != RENDERS:
         return
     if options.budget.max_drop is not None:
-        problem = f'quality {options.budget.quality}: expected a PSNR from the input as "35dB" without photos'
-        raise UsageError(f"{problem}, since nothing shows the scene better than the input; or give --images")
+        problem = f'quality {options.budget.quality}: expected a PSNR against the input, such as "35dB", without photos'
+        raise UsageError(f"{problem}; without photos nothing shows the scene better than the input; or give --images")
     if "sky" in options.clean.drops and prepared.input_scene.images is None:
-        raise UsageError("drop sky: expected photos, which say where the sky is; name them with --images")
+        raise UsageError("drop sky: expected photos, which show where the sky is; name them with --images")
 
 
 def _can_merge_pairs(scene: SceneSize, options: CompactOptions, networks: str) -> bool:
-    """Return whether neighbours are merged, not superpixels: no views show the scene, or renders of it alone.
+    """Return whether neighbours are merged pair by pair instead of superpixels.
 
-    Settings of superpixels other than their numbers, which say how many Gaussians there will be, ask for superpixels.
+    They are if the scene has no views, or no pictures other than renders of it. Settings of superpixels ask for
+    superpixels, except for their number, which only says how many Gaussians there will be.
     """
     ours = options.method == OURS and networks == "none"
     return ours and (scene.num_views == 0 or (scene.rendered and not options.changes_superpixels))
 
 
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:
-    """Return whether a scene is merged by positions and colours only: it has no views, and no option needs one."""
+    """Return whether a scene is merged by positions and colours only: it has no views, and no option needs any."""
     return len(scene) == 0 and not options.replaces_stages
 
 
 def choose_networks(options: CompactOptions, size: SceneSize) -> str:
-    """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
+    """Return the name of the checkpoint to load: the one that was asked for, or the shipped one if it improves results.
 
-    If no fit follows, the shipped networks improve scenes with one Gaussian per pixel, and others that have photos; a
-    fit gains more by further steps (docs/internals/networks.md).
+    If no fit follows, the shipped networks improve scenes with one Gaussian per pixel, and other scenes with photos. A
+    fit gains more by further steps in the same time (docs/internals/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -405,7 +417,7 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
 
 
 def heads_alone(options: CompactOptions) -> bool:
-    """Return whether only the heads of networks run: those that ``auto`` chose, at an effort that saves the rest."""
+    """Return whether only the heads of the networks run: with networks by ``auto``, at an effort that does so."""
     return options.checkpoint == "auto" and not EFFORTS[options.effort].refines
 
 
@@ -421,7 +433,7 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
 
 
 def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> None:
-    """Raise UsageError if the option ``name`` asks for more children per group than the checkpoint's heads make."""
+    """Raise UsageError if ``count``, the value of an option, exceeds the children that the networks make per group."""
     if checkpoint is not None and count > checkpoint.networks.options.max_children:
         raise UsageError(
             f"{name}: expected at most {checkpoint.networks.options.max_children} with the absolute outputs of"
@@ -430,9 +442,10 @@ def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> No
 
 
 def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
-    """Fill in how many Gaussians a fit of the scene bears, by how far views confirm each other's depth; with a note.
+    """Fill in the number of Gaussians that is useful for the scene, with a note.
 
-    That is an automatic budget, and the most that is taken of a share, a size or a device.
+    It depends on how far views confirm each other's depth: beyond it, new views gain nothing. It is the automatic
+    budget, and an upper limit for a budget that is a share, a size or a device.
     """
     budget = options.budget
     is_limit = budget.is_limit and options.method == OURS
@@ -444,24 +457,24 @@ def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreemen
         return replace(options, budget=replace(budget, budget=text))
     most = max(size.num_views, int(agreement.share * size.num_gaussians))
     if most < max_allowed(budget, size.num_gaussians, size.sh_degree):
-        taken = f"at most {most:,} Gaussians are taken, {text} of the input"
-        more = f"more would not show new views better, as {why}; --set fill=true takes all"
-        note(f"budget {budget.budget}: {taken}: {more}")
-        usual = options.changed_counts == ["budget"]
-        if usual and agreement.share <= FEWEST:  # as without a budget
+        limit = f"limited to {most:,} Gaussians, {text} of the input"
+        reason = f"more would not show new views better, because {why}; --set fill=true takes the whole budget"
+        note(f"budget {budget.budget}: {limit}; {reason}")
+        is_only_count = options.changed_counts == ["budget"]
+        if is_only_count and agreement.share <= FEWEST:  # as without a budget
             budget = replace(budget, budget=None)
     return replace(options, budget=replace(budget, most=most))
 
 
 def describe_share(agreement: Agreement | None) -> tuple[str, str]:
-    """Return the share of a scene's pixels that it bears Gaussians for, as text such as "10%", and the reason."""
+    """Return the useful number of Gaussians as a share of the pixels, a text such as "10%", and the reason for it."""
     if agreement is None:
         return SHARE, "depths of several views cannot be compared"
     return f"{100 * agreement.share:.3g}%", f"other views confirm {100 * agreement.confirmed:.0f} % of the pixels"
 
 
 def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, effort: Effort) -> SegmentOptions:
-    """Fill in the options of superpixels that depend on effort and scene; a note gives the reason."""
+    """Fill in the settings of superpixels that depend on effort and scene; a note gives the reason."""
     if options.superpixels == AUTO_SHARE:
         text, why = describe_share(agreement)
         note(f"superpixels: {text} of the pixels, because {why}")
@@ -472,19 +485,19 @@ def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, e
 
 
 def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
-    """Keep the sky, with a note, where no photo is used that shows it."""
+    """Keep the sky, with a note, if no photo is used that shows where it is."""
     if "sky" not in options.drops or prepared.reference.name != RENDERS:
         return options
-    note("drop sky: no photo is used that could say where the sky is, so it stays")
-    left = ",".join(name for name in options.drops if name != "sky")
-    return replace(options, drop=left or None)
+    note("drop sky: no photo that is used shows where the sky is, so it is kept")
+    remaining = ",".join(name for name in options.drops if name != "sky")
+    return replace(options, drop=remaining or None)
 
 
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
-    """Choose K if it is "auto": more if a single camera sees the scene and no fit, or only a short one, follows.
+    """Choose K if it is "auto": 4 if a single camera sees the scene and no fit, or only a short one, follows; else 1.
 
-    With K = 1, 4.4 % of the pixels of one photo are too few to show it; with more views each view has Gaussians of its
-    own.
+    With K = 1 and 4.4 % of the pixels, Gaussians are too few to show one photo. With more views each view adds
+    Gaussians of its own.
     """
     decode = options.decode
     if decode.k != AUTO:
@@ -496,7 +509,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:
-    """Choose the number of fit steps by effort, and whether to drop Gaussians that no photo shows."""
+    """Fill in the number of fit steps by effort, and whether Gaussians that no photo shows are dropped."""
     fit, effort = options.fit, EFFORTS[options.effort]
     steps = effort.steps if fit.fit_steps is None else fit.fit_steps
     prunes = fit.fit != "none" or effort.prunes
@@ -504,9 +517,9 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 
 
 def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHARE) -> int:
-    """Return the number of steps of the full fit: as set, or by effort, views and ``share``.
+    """Return the number of steps of the full fit: as set, or by effort, number of views and ``share``.
 
-    ``share``: Gaussians of the result for each pixel. A step looks at one view. Measurements are in
+    ``share``: Gaussians of the result for each pixel. A step draws one view. Measurements are in
     docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
@@ -518,7 +531,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
 
 
 def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
-    """Fill in the size of the photos for the fit, and whether it moves cameras, and what it may write."""
+    """Fill in the photo scale of the fit, whether it moves cameras, and whether it fills the budget and goes beyond."""
     scene = prepared.scene
     fit = replace(fit, beyond=options.prepare.extent == "beyond", fills=options.budget.is_filled)
     if fit.fit == "none":
@@ -532,9 +545,11 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) ->
 
 
 def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
-    """Fill in small steps for a fit to renders: these show no more than the merged Gaussians are made of.
+    """Fill in the settings of a fit to renders of the input.
 
-    Nothing is there to judge it by, and strokes of the input are wanted. What lies beyond these views is of the scene.
+    The steps are small, because the merged Gaussians are near to the renders already. Long thin Gaussians are allowed,
+    because the input may have them. The fit is not scored on held-out patches, and Gaussians beyond all views are kept,
+    because they belong to the scene.
     """
     placed = prepared.reference.placed
     if placed and fit.fit == "none" != options.fit.fit:
@@ -544,9 +559,12 @@ def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -
 
 
 def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:
-    """Choose views for scoring whose pictures show the scene: those of an effort's report; None: decisive ones."""
+    """Choose the views for scoring, among those whose pictures show the scene.
+
+    ``effort``: choose as many as its report needs; None: as many as a decision about the count needs.
+    """
     reference = prepared.reference
-    if reference.placed or not prepared.repeated:  # views that the scene lacks
+    if reference.placed or not prepared.repeated:  # placed views, which are not views of the input
         return reference.score_views
     candidates = [view for view, place in enumerate(prepared.repeated) if place in reference.score_views]
     count = len(candidates)

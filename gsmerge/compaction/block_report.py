@@ -86,9 +86,8 @@ def _join_parts(starts: Sequence[BlockStart], scores: Sequence[BlockScores], siz
     if any(parts.photo_files for parts in each):
         rows = [astuple(parts.photo_files or PhotoFiles(*pair)) for parts, pair in zip(each, whole, strict=True)]
         photo_files = PhotoFiles(*mean(rows))
-    shares = [
-        size * (parts.protected.share if parts.protected else 0.0) for parts, size in zip(each, sizes, strict=True)
-    ]
+    protected_shares = [parts.protected.share if parts.protected else 0.0 for parts in each]
+    shares = [size * share for size, share in zip(sizes, protected_shares, strict=True)]
     if sum(shares) > 0:
         rows = [(parts.protected.before, parts.protected.after) if parts.protected else (0.0, 0.0) for parts in each]
         protected = Covered(sum(shares) / sum(sizes), *mean(rows, shares))

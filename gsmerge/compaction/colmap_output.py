@@ -1,4 +1,4 @@
-"""Write a scene as a COLMAP model: its three files, and links to the photos where trainers look for them."""
+"""Write a scene as a COLMAP model: its three files, and links to the photos in the folder that trainers read."""
 
 from __future__ import annotations
 
@@ -11,29 +11,28 @@ from gsmerge.measure.visibility import front_rows
 
 
 def photo_folder(points: Path) -> Path:
-    """Return the folder in which trainers look for the photos of a model, given the path of its points."""
+    """Return the folder from which trainers read the photos of a model, given the path of its points."""
     return points.parent.parent.parent / "images"
 
 
 def files_beside(points: Path, apart: bool) -> tuple[Path, ...]:
-    """Return the paths of a model's other files; SceneError if another program's are beside them."""
+    """Return the paths of a model's other files; SceneError if files of another program are beside them."""
     return colmap_model.files_beside(points)
 
 
 def note_photos(points: Path, photos: NamedPhotos) -> list[str]:
-    """Note how many photos are missing where trainers look for them, if they are not linked there."""
+    """Return a note on the photos that are missing in the folder that trainers read, if they are not linked there."""
     place = photo_folder(points)
     if not place.exists() and all(photo is not None for _, photo in photos):
         return []
     absent = len({name for name, _ in photos if not (place / name).is_file()})
-    more = f"trainers look for photos in {place}: copy or link the {absent:,} that it lacks there"
-    return [more] if absent else []
+    return [f"trainers read photos from {place}: copy or link the {absent:,} missing photos there"] if absent else []
 
 
 def write_output(add: AddOutput, path: Path, points: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write a model, as :data:`gsmerge.io.formats.table.WriteOutput`; its photos are linked unless their folder exists.
+    """Write a model, see :data:`gsmerge.io.formats.table.WriteOutput`; link its photos unless their folder exists.
 
-    ``photos`` are those of :func:`gsmerge.compaction.outputs.name_photos`.
+    ``contents.photos`` come from :func:`gsmerge.compaction.outputs.name_photos`.
     """
     gaussians, cameras = contents.levels[0], contents.cameras
     files, place = [points, *map(add, files_beside(path, apart=False))], photo_folder(path)

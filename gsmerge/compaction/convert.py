@@ -1,4 +1,4 @@
-"""Convert files of Gaussians from format to format without a fit: joined, cut, turned, and written."""
+"""Convert files of Gaussians from format to format without a fit: join, clean, place and write them."""
 
 from __future__ import annotations
 
@@ -42,24 +42,24 @@ from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath, make_scene
 class ConvertOptions:
     """Files to convert, how to read them, and what to do with them."""
 
-    inputs: Sequence[Path]  # several are joined in their order
-    output: Path  # its name chooses the format
-    cameras: StrPath | None = None  # in the frame of the first input; None: those of a result, inside or beside it
-    images: StrPath | None = None  # photos of these cameras, which say where the sky is
+    inputs: Sequence[Path]  # Several inputs are joined in their order
+    output: Path  # Its name chooses the format
+    cameras: StrPath | None = None  # In the frame of the first input; None: those of a result, inside or beside it
+    images: StrPath | None = None  # Photos of these cameras, which show where the sky is
     opacity: OpacityChoice = "auto"
     clean: CleanOptions = field(default_factory=CleanOptions)
     placement: PlacementOptions = field(default_factory=PlacementOptions)
-    normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
-    full_columns: bool = False  # pad its harmonics with zeros up to degree 3
-    site: bool = False  # write the files of a page beside it
+    normals: bool = True  # Write the three columns of zeros that some viewers expect in a ``.ply``
+    full_columns: bool = False  # Pad its harmonics with zeros up to degree 3
+    site: bool = False  # Write the files of a page beside it
     overwrite: bool = False
 
 
 def convert_files(options: ConvertOptions) -> dict[str, Any]:
-    """Convert files of Gaussians and write the result, with cameras if they are known: all files, or none.
+    """Convert files of Gaussians and write the result, with cameras if they are known: all files or none.
 
-    Returns the document of ``gsmerge convert``. SceneError if a file cannot be read or written, or nothing is left;
-    UsageError for an ending that cannot be written, or for dropping the sky without photos.
+    Returns the document of ``gsmerge convert``. Raises SceneError if a file cannot be read or written, or if no
+    Gaussian remains; UsageError for an ending that cannot be written, and for dropping the sky without photos.
     """
     chosen = output_format(options.output, levels=True, cameras=True)
     with use_threads():
@@ -71,22 +71,22 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         stored, unread = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
         if cameras is None and chosen.cameras == "needed":
-            problem = (
-                f"expected a result's cameras inside or beside it for {chosen.about.partition(':')[0]}, found none"
-            )
-            near = find_scene_files(options.inputs[0]).cameras if options.cameras != NONE else None
-            raise SceneError(options.inputs[0], problem, f"name them with --cameras {near or 'FILE'}")
+            about = chosen.about.partition(":")[0]
+            problem = f"expected a result's cameras inside or beside it for {about}, found none"
+            beside = find_scene_files(options.inputs[0]).cameras if options.cameras != NONE else None
+            raise SceneError(options.inputs[0], problem, f"name them with --cameras {beside or 'FILE'}")
         count = len(gaussians)
         rows, left_out = _clean(gaussians, options, stored)
         gaussians = gaussians[rows]
         if len(gaussians) == 0:
             problem = f"expected Gaussians that are kept, found none of {count:,}"
-            raise SceneError(options.inputs[0], problem, "look where the scene lies with gsmerge inspect")
+            raise SceneError(options.inputs[0], problem, "find the extent of the scene with gsmerge inspect")
         frame = find_placement(options.placement, cameras, upward_axis(files[0].info.comments))
         gaussians, moved = place(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
-        side = max(float(np.abs(gaussians.means).max()), float(gaussians.scales.max()))
-        if options.placement.moves and not 1e-30 < side < 1e30:  # numbers in files are of 32 bits
-            raise UsageError(f"--scale, --translate: expected a scene of 1e-30 to 1e30 across, would be {side:.0e}")
+        largest = max(float(np.abs(gaussians.means).max()), float(gaussians.scales.max()))
+        if options.placement.moves and not 1e-30 < largest < 1e30:  # numbers in files have 32 bits
+            problem = f"expected coordinates of 1e-30 to 1e30, the largest would be {largest:.0e}"
+            raise UsageError(f"--scale, --translate: {problem}")
     gaussians = pad_harmonics(gaussians, NUM_FULL) if options.full_columns else gaussians
     infos = [file.info for file in files]
     columns, missing = join_extra_columns([read_extra_columns(file.info)[file.valid] for file in files])
@@ -118,32 +118,36 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
 
 
 def _join_comments(infos: Sequence[FileInfo], chosen: Format, *, moves: bool) -> tuple[list[str], list[str]]:
-    """Join the header comments of files that become one, which ``moves`` or not; also return notes on what is lost."""
+    """Return the header comments that all files share, and notes on the comments that are lost.
+
+    ``moves``: the scene is moved, so comments on its frame are no longer true.
+    """
     each = [[comment for comment in kept_comments(info) if not (moves and is_of_frame(comment))] for info in infos]
     every = list(dict.fromkeys(chain(*each)))
-    kept = [comment for comment in every if all(comment in comments for comments in each)]
-    notes = [f"not all files are marked {comment!r}: the joined one is not" for comment in every if comment not in kept]
-    lost = [] if chosen.marks is None else [comment for comment in kept if comment not in chosen.marks]
-    return kept, [*notes, *(f"{chosen.ending} has no room for the mark {comment!r}" for comment in lost)]
+    shared = [comment for comment in every if all(comment in comments for comments in each)]
+    unshared = [comment for comment in every if comment not in shared]
+    notes = [f"not all files have the mark {comment!r}, so the joined file has not" for comment in unshared]
+    lost = [] if chosen.marks is None else [comment for comment in shared if comment not in chosen.marks]
+    return shared, [*notes, *(f"{chosen.ending} cannot store the mark {comment!r}" for comment in lost)]
 
 
 def conversion_line(document: dict[str, Any]) -> str:
     """Describe a conversion in one line of text."""
     before, after = sum(entry["num_gaussians"] for entry in document["inputs"]), document["output"]
-    kept = "" if after["num_gaussians"] == before and not document["left_out"] else f" of {before:,}"
+    of_all = "" if after["num_gaussians"] == before and not document["left_out"] else f" of {before:,}"
     reasons = describe_counts(document["left_out"], placed=document["cameras"] is None)
     why = f" (left out: {reasons})" if reasons else ""
     beside = document["viewer_cameras"]
     cameras = f"; cameras in {Path(beside).name}" if beside else ""
-    return f"{after['path']}: {after['num_gaussians']:,}{kept} Gaussians{why}, {human_bytes(after['bytes'])}{cameras}"
+    return f"{after['path']}: {after['num_gaussians']:,}{of_all} Gaussians{why}, {human_bytes(after['bytes'])}{cameras}"
 
 
 def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: StrPath | None) -> list[str]:
-    """Note whose views counted where nobody named them, or where they see less than half of the Gaussians."""
+    """Return a note on the views for ``--drop unseen``: if they were placed, or see less than half of the Gaussians."""
     if cameras is None:
         beside = None if options.cameras == NONE else find_scene_files(options.inputs[0]).cameras
         remedy = "" if options.cameras == NONE else f"; name them with --cameras {beside or 'FILE'}"
-        return [f"drop unseen: without cameras, views placed around and inside the scene count{remedy}"]
+        return [f"drop unseen: without cameras, views are placed around and inside the scene{remedy}"]
     if 2 * unseen > count:
         share = f"{100 * unseen / count:.0f} % of the Gaussians"
         return [f"drop unseen: the cameras in {cameras} do not show {share}; are they those of this scene?"]
@@ -151,13 +155,16 @@ def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: Str
 
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
-    """Join Gaussians of one world; missing harmonics are zeros."""
+    """Join Gaussians of the same world frame; missing harmonics become zeros."""
     most = max(part.shN.shape[1] for part in parts)
     return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, most) for part in parts])
 
 
 def _read_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]]:
-    """Read the cameras; those found beside the first input are left out, with a note, if they cannot be read."""
+    """Read the cameras; also return notes.
+
+    Cameras that were found beside the first input, and not named, are left out with a note if they cannot be read.
+    """
     named, first = options.cameras, options.inputs[0]
     path = result_cameras(first) if named is None else named_path(named)
     try:
@@ -165,11 +172,11 @@ def _read_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]
     except SceneError as error:
         if named is not None or path == first:
             raise
-        return None, [f"{path} is left out: {error.problem}; name what fits, or say none"]
+        return None, [f"{path} is left out: {error.problem}; name other cameras with --cameras, or pass none"]
 
 
 def _photo_folder(options: ConvertOptions, stored: CameraFile | None) -> Path | None:
-    """Return the folder of the cameras' photos: the given one, or ``images`` beside their file."""
+    """Return the folder of the cameras' photos: the given folder, or ``images`` beside the camera file."""
     if stored is None or options.images is not None:
         return named_path(options.images)
     return Path(stored.path).parent / "images"
@@ -178,13 +185,13 @@ def _photo_folder(options: ConvertOptions, stored: CameraFile | None) -> Path | 
 def _clean(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
 ) -> tuple[np.ndarray, dict[str, int]]:
-    """Crop the Gaussians and drop unwanted ones; return the rows of the rest, and counts of the others."""
+    """Crop the Gaussians and drop unwanted ones; return the rows that remain, and counts of those left out."""
     drops = options.clean.drops
     if not {"sky", "unseen"} & set(drops) or len(gaussians) == 0:
         return clean(gaussians, options.clean, None, None, lambda g: g)
     photos, images, cameras = named_path(options.images), None, None
     if "sky" in drops and (stored is None or photos is None):
-        problem = "expected photos and their cameras, which say where the sky is"
+        problem = "expected photos and their cameras, which show where the sky is"
         raise UsageError(f"--drop sky: {problem}; give --set images=FOLDER")
     if stored is not None and photos is not None:
         images = read_images(photos, stored.names)
@@ -207,7 +214,7 @@ def _write(
     names: Sequence[str],
     comments: Sequence[str],
 ) -> tuple[int, str | None]:
-    """Write the Gaussians, and the cameras beside them; return the bytes and the path of the cameras."""
+    """Write the Gaussians, and the cameras beside them; return the number of bytes and the path of the cameras."""
     out, beside = options.output, None
     with atomic_outputs(overwrite=options.overwrite) as add:
         title = scene_title(options.inputs[0])

@@ -41,21 +41,21 @@ from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
 
-COARSER = 0.5  # of the time of a result, that each coarser level takes
-MAX_DRAWN_GAUSSIANS = 10_000  # Gaussians of which an estimate asks how many lie in a view
+COARSER = 0.5  # time of each coarser level, as a share of that of the result
+MAX_DRAWN_GAUSSIANS = 10_000  # sample of Gaussians by which the share inside a view is estimated
 
 
 def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """Estimate size, time and memory of a run without running it.
 
     Returns:
-        ``num_gaussians``: the most that the result can have, its number if ``exact``, or, where ``psnr_kept`` or
-        ``loss_kept`` is a number, the fewest: more are taken until the result is so many dB from the input, or shows
-        the photos at most so much worse, or until ``quality`` is met; ``ratio`` to the input, ``bytes`` as a ``.ply``;
-        ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where neighbours are
-        merged), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
-        ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
-        machine has enough.
+        ``num_gaussians``: the largest number of Gaussians that the result can have, or, if ``exact``, their number. If
+        ``psnr_kept`` or ``loss_kept`` is a number, it is the smallest number: the run takes more until the PSNR against
+        the input is ``psnr_kept`` dB, until the photos are shown at most ``loss_kept`` dB worse, or until ``quality``
+        is met. ``ratio`` to the input, ``bytes`` as a ``.ply``. ``blocks``, ``method``, ``superpixels_per_view`` (None
+        if a budget distributes them, 0 if neighbours are merged), ``k``, ``match``, ``checkpoint``, ``fit`` and
+        ``fit_steps`` as the run uses them. ``seconds`` and ``memory_bytes``, to two digits and right within a factor of
+        about two. ``memory_problem``: None if this machine has enough memory.
     """
     if options.clean.crop is not None:
         scene = crop_scene(scene.numpy(), options.clean.crop)
@@ -105,7 +105,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
 
 
 def _search(size: SceneSize, options: CompactOptions, choices: SceneChoices, inside: float) -> dict[str, Any]:
-    """Return what a search for the number of Gaussians, and levels, add, as arguments of :func:`wall_seconds`."""
+    """Return the builds of a search and of levels of detail, as arguments of :func:`wall_seconds`."""
     budget, limits = options.budget, choices.limits
     coarser = COARSER * (budget.levels - 1)
     if choices.keeps_fidelity or budget.target_psnr is not None:
@@ -126,10 +126,10 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     method = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
     if per_view == 0:
         method = "neighbours merged pair by pair, because no photo shows them"
-    count, kept = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %)", run["psnr_kept"]
+    count = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %)"
     number = count if run["exact"] else f"at most {count}"
-    if kept is not None:
-        number = f"{count}, or more until {kept:g} dB from the input are kept"
+    if run["psnr_kept"] is not None:
+        number = f"{count}, or more until the PSNR against the input is {run['psnr_kept']:g} dB"
     if run["quality"] is not None:
         number = f"{count}, or more or fewer until --quality {run['quality']} is met"
     if run["loss_kept"] is not None:
@@ -144,7 +144,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 
 
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
-    """Return as a document what :func:`compact_files` would make of a scene."""
+    """Describe in a document what :func:`gsmerge.compaction.files.compact_files` would make of a scene."""
     scene, out, settings = load.scene, outputs.result, sized(settings, outputs)
     check_cameras(scene, out)
     _, unused = check_method(settings, scene)
@@ -152,7 +152,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:
-        if settings.method == OURS and settings.checkpoint != "auto":  # which the run may refuse
+        if settings.method == OURS and settings.checkpoint != "auto":  # a named checkpoint, which the run may refuse
             load_networks(settings, measure_size(scene))
         run = estimate(scene, settings)
     paths = {name: path and str(path) for name, path in vars(load.files).items() if name not in ("more", "named")}
@@ -168,7 +168,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
 
 
 def plan_lines(document: Mapping[str, Any]) -> list[str]:
-    """Write the document of :func:`plan_files` as lines for people."""
+    """Describe the document of :func:`plan_files` in lines of text."""
     scene, out = document["input"], document["output"]["path"]
     number, size = scene["num_views"], f"{scene['width']} x {scene['height']}"
     inside = find_format(out).levels == "inside"

@@ -1,4 +1,4 @@
-"""Meet a size in bytes in formats whose files do not have so many bytes for each Gaussian."""
+"""Meet a size in bytes in formats whose number of bytes depends on the content of the file."""
 
 from __future__ import annotations
 
@@ -15,25 +15,29 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Cameras, Gaussians
 
-NEAR_SHARE, MOST_DROPPED = 0.97, 0.08  # share of the size that is reached; of the Gaussians that are left out, at most
-ENOUGH = 0.985  # share of the size from which on no further one is put back
-SURPLUS = 1.02  # times the Gaussians that the size seems to have room for
-TRIES, MAX_REBUILDS = 8, 2
+NEAR_SHARE = 0.97  # share of the size that a build has to reach
+MOST_DROPPED = 0.08  # largest share of the Gaussians that is dropped after the last build
+ENOUGH = 0.985  # share of the size from which on no further Gaussian is put back
+SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
+TRIES, MAX_REBUILDS = 8, 2  # files that are measured to choose what is dropped; builds after the first one
 
 Rebuild = Callable[[int | None], Candidate]  # a count -> a candidate of all views, built, cleaned up and scored
 
 
 def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras) -> int:
-    """Count the bytes of a file with the given Gaussians; of a page, which shows ``cameras``, at most."""
+    """Count the bytes of a file with the given Gaussians; of a page with ``cameras``, count an upper bound."""
     comments = RESULT_COMMENT, MIP_COMMENT
     if file.measure is not None:
         return file.measure(gaussians, cameras, comments)
-    assert file.encode is not None  # others have a count for each size
+    assert file.encode is not None  # all other formats have a fixed number of bytes for each Gaussian
     return len(file.encode(gaussians, comments))
 
 
 def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan: Plan) -> Candidate:
-    """Make a candidate as large as its file may be: rebuild it until it is near, then drop its faintest Gaussians."""
+    """Make a candidate as large as its file may be: rebuild it until it is near, then drop the faintest Gaussians.
+
+    A candidate without a size in bytes, or with one that follows from the count, stays unchanged.
+    """
     if plan.size is None or not plan.size.packed:
         return candidate
     most, file = plan.size.num_bytes, plan.size.file
@@ -41,19 +45,20 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
 
     def choose_next(built: Sequence[Candidate]) -> int | None:
         size, count = measure_bytes(built[-1].gaussians, file, built[-1].cameras), len(built[-1].gaussians)
-        asked = max(count, built[-1].count or 0)  # what nobody sees is left out, and its bytes are not filled up
+        # unseen Gaussians were dropped from the asked number: the bytes that they free are not filled up
+        asked = max(count, built[-1].count or 0)
         whole = rest + (size - rest) * asked / max(count, 1)
         room = min(int(SURPLUS * count * (most - rest) / max(size - rest, 1)), plan.limits.most)
         fits = room >= (1 - MOST_DROPPED) * count and (whole >= NEAR_SHARE * most or room <= SURPLUS * asked)
         return None if fits or len(built) > MAX_REBUILDS else room
 
     candidate = meet(rebuild, candidate, choose_next)[-1]
-    kept = drop_to_bytes(candidate.gaussians, most, file, candidate.cameras, rest)
-    return candidate if len(kept) == len(candidate.gaussians) else shrink(candidate, kept, prepared, plan)
+    gaussians = drop_to_bytes(candidate.gaussians, most, file, candidate.cameras, rest)
+    return candidate if len(gaussians) == len(candidate.gaussians) else shrink(candidate, gaussians, prepared, plan)
 
 
 def measure_rest(gaussians: Gaussians, most: int, file: Format, cameras: Cameras) -> int:
-    """Count the bytes of a file with one of the Gaussians; UsageError if they are more than ``most``."""
+    """Count the bytes of a file with one Gaussian; UsageError if they are more than ``most``."""
     rest = measure_bytes(gaussians[:1], file, cameras)
     if rest > most:
         problem = f"expected at least {human_bytes(rest)} for a {file.ending} with one Gaussian"
@@ -62,17 +67,20 @@ def measure_rest(gaussians: Gaussians, most: int, file: Format, cameras: Cameras
 
 
 def drop_to_bytes(gaussians: Gaussians, most: int, file: Format, cameras: Cameras, rest: int) -> Gaussians:
-    """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes; one takes ``rest``."""
-    low, high = 0, len(gaussians)
-    kept, count = gaussians[:0], len(gaussians)
+    """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes.
+
+    ``rest``: bytes of a file with one Gaussian.
+    """
+    low, high = 0, len(gaussians)  # counts: the largest that is known to fit, and the largest that may fit
+    best, count = gaussians[:0], len(gaussians)
     for _ in range(TRIES):
         tried = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
         size = measure_bytes(tried, file, cameras)
         if size <= most:
-            low, kept = count, tried
+            low, best = count, tried
         else:
             high = count - 1
         if low == len(gaussians) or (low and ENOUGH * most <= size <= most) or low >= high:
             break
         count = min(max(low + 1, int(count * ((1 + ENOUGH) / 2 * most - rest) / max(size - rest, 1))), high)
-    return kept
+    return best

@@ -34,21 +34,22 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.clean import BOX_QUANTILES
 from gsmerge.types import Scene
 
-# Opacity times area of a scene's Gaussians together, of each view, as a share of its box's squared diagonal: all of it
-# that is left once they are merged is at most a tenth of this where each result is too transparent to be kept
-COVERED, SAMPLE_GAUSSIANS = 0.006, 200_000
+# Sum of opacity times area of a scene's Gaussians, for each view, as a share of the squared diagonal of their box. If
+# merging leaves only Gaussians that are too transparent to be kept, the sum after merging is at most a tenth of this
+COVERED = 0.006
+SAMPLE_GAUSSIANS = 200_000  # Gaussians by which that sum is estimated
 
 
 @dataclass(frozen=True)
 class Outputs:
     """Files that a run writes: all, or none."""
 
-    result: Path  # its name chooses the format; a ``lod-meta.json`` holds all levels, in chunks beside it
-    viewer_cameras: Path | None = None  # it may exist already with the same content, beside a result in another format
+    result: Path  # Its name chooses the format; a ``lod-meta.json`` holds all levels, in chunks beside it
+    viewer_cameras: Path | None = None  # May exist already with the same content, beside a result in another format
     overwrite: bool = False
-    normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
-    full_columns: bool = False  # pad harmonics of a ``.ply`` with zeros up to degree 3
-    site: bool = False  # write the files of a page beside it
+    normals: bool = True  # Write the three columns of zeros that some viewers expect in a ``.ply``
+    full_columns: bool = False  # Pad harmonics of a ``.ply`` with zeros up to degree 3
+    site: bool = False  # Write the files of a page beside it
 
 
 def compact_files(
@@ -65,11 +66,11 @@ def compact_files(
 ) -> dict[str, Any]:
     """Read a scene, compact it, and write result, levels and cameras: all files or none.
 
-    ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's earlier steps.
-    ``on_read`` is called with the scene.
+    ``hashed``: hash the input for the report. ``seconds_before``: wall time of the caller's earlier steps, by name.
+    ``on_read``: called with the scene after it was read.
 
     Returns the report, see :func:`gsmerge.compaction.report.report_document`. Raises SceneError if the scene cannot be
-    read or the result cannot be written, UsageError if the settings need what the scene does not have.
+    read or the result cannot be written; UsageError if the settings need something that the scene does not have.
     """
     start, out, settings = perf_counter(), outputs.result, sized(settings, outputs)
     chosen = output_format(out, levels=True, cameras=True)
@@ -83,7 +84,7 @@ def compact_files(
         cameras_path = outputs.viewer_cameras if len(load.scene) else None
         shared = cameras_path if cameras_path is not None and cameras_path.exists() else None
         if shared is not None and not outputs.overwrite and named_cameras(shared, names) is None:
-            raise other_cameras(shared)  # before the work
+            raise other_cameras(shared)  # before the long work
         read = perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DoubtWarning)  # the report has them
@@ -117,13 +118,13 @@ def compact_files(
 
 
 def nothing_left(path: Path) -> SceneError:
-    """Return the error of a scene whose Gaussians are all too small or too transparent to show anything."""
-    problem = "expected Gaussians that show something, found none that is left once they are merged"
-    return SceneError(path, problem, "look at its scales and opacities")
+    """Return the error for a scene whose Gaussians are all too small or too transparent to show anything."""
+    problem = "expected Gaussians that show something, found none that remains after merging"
+    return SceneError(path, problem, "check its scales and opacities")
 
 
 def shows_nothing(scene: Scene) -> bool:
-    """Return whether a run would end with :func:`nothing_left`; a scene that covers little is merged to find out."""
+    """Return whether a run would end with :func:`nothing_left`; a scene that covers little is compacted to find out."""
     gaussians = scene.gaussians
     sample = gaussians[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
     if len(sample) == 0:
@@ -141,12 +142,12 @@ def shows_nothing(scene: Scene) -> bool:
 
 
 def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
-    """Say in the settings whose bytes a budget counts."""
+    """Return the settings with the name of the output file, whose bytes a budget may count."""
     return replace(settings, budget=replace(settings.budget, output=outputs.result.name))
 
 
 def _padded(result: CompactResult) -> CompactResult:
-    """Add the columns of a result and its levels that are written as zeros."""
+    """Pad the harmonics of a result and its levels with zeros up to degree 3."""
     from gsmerge.compaction.placement import NUM_FULL, pad_harmonics
 
     coarser = tuple(map(_padded, result.coarser))
@@ -154,32 +155,35 @@ def _padded(result: CompactResult) -> CompactResult:
 
 
 def _views_once(scene: Scene) -> list[int]:
-    """Return the views without further layers, which have the name and camera of an earlier view."""
+    """Return the views without further layers; a layer has the name and camera of an earlier view."""
     cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
     keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
 
 
 def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> Loaded:
-    """Read a scene from its files, and note what is missing or odd; raise SceneError if it cannot be read."""
+    """Read a scene from its files, with notes on missing or unusual content; SceneError if it cannot be read."""
     loaded = load_files(files, opacity=opacity, hints=hints).without_photos()
     release_memory()
     return replace(loaded, notes=(*loaded.notes, *_compact_notes(loaded)))
 
 
 def check_cameras(scene: Scene, out: Path) -> None:
-    """Raise UsageError if the output cannot do without cameras and the scene has none."""
+    """Raise UsageError if the output needs cameras and the scene has none."""
     if len(scene) == 0 and find_format(out).cameras == "needed":
         raise UsageError(f"{out}: expected a scene with cameras, got none")
 
 
 def _compact_notes(loaded: Loaded) -> list[str]:
-    """Note columns that results lack, and a scene that is a result, by its header or its small number of Gaussians."""
+    """Return notes on columns that results lack, and on a scene that is a result already.
+
+    A result is recognised by the header of its file, or by its small number of Gaussians.
+    """
     scene, comments, notes = loaded.scene, loaded.info.comments, list[str]()
     named = " ".join(note for note in loaded.info.adapted if note.startswith(UNUSED))
     lost = [name for name in loaded.info.extra_columns if name not in named]
     if lost:
-        notes.append(f"columns that merged Gaussians do not have: {list_names(lost)}; gsmerge convert copies them")
+        notes.append(f"merged Gaussians do not have the columns {list_names(lost)}; gsmerge convert copies them")
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
     few = is_from_gsmerge(comments) and scene.num_gaussians <= pixels / 2
     if few or RESULT_COMMENT in comments:

@@ -1,4 +1,4 @@
-"""Leave views out of a scene: what no fit has seen says how good its result is."""
+"""Leave views out of a scene, so that results can be scored on photos that their fit has not seen."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.setting import piece_settings
 from gsmerge.types import Gaussians, PicturedScene
 
-LEAST_VIEWS = 4  # with photos: fewer are alone when one is left out
-PART, MOST = 6, 3  # one of so many views is left out at a time, at most so many
-LEAST_SEEN = 0.02  # share of a left-out photo that the others must cover
+LEAST_VIEWS = 4  # fewest views with photos: of fewer, too little is left when one is left out
+PART, MOST = 6, 3  # one of every PART views is left out at a time, and at most MOST views
+LEAST_SEEN = 0.02  # share of a left-out photo that the other views must cover
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """A scene without some of its views, and the photos of these."""
+    """A scene without some of its views, and the photos of the views that are left out."""
 
     rest: Prepared  # The scene of the other views
-    photos: Photos  # Of the views that are left out
-    seen: np.ndarray  # [v,h,w] bool, their pixels that show what the other views see
+    photos: Photos  # Photos of the v views that are left out
+    seen: np.ndarray  # [v,h,w] bool, pixels of these photos that show what the other views see
 
     @property
     def shares(self) -> np.ndarray:
@@ -43,57 +43,63 @@ class LeftOut:
         return self.rest.scene.file_gaussians
 
     def score(self, gaussians: Gaussians) -> np.ndarray:
-        """Return the PSNR (dB) ``[v]`` of canonical Gaussians on what each photo shows of the rest."""
+        """Return the PSNR (dB) ``[v]`` of canonical Gaussians on each photo, over the pixels that other views see."""
         views = enumerate(self.seen)
         return np.array([score_photos(gaussians, self.photos, [i], covered=[mask]).covered_psnr for i, mask in views])
 
     def reduce(self, count: int) -> int:
-        """Return as many of ``count`` Gaussians of the whole scene as its other views have of all pixels."""
+        """Return the share of ``count`` Gaussians of the whole scene that belongs to the other views."""
         views = len(self.rest.scene)
         return max(1, round(count * views / (views + len(self.photos))))
 
     def plan(self, plan: Plan, **settings: Any) -> Plan:
-        """Plan a run on the rest: as ``plan``, but for what is decided by the whole scene, and for ``settings``."""
+        """Plan a run on the rest with the settings of ``plan``.
+
+        ``settings`` replace some of them. Others, which only the whole scene can decide, get the values of a trial.
+        """
         settings = plan.settings | piece_settings(CompactOptions, trial=True) | settings
         settings |= {"method": OURS, "checkpoint": "none"} if plan.checkpoint is None else {}
         return make_plan(self.rest, CompactOptions().with_settings(settings), plan.checkpoint)
 
 
 def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) -> LeftOut | None:
-    """Leave views out of a canonical scene of photos; None if the others see nothing of what they show."""
+    """Leave ``views`` out of a canonical scene with photos; None if no other view sees what these views show."""
     rest = subset(scene, [view for view in range(len(scene)) if view not in views])
     if not views or len(rest.file_gaussians) == 0:
         return None
     every = tuple(range(len(rest)))
-    part = replace(
+    prepared_rest = replace(
         prepared, input_scene=rest, scene=rest, reference=Reference(PHOTOS, every, every), repeated=every, moved=False,
         unseen=rest.gaussians[:0], agreement=None,
     )  # fmt: skip
     chosen = subset(scene, views)
-    left_out = LeftOut(part, scene_photos(chosen), cover(rest, chosen))
+    left_out = LeftOut(prepared_rest, scene_photos(chosen), cover(rest, chosen))
     return left_out if (left_out.shares > LEAST_SEEN).any() else None
 
 
 def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
-    """Return the mean of scores ``[v]`` of photos by the ``shares [v]`` of them that others see, of those they see."""
+    """Return the mean of the scores ``[v]`` of left-out photos, weighted by the ``shares [v]`` that other views see.
+
+    Photos of which other views see almost nothing do not count.
+    """
     seen = shares > LEAST_SEEN
     return float(np.average(scores[seen], weights=shares[seen]))
 
 
 def choose_views(views: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Choose views to leave out in each of two rounds, evenly spread among ``views`` and no neighbours together."""
+    """Choose views to leave out in each of two rounds: evenly spread among ``views``, without neighbours in a round."""
     count = min(MOST, max(1, len(views) // PART))
     chosen = [views[place] for place in pick_views(len(views), 2 * count)]
     return chosen[::2], chosen[1::2]
 
 
 def can_leave_out(prepared: Prepared) -> bool:
-    """Return whether a scene has photos of so many views, with Gaussians of their own, that some can be left out."""
+    """Return whether views can be left out: enough of them have photos, and they have Gaussians of their own."""
     reference = prepared.reference
     of_photos = reference.name == PHOTOS and len(reference.score_views) >= LEAST_VIEWS
     return of_photos and prepared.scene.has_own_pixels
 
 
 def cover(rest: PicturedScene, views: PicturedScene) -> np.ndarray:
-    """Mark the pixels ``[v,h,w]`` of views that surfaces which views of the ``rest`` see cover."""
+    """Mark the pixels ``[v,h,w]`` of ``views`` that show surfaces which views of the ``rest`` see."""
     return visible_pixels(context_points(rest, NEAR_PLANE), views.cameras, NEAR_PLANE, rest.cameras)

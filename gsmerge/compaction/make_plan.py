@@ -9,7 +9,7 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.plan import (
     Plan,
-    Settled,
+    FilledOptions,
     check_networks,
     check_pictures,
     choose_networks,
@@ -17,7 +17,7 @@ from gsmerge.plan import (
     cuts_views,
     decide,
     heads_alone,
-    settle,
+    fill_options,
 )
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
@@ -29,27 +29,28 @@ if TYPE_CHECKING:
 
 
 def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
-    """Make all decisions that the options leave open, and what they need: networks, and merged Gaussians out of sight.
+    """Make all decisions that the options leave open.
 
+    This also loads the networks and merges the Gaussians that no view sees, because decisions need them.
     ``checkpoint``: networks to use instead of those that the options name. Raises UsageError if the scene or the
     networks do not allow what the options ask for.
     """
     check_pictures(prepared, options)
     with stage("prepare"):
         checkpoint = checkpoint or load_networks(options, prepared.size)
-        settled = settle(prepared, options)
-        return decide(prepared, settled, checkpoint, merge_hidden(prepared, settled))
+        filled = fill_options(prepared, options)
+        return decide(prepared, filled, checkpoint, merge_hidden(prepared, filled))
 
 
 def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
-    """Load the networks that a run uses; None: it uses closed formulas alone.
+    """Load the networks that a run uses; None: the run uses closed formulas alone.
 
     Raises SceneError if networks are required and cannot be used, UsageError if they do not fit the options.
     """
     from gsmerge.networks.checkpoint import find_checkpoint, load_checkpoint
 
     if not cuts_views(options, size):
-        if options.checkpoint not in CHECKPOINTS:  # a damaged file is refused, although nothing uses it
+        if options.checkpoint not in CHECKPOINTS:  # refuse a damaged file, although nothing would use it
             load_checkpoint(options.checkpoint)
         return None
     checkpoint, notes = find_checkpoint(choose_networks(options, size), required=options.require_checkpoint)
@@ -62,17 +63,17 @@ def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None
     return checkpoint
 
 
-def merge_hidden(prepared: Prepared, settled: Settled) -> Gaussians:
-    """Merge the Gaussians that no view sees into their share of the result, and clean them up."""
+def merge_hidden(prepared: Prepared, filled: FilledOptions) -> Gaussians:
+    """Merge the Gaussians that no view sees, so that they keep their share of the result, and clean them up."""
     scene, unseen = prepared.scene, prepared.unseen
-    visible = unseen[unseen.opacities >= settled.options.decode.min_opacity]
-    count = min(len(visible), count_unseen(prepared, settled))
+    visible = unseen[unseen.opacities >= filled.options.decode.min_opacity]
+    count = min(len(visible), count_unseen(prepared, filled))
     if count == 0:
         return unseen[:0]
     merged = merge_unseen(visible, scene, count)
-    if settled.clean.asked:
+    if filled.clean.asked:
         from gsmerge.stages.clean import clean
 
-        rows, _ = clean(merged, settled.clean, scene.cameras, scene.images, prepared.frame.leave)
+        rows, _ = clean(merged, filled.clean, scene.cameras, scene.images, prepared.frame.leave)
         merged = merged[rows]
     return merged

@@ -1,6 +1,6 @@
-"""All ways to compact a scene behind one interface: ours, and those of packages.
+"""All methods of compacting a scene behind one interface: our own, and those of other packages.
 
-A package adds one by an entry point of the group ``gsmerge.methods`` that names a :class:`Method`.
+A package adds a method by an entry point of the group ``gsmerge.methods`` that names a :class:`Method`.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Gaussians, Scene
 
 Need = Literal["photos", "pixels"]
-COUNTS = names_of(CompactOptions, lambda one: one.counts)  # settings that decide how many
+COUNTS = names_of(CompactOptions, lambda one: one.counts)  # settings that decide the number of Gaussians
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way to compact a scene: our own, or another, such as a baseline.
+    """A method of compacting a scene: our own, or another one, such as a baseline.
 
     Args:
-        name: As on the command line.
-        run: Prepared scene, plan and a number of Gaussians -> canonical Gaussians, at most that many unless the method
-            keeps the input's. It times itself by stages of the record.
-        needs: What the scene has to have: ``"photos"``; ``"pixels"``: one Gaussian per pixel.
-        uses: Settings that it uses, by flat name, besides those that all methods use.
-        check: Raises a UsageError where a program that it runs is missing.
+        name: The name on the command line.
+        run: Prepared scene, plan and a number of Gaussians -> canonical Gaussians, at most that number unless the
+            method keeps those of the input. It times itself by stages of the record.
+        needs: What the scene must have: ``"photos"``, or ``"pixels"``, which means one Gaussian per pixel.
+        uses: Flat names of the settings that it uses, in addition to those that all methods use.
+        check: Raises a UsageError if a program that the method runs is missing.
         prepare: Scene and options -> the prepared scene that ``run`` gets.
     """
 
@@ -54,7 +54,7 @@ class Method:
 
 @dataclass(frozen=True)
 class _Superpixels(Method):
-    """Our own method, which fits what it builds."""
+    """Our own method, which also fits the Gaussians that it builds."""
 
     def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
         """Build and fit ``count`` canonical Gaussians."""
@@ -65,7 +65,7 @@ SUPERPIXELS = _Superpixels(OURS, lambda *arguments: build(*arguments).gaussians)
 
 
 def find_method(options: CompactOptions) -> Method:
-    """Load the method that the options name. Raises UsageError if a program is missing."""
+    """Load the method that the options name. Raises UsageError if a program that it runs is missing."""
     if options.method == OURS:
         return SUPERPIXELS
     method: Method = load_plugin(METHODS, options.method)
@@ -74,9 +74,9 @@ def find_method(options: CompactOptions) -> Method:
 
 
 def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[str]]:
-    """Choose the method for a scene by its options, and note changed settings that the method ignores.
+    """Choose the method for a scene; also return notes on changed settings that the method ignores.
 
-    Raises UsageError if the scene lacks what the method needs, or a program is missing.
+    Raises UsageError if the scene lacks what the method needs, or if a program that it runs is missing.
     """
     if stands_alone(scene, options):
         return replace(SUPERPIXELS, prepare=prepare_alone), _unused_alone(options)
@@ -87,15 +87,15 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
     if "photos" in method.needs and not scene.is_shown:
         raise UsageError(f"{place}: expected photos, found none; give --images, or another method")
     if "pixels" in method.needs and not scene.has_own_pixels:
-        raise UsageError(f"{place}: expected Gaussians of the views' own, one for each pixel; give another method")
+        raise UsageError(f"{place}: expected one Gaussian per pixel of every view; give another method")
     unused = [name for name in changed_settings(options, lambda one: not one.common) if name not in method.uses]
     return method, [f"{place} does not use {', '.join(unused)}"] if unused else []
 
 
 def _unused_alone(options: CompactOptions) -> list[str]:
-    """Note changed settings that have no effect on a scene without views."""
+    """Return a note on changed settings that have no effect on a scene without views, if there are any."""
     unused = decided_settings(options, lambda one: one.acts_on and not one.counts)
-    return [f"without cameras these are not used: {', '.join(unused)}"] if unused else []
+    return [f"these settings have no effect without cameras: {', '.join(unused)}"] if unused else []
 
 
 def choose_method(options: CompactOptions, scene: Scene) -> Method:

@@ -1,8 +1,8 @@
-"""What a new viewpoint gains: photos that a short fit of small pictures did not see, before and after.
+"""Estimate how much new views gain, by a trial on small photos that a short fit did not see.
 
-Scores of the photos that a fit has seen say how well it remembers them. So some views are left out with their rows, the
-rest is compacted at a quarter of the size, and its rows and its result are compared with the photos that were left out,
-where the rows cover them.
+Scores on photos that a fit has seen only say how well it remembers them. So the trial leaves out some views with their
+rows, and compacts the other views at a small size. The rows of the other views and the result are both scored on the
+photos that were left out, over the pixels that the rows cover.
 """
 
 from __future__ import annotations
@@ -25,27 +25,28 @@ from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
 from gsmerge.types import PicturedScene, Pixels
 
-SIDE = 120  # pixels of the longer side, at least
-# Of the fit, at most: fewer than 150 fit few views in another way (gsmerge.fit.schedule.MANY_STEPS), and say less
+SIDE = 120  # the longer side of the small pictures is at least so many pixels long
+# Most steps of the fit. Fewer than 150 steps fit few views differently (gsmerge.fit.schedule.MANY_STEPS), and say less
 STEPS = 200
-# Small pictures have more detail to a pixel, so that fewer Gaussians cost them more: theirs are as many times the usual
-# share as the result's times, to this power. Gains at 1 % of five captures: 1.0 dB off for 2.3.
+# Small pictures have more detail in each pixel, so fewer Gaussians cost them more. The trial's share of Gaussians,
+# relative to the usual share, is that of the result to the power of LESS. On five captures at 1 % this lowers the error
+# of the estimated gain from 2.3 to 1.0 dB
 USUAL, LESS = parse_share(SHARE), 0.3
-# A fifth of what new views gain is that of own photos where depth is confirmed, the rest that of the trial: chosen on
-# ten captures, of which, and of five others, 80 % of the results lie within SPREAD dB of it
-# (docs/internals/notebook.md). Beyond MOST_SHARE Gaussians for a pixel nothing is known
+# OWN is the weight of the gain of own photos, where depth is confirmed; the rest is the weight of the trial's gain. It
+# was chosen on ten captures. On these and five others 80 % of the results lie within SPREAD dB of the estimate
+# (docs/internals/notebook.md). Nothing is known about more than MOST_SHARE Gaussians for each pixel
 OWN, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
 
 
 @dataclass(frozen=True)
 class NewViews(ExpectedScores):
-    """PSNR (dB) that new views of a scene are expected to have, and of how many ``views`` that was estimated."""
+    """PSNR (dB) that new views of a scene are expected to have, estimated on so many ``views``."""
 
     views: int
 
     @property
     def gain(self) -> float:
-        """How much nearer a new view comes, dB."""
+        """PSNR that a new view gains, dB."""
         return self.after - self.before
 
     def to_dict(self) -> dict[str, float]:
@@ -58,29 +59,30 @@ class Trial:
     """PSNR (dB) of small photos that short fits have not seen."""
 
     own_before: float  # Rendered from all rows of the input
-    before: float  # From those of other views
-    after: float  # From what these were compacted to
-    views: int
+    before: float  # Rendered from the rows of other views
+    after: float  # Rendered from the compact result of these rows
+    views: int  # Number of left-out photos that count
 
     def predict(self, own_before: float, own_after: float, confirmed: float) -> NewViews:
-        """Predict new views of a result from the PSNR (dB) of its own photos, and the share of confirmed depth.
+        """Predict the PSNR of new views of a result.
 
-        New views gain no more than own photos do where depth is confirmed. The input shows them as much worse than own
-        photos as it does small ones.
+        ``own_before`` and ``own_after`` are the PSNR (dB) of its own photos, from the input and from the result;
+        ``confirmed`` is the share of confirmed depth. New views gain at most this share of the gain of own photos. The
+        input shows new views as much worse than own photos as in the trial.
         """
         most = confirmed * max(0.0, own_after - own_before)
         gain = OWN * most + (1 - OWN) * min(self.after - self.before, most)
         before = own_before + self.before - self.own_before
         before, after, low, high = (round(psnr, 2) for psnr in (before, before + gain, gain - SPREAD, gain + SPREAD))
-        return NewViews(before, after, low, high, self.views)  # as files say it
+        return NewViews(before, after, low, high, self.views)  # rounded as in files
 
 
 def trial_part(prepared: Prepared, plan: Plan) -> Part | None:
-    """Return the cost of the trial on views that are left out; None where there is none."""
+    """Return the cost of the trial on views that are left out; None if there is no trial."""
     if not _has_trial(prepared, plan):
         return None
     scene, num_rounds = prepared.scene, len(choose_views(prepared.reference.score_views))
-    pixels = scene.pixels_per_view / _shrinking(scene) ** 2
+    pixels = scene.pixels_per_view / _reduction(scene) ** 2
     fits = fit_cost(min(STEPS, plan.fit.steps), pixels, USUAL * pixels * len(scene))
     before, after = (num_rounds * each * pixels * len(scene) for each in (BEFORE, AFTER))
     return Part(before, num_rounds * fits, after, num_rounds)
@@ -90,16 +92,17 @@ def _has_trial(prepared: Prepared, plan: Plan) -> bool:
     return plan.new_views and prepared.agreement is not None and can_leave_out(prepared)
 
 
-def _shrinking(scene: PicturedScene) -> int:
-    """Return how many times smaller the pictures of the trial are."""
+def _reduction(scene: PicturedScene) -> int:
+    """Return by which factor the sides of the trial's pictures are shorter."""
     return max(1, max(scene.cameras.width, scene.cameras.height) // SIDE)
 
 
 def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> Trial | None:
-    """Try what views gain that a fit of ``count`` Gaussians leaves out.
+    """Measure in a trial what views gain that a fit of ``count`` Gaussians leaves out.
 
-    None where views or photos are too few, or Gaussians too many; and where views have no Gaussians of their own, since
-    those hold what photos showed that are left out: errors of 2 dB for 1.2, for a quarter of a run's time.
+    None with too few views or photos, or too many Gaussians. None also if views have no Gaussians of their own: then
+    the Gaussians still hold what the left-out photos showed, which makes the error 2 dB instead of 1.2, and the trial
+    takes a quarter of a run's time.
     """
     scene = prepared.scene
     pixels = scene.pixels_per_view * len(scene)
@@ -107,7 +110,7 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
         return None
     begin_part()
     with record_part(silent=True) as record:
-        small = shrink_scene(scene, _shrinking(scene))
+        small = shrink_scene(scene, _reduction(scene))
         share = min(1.0, USUAL * float(power(count / (USUAL * pixels), LESS)))
         rounds = [leave_out(small, views, prepared) for views in choose_views(prepared.reference.score_views)]
         scores = [_score_round(left_out, small, plan, build, share) for left_out in rounds if left_out is not None]
@@ -120,21 +123,22 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
 
 
 def _score_round(left_out: LeftOut, small: PicturedScene, plan: Plan, build: Build, share: float) -> np.ndarray:
-    """Compact the rest with a short fit.
+    """Compact the rest with a short fit, and score it on the photos that are left out.
 
-    Returns ``[4,v]``: of each photo that is left out the share that the rest sees, and its PSNR rendered from all rows,
-    from those of the rest, and from the result.
+    Returns ``[4,v]``: for each photo the share that the rest sees, and the PSNR (dB) of renders from all rows, from the
+    rows of the rest, and from the result.
     """
     superpixels = max(1, round(share * small.pixels_per_view))
     short = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(STEPS, plan.fit.steps))
-    inside = replace(short.fit, tuning=replace(short.fit.tuning, outside_from=1.0))  # no photo shows what is outside
+    # views from outside the photos' region are of no use here: no photo shows what they see
+    inside = replace(short.fit, tuning=replace(short.fit.tuning, outside_from=1.0))
     compacted = build(left_out.rest, replace(short, fit=inside), None).gaussians
     drawn = small.file_gaussians, left_out.rows, compacted
     return np.stack([left_out.shares, *(left_out.score(gaussians) for gaussians in drawn)])
 
 
 def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
-    """Keep every so many rows and columns of pixels, and the Gaussians in front of them."""
+    """Shrink the pictures by a factor ``step`` per side, and keep the front Gaussian of each remaining pixel."""
     cameras, shape = scene.cameras, scene.images.shape[1:3]
     height, width = (max(1, side // step) for side in shape)
     Ks = cameras.Ks / np.array([[step], [step], [1]], cameras.Ks.dtype)

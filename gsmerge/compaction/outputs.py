@@ -19,13 +19,15 @@ from gsmerge.io.formats.table import FOLDERS, Contents, NamedPhotos
 from gsmerge.io.image_names import match_images
 from gsmerge.types import Cameras, Gaussians
 
-SAME = 1e-5  # relative difference up to which cameras are the same; pixels by a hundred times as much
+# Cameras are the same up to this difference of their positions, relative to the farthest one, and of their Ks,
+# relative; and up to a hundred times as many pixels
+SAME = 1e-5
 
 
 def add_views(add: AddOutput, path: Path, cameras: Cameras, names: Sequence[str], *, overwrite: bool) -> None:
-    """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has others.
+    """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has other cameras.
 
-    A file with these cameras, to within rounding, is left as it is: results in several formats share it.
+    A file that has these cameras already, to within rounding, stays unchanged: results in several formats share it.
     """
     if overwrite or not path.exists():
         add(path).write_bytes(viewer_cameras(cameras, names).encode())
@@ -43,28 +45,29 @@ def named_cameras(path: Path, names: Sequence[str]) -> Cameras | None:
 
 def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> bool:
     """Return whether a file holds these cameras under these names, to within rounding."""
-    found, reach = named_cameras(path, names), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
-    if found is None or (found.width, found.height) != (cameras.width, cameras.height):
+    stored, farthest = named_cameras(path, names), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
+    if stored is None or (stored.width, stored.height) != (cameras.width, cameras.height):
         return False
-    same_place = np.allclose(found.viewmats, cameras.viewmats, rtol=0, atol=SAME * reach)
-    return same_place and np.allclose(found.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME)
+    same_poses = np.allclose(stored.viewmats, cameras.viewmats, rtol=0, atol=SAME * farthest)
+    return same_poses and np.allclose(stored.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME)
 
 
 def other_cameras(path: Path) -> UsageError:
-    """Make the error for an existing file of cameras that belongs to another result."""
+    """Return the error for an existing file of cameras that belongs to another result."""
     remedy = "name another output, or pass --overwrite to replace it"
     return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
 
 def name_photos(photos: Path | None, names: Sequence[str]) -> NamedPhotos:
-    """Name views by their files in a folder of photos, as COLMAP does; otherwise by their names in the camera file.
+    """Name views by their files in a folder of photos, as COLMAP does; without it, by their names in the camera file.
 
-    Returns each name and its photo, None where that is in no folder.
+    Returns each name with the path of its photo, or None if no folder has it.
     """
     if photos is not None and photos.is_dir():
         with suppress(SceneError):
             return [(file.relative_to(photos).as_posix(), file) for file in match_images(photos, names)]
-    return [(name.removeprefix("./").removeprefix("images/"), None) for name in names]  # as a transforms.json has them
+    # a transforms.json names photos with their folder
+    return [(name.removeprefix("./").removeprefix("images/"), None) for name in names]
 
 
 def write_result(
@@ -78,7 +81,8 @@ def write_result(
 ) -> Path:
     """Write the levels of a result, the finest first, with its cameras; return the path of the main file.
 
-    The name chooses the format. UsageError if it has another ending, or the format needs cameras and there are none.
+    The name chooses the format. Raises UsageError if no format has this ending, or if the format needs cameras and
+    there are none.
     """
     row = FOLDERS.get(path.name)
     out = path if row is None else path / row.place / row.ending

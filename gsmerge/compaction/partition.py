@@ -1,7 +1,8 @@
 """Scene -> blocks of views that see the same surfaces, each with some views of its neighbours.
 
-Views are nodes of a graph whose edges say how much of one view another one sees. Blocks grow from its rim, each time
-by the view that shares most with those in it, and then exchange views while that cuts less.
+Views are nodes of a graph. The weight of an edge says how much of one view the other view sees. Blocks grow one by one
+from the rim of the graph; each step adds the view that shares most with the block. Then blocks exchange views as long
+as that lowers the weights between blocks.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene
 
 GRID = 24  # cells along the longer side of a view's depth map
-SAMPLE_CELLS = 120  # cells of a view that are looked up in all others, at most
+SAMPLE_CELLS = 120  # most cells of a view that are looked up in all other views
 SAME_DEPTH = 0.15  # share by which a point may lie behind the depth of a cell that shows it
-SHARED = 0.25  # views of neighbours that a block takes in addition, a share of its own
+SHARED = 0.25  # most views of neighbours that a block takes in addition, as a share of its own views
 SLACK = 0.2  # share by which blocks may differ from equal sizes
-SWEEPS = 8  # exchanges of views between blocks, at most
-TOGETHER = 32  # points of a view that are looked up together: few cameras may see any of them
-POINTS = 1024  # the same where owners are searched
-MOST_CUT = 1 / 3  # of what views share: where blocks cut more, one piece is better
+SWEEPS = 8  # most passes in which blocks exchange views
+POINTS_TOGETHER = 32  # points of a view that are looked up together; only a few cameras can see any of them
+OWNED_TOGETHER = 1024  # points whose owners are searched together
+MOST_CUT = 1 / 3  # largest share of the weights that blocks may cut; beyond it, one piece is better
 
 
 def gaussians_at_once(num_gaussians: int, blocks: int) -> int:
@@ -37,8 +38,8 @@ def gaussians_at_once(num_gaussians: int, blocks: int) -> int:
 class Block:
     """Views that are compacted together: the block's own, and further ones shared with neighbouring blocks."""
 
-    own: tuple[int, ...]  # its views, ascending
-    shared: tuple[int, ...]  # views of other blocks that see the same surfaces, ascending
+    own: tuple[int, ...]  # Its own views, ascending
+    shared: tuple[int, ...]  # Views of other blocks that see the same surfaces, ascending
 
     @property
     def views(self) -> list[int]:
@@ -48,13 +49,13 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Covisibility:
-    """Shares of its surface that each of v views has in common with the others, from coarse depth maps."""
+    """How much of the surfaces of each of v views every other view sees, from coarse depth maps."""
 
     cameras: Cameras
-    depths: np.ndarray  # [v,h,w] float64 depths of a coarse grid of each view, infinite where nothing is
-    shares: np.ndarray = field(repr=False)  # [v,v] share of the samples of one view (row) that another one sees
-    samples: np.ndarray = field(repr=False)  # [n,3] float64 some means of all views
-    sample_views: np.ndarray = field(repr=False)  # [n] the view of each
+    depths: np.ndarray  # [v,h,w] float64, depths of a coarse grid of each view; infinite where nothing is
+    shares: np.ndarray = field(repr=False)  # [v,v] share of the samples of one view (row) that another view sees
+    samples: np.ndarray = field(repr=False)  # [n,3] float64, means of some Gaussians of all views
+    sample_views: np.ndarray = field(repr=False)  # [n] view of each sample
 
     @property
     def weights(self) -> np.ndarray:
@@ -65,7 +66,7 @@ class Covisibility:
 
 
 def measure_covisibility(scene: Scene) -> Covisibility:
-    """Measure the share of every view of a scene with pixels that each other view sees, with occlusion."""
+    """Measure which share of every view each other view sees, with occlusion; the scene has to have pixels."""
     cameras, step = scene.cameras, max(1, -(-max(scene.cameras.height, scene.cameras.width) // GRID))
     rows, columns = (np.arange(step // 2, side, step) for side in (cameras.height, cameras.width))
     picked = (rows[:, None] * cameras.width + columns).reshape(-1)
@@ -74,39 +75,39 @@ def measure_covisibility(scene: Scene) -> Covisibility:
     free_pages([scene.gaussians.means])
     valid = fronts >= 0
 
-    def one_depth(view: int) -> np.ndarray:
+    def measure_depths(view: int) -> np.ndarray:
         z = project(means[view], cameras[[view]])[1][0]
         return np.where(valid[view] & (z > 0), z, np.inf)
 
-    depths = np.stack(parallel_map(one_depth, range(len(scene)))).reshape(-1, len(rows), len(columns))
+    depths = np.stack(parallel_map(measure_depths, range(len(scene)))).reshape(-1, len(rows), len(columns))
     stride = slice(None, None, max(1, len(picked) // SAMPLE_CELLS))
     samples = [means[view, stride][valid[view, stride]] for view in range(len(scene))]
 
     frustums = make_frustums(cameras, depths)
 
-    def one_view(points: np.ndarray) -> np.ndarray:
+    def measure_shares(points: np.ndarray) -> np.ndarray:
         counts = np.zeros(len(scene))
-        for rows in split_points(points, TOGETHER):
-            near = frustums.reached_by(points[rows])
-            counts[near] += see(points[rows], cameras[near], depths[near])[0].sum(1)
+        for rows in split_points(points, POINTS_TOGETHER):
+            candidates = frustums.reached_by(points[rows])
+            counts[candidates] += see(points[rows], cameras[candidates], depths[candidates])[0].sum(1)
         return counts / max(1, len(points))
 
-    shares = np.stack(parallel_map(one_view, samples))
-    numbers = np.repeat(np.arange(len(scene)), [len(points) for points in samples])
-    return Covisibility(cameras, depths, shares, np.concatenate(samples), numbers)
+    shares = np.stack(parallel_map(measure_shares, samples))
+    sample_views = np.repeat(np.arange(len(scene)), [len(points) for points in samples])
+    return Covisibility(cameras, depths, shares, np.concatenate(samples), sample_views)
 
 
 @dataclass(frozen=True, eq=False)
 class Frustums:
-    """Half-spaces that bound what each of v cameras sees: most cameras are far from a few points."""
+    """Half-spaces that bound what each of v cameras sees, to exclude cameras that see none of a few points."""
 
     planes: np.ndarray  # [v,5,4] unit normals, which point inside, and distances; the last is the image plane
-    farthest: np.ndarray  # [v] largest depth that is seen
+    farthest: np.ndarray  # [v] largest depth that the camera sees
 
     def reached_by(self, points: np.ndarray, *, hidden: bool = False) -> np.ndarray:
-        """Return the cameras, ascending, that may see any of ``points [n,3]``; with ``hidden`` through surfaces."""
+        """Return the cameras, ascending, that may see any of ``points [n,3]``; ``hidden``: also through surfaces."""
         low, high = points.min(0), points.max(0)
-        middle, radius = (low + high) / 2, float(np.sqrt(np.square(high - low).sum())) * 0.500001
+        middle, radius = (low + high) / 2, float(np.sqrt(np.square(high - low).sum())) * 0.500001  # rounded up
         distances = matmul(self.planes[..., :3], middle[:, None])[..., 0] + self.planes[..., 3]
         radius += 1e-9 * float(np.abs(distances).max(initial=0))
         reached = (distances >= -radius).all(1)
@@ -138,7 +139,7 @@ def split_points(points: np.ndarray, most: int) -> Iterator[np.ndarray]:
 
 
 def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return masks ``[c,n]`` of points ``[n,3]``: seen by each camera, and inside each camera's frustum.
+    """Return two masks ``[c,n]`` of points ``[n,3]``: seen by each camera, and inside the frustum of each camera.
 
     Points behind the surfaces of the coarse depth maps ``depths [c,h,w]`` are not seen.
     """
@@ -154,7 +155,8 @@ def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.nd
 def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.ndarray:
     """Return a factor for each block's number of Gaussians that makes all blocks equally dense.
 
-    Views of other blocks also see the surfaces of a block, but their Gaussians there are dropped.
+    Views of other blocks also have Gaussians on the surfaces of a block, but these are dropped. The factor makes up for
+    them.
     """
     views = range(len(covisibility.cameras))
     owners = owning_views(covisibility.samples, covisibility, views)
@@ -162,17 +164,17 @@ def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.nda
     for i, block in enumerate(blocks):
         inside = np.isin(owners, block.own)
         used = np.isin(covisibility.sample_views, block.views)
-        kept = int((inside & used).sum())
-        if kept:
-            factors[i] = max(1.0, int(inside.sum()) / kept)
+        num_kept = int((inside & used).sum())
+        if num_kept:
+            factors[i] = max(1.0, int(inside.sum()) / num_kept)
     return factors
 
 
 def partition_views(weights: np.ndarray, count: int) -> list[Block]:
     """Cluster v views into ``count`` blocks of similar size with weak edges between them; add views of neighbours.
 
-    ``weights [v,v]`` are symmetric and at least 0. Every view belongs to one block. A block also shares the views of
-    other blocks with the largest weights, up to ``SHARED`` times the number of its own.
+    ``weights [v,v]`` are symmetric and at least 0. Every view belongs to one block. A block also shares those views of
+    other blocks that have the largest weights with it, up to ``SHARED`` times the number of its own views.
     """
     labels = exchange(weights, grow_blocks(weights, count))
     blocks = []
@@ -185,9 +187,10 @@ def partition_views(weights: np.ndarray, count: int) -> list[Block]:
 
 
 def partition_apart(weights: np.ndarray, count: int) -> list[Block]:
-    """Cut views into at most ``count`` blocks that see little of each other, as :func:`partition_views` does.
+    """Cut views into at most ``count`` blocks that see little of each other.
 
-    The number is halved while more than a third of the shared weights is cut, down to one block.
+    The blocks are those of :func:`partition_views`. Their number is halved, down to one, while they cut more than a
+    third of the weights.
     """
     while True:
         blocks = partition_views(weights, count)
@@ -204,25 +207,28 @@ def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
     most with the block.
     """
     num_views = len(weights)
-    labels, left = np.full(num_views, -1), np.ones(num_views, bool)
+    labels, is_free = np.full(num_views, -1), np.ones(num_views, bool)
     for label in range(count):
-        size = round(left.sum() / (count - label))
-        behind = weights[:, left].sum(1)  # edges of each view to those left
-        gain = np.where(left, 0.0, -np.inf)
-        view = int(np.where(left, behind, np.inf).argmin())
+        size = round(is_free.sum() / (count - label))
+        free_weights = weights[:, is_free].sum(1)  # of the edges from each view to unlabelled ones
+        block_weights = np.where(is_free, 0.0, -np.inf)  # of the edges from each unlabelled view to the block
+        view = int(np.where(is_free, free_weights, np.inf).argmin())
         for _ in range(size):
-            labels[view], left[view] = label, False
-            gain += weights[view]
-            gain[view] = -np.inf
-            # of equals the one that leaves the fewest edges behind, so that no view is left alone
-            behind -= weights[view]
-            score = gain - 0.5 * np.where(left, behind, 0)
+            labels[view], is_free[view] = label, False
+            block_weights += weights[view]
+            block_weights[view] = -np.inf
+            # prefer views with weak edges to the other unlabelled ones, so that no view remains alone
+            free_weights -= weights[view]
+            score = block_weights - 0.5 * np.where(is_free, free_weights, 0)
             view = int(score.argmax())
     return labels
 
 
 def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Move views between blocks ``labels [v]`` while that weakens the edges between them; sizes stay nearly equal."""
+    """Move views between the blocks ``labels [v]`` while that weakens the edges between blocks.
+
+    The sizes of the blocks stay nearly equal.
+    """
     labels, count = labels.copy(), int(labels.max()) + 1
     mean = len(labels) / count
     least, most = int(np.floor((1 - SLACK) * mean)), int(np.ceil((1 + SLACK) * mean))
@@ -231,9 +237,9 @@ def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
         for view in range(len(labels)):
             ties = np.bincount(labels, weights[view], count)
             sizes, label = np.bincount(labels, minlength=count), labels[view]
-            free = (sizes < most) & (ties > ties[label])
-            if sizes[label] > max(1, least) and free.any():
-                labels[view] = int(np.where(free, ties, -np.inf).argmax())
+            is_better = (sizes < most) & (ties > ties[label])
+            if sizes[label] > max(1, least) and is_better.any():
+                labels[view] = int(np.where(is_better, ties, -np.inf).argmax())
                 moved = True
         if not moved:
             break
@@ -243,30 +249,33 @@ def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
 def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence[int]) -> np.ndarray:
     """Return the owner ``[n]`` of each point ``[n,3]``: the nearest of the ``views`` that see the point.
 
-    If no view sees the point, it is the nearest view with the point inside its picture, or else the nearest view.
+    If no view sees the point, its owner is the nearest view with the point inside its picture; if there is none, the
+    nearest view.
     """
     cameras, depths = covisibility.cameras[list(views)], covisibility.depths[list(views)]
     centres, frustums = camera_centres(cameras.viewmats.astype(np.float64)), make_frustums(cameras, depths)
     points = points.astype(np.float64)
 
-    def of_group(rows: np.ndarray) -> np.ndarray:
-        best, left = np.zeros(len(rows), np.int64), np.arange(len(rows))  # those without an owner so far
-        for sight in ("seen", "inside", "any"):
-            part = points[rows[left]]
-            near = np.arange(len(views)) if sight == "any" else frustums.reached_by(part, hidden=sight == "inside")
-            squares = np.square(part - centres[near][:, None]).sum(-1)
-            if sight != "any":
-                seen, inside = see(part, cameras[near], depths[near])
-                squares[~(seen if sight == "seen" else inside)] = np.inf
-            owned = np.isfinite(squares).any(0)
-            if owned.any():
-                best[left[owned]] = near[squares[:, owned].argmin(0)]
-            left = left[~owned]
-            if len(left) == 0:
+    def find_owners(rows: np.ndarray) -> np.ndarray:
+        owners, ownerless = np.zeros(len(rows), np.int64), np.arange(len(rows))
+        for condition in ("seen", "inside", "any"):
+            part = points[rows[ownerless]]
+            candidates = np.arange(len(views))
+            if condition != "any":
+                candidates = frustums.reached_by(part, hidden=condition == "inside")
+            squares = np.square(part - centres[candidates][:, None]).sum(-1)
+            if condition != "any":
+                seen, inside = see(part, cameras[candidates], depths[candidates])
+                squares[~(seen if condition == "seen" else inside)] = np.inf
+            is_owned = np.isfinite(squares).any(0)
+            if is_owned.any():
+                owners[ownerless[is_owned]] = candidates[squares[:, is_owned].argmin(0)]
+            ownerless = ownerless[~is_owned]
+            if len(ownerless) == 0:
                 break
-        return best
+        return owners
 
-    owners, groups = np.zeros(len(points), np.int64), list(split_points(points, POINTS))
-    for rows, best in zip(groups, parallel_map(of_group, groups), strict=True):
-        owners[rows] = best
+    owners, groups = np.zeros(len(points), np.int64), list(split_points(points, OWNED_TOGETHER))
+    for rows, group_owners in zip(groups, parallel_map(find_owners, groups), strict=True):
+        owners[rows] = group_owners
     return np.asarray(views)[owners]

@@ -1,19 +1,14 @@
-"""Bring Gaussians and cameras into the frame of an output: rotate them, and cut their harmonics to a degree."""
+"""Bring Gaussians and cameras into the frame of an output file, and cut harmonics to a degree."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
 from gsmerge.kernels.matrices import matmul
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.types import Cameras, Gaussians
-
-if TYPE_CHECKING:
-    pass
 
 NUM_FULL = 15  # harmonics above degree 0 up to degree 3
 
@@ -27,14 +22,15 @@ def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
 def find_placement(options: PlacementOptions, cameras: Cameras | None, marked: str | None = None) -> Similarity:
     """Find the map from the frame of the scene to that of its file.
 
-    The upward axis is that of the ``cameras``, otherwise that which the file is ``marked`` with, otherwise -y.
+    The upward axis of the scene is that of the ``cameras``; without cameras, the axis that the file is ``marked`` with;
+    without a mark, -y.
     """
     if not options.moves:
         return IDENTITY
     rotation = np.eye(3)
     if options.up is not None:
         upward = _axis(marked or "-y") if cameras is None else -cameras.viewmats[:, 1, :3].sum(0)
-        rotation = turn_to(normalize(upward), _axis(options.up))
+        rotation = rotation_between(normalize(upward), _axis(options.up))
     if options.rotate is not None:
         rotation = matmul(turn_by(np.array(parse_triple("rotate", options.rotate))), rotation)
     scale = 1.0 if options.scale is None else float(options.scale)
@@ -42,13 +38,18 @@ def find_placement(options: PlacementOptions, cameras: Cameras | None, marked: s
 
 
 def _axis(name: str) -> np.ndarray:
+    """Return the unit vector ``[3]`` of an axis such as ``"y"`` or ``"-y"``."""
     axis = np.zeros(3)
     axis[AXES.index(name) // 2] = -1 if name[0] == "-" else 1
     return axis
 
 
-def turn_to(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation ``[3,3]`` of a unit vector to another (Rodrigues); about x if they are opposite."""
+def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the smallest rotation ``[3,3]`` from one unit vector to another (Rodrigues).
+
+    If the vectors are opposite, the axis of the rotation is the part of x that is perpendicular to them; of y if they
+    are almost parallel to x.
+    """
     cosine = float((start * end).sum())
     if cosine < -1 + 1e-12:
         about = np.eye(3)[0] if abs(start[0]) < 0.9 else np.eye(3)[1]
@@ -62,10 +63,10 @@ def turn_to(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 def place(
     gaussians: Gaussians, cameras: Cameras, frame: Similarity, sh_degree: int | None
 ) -> tuple[Gaussians, Cameras]:
-    """Move Gaussians and cameras into a frame, and leave out harmonics above a degree."""
+    """Move Gaussians and cameras into a frame, and leave out harmonics above ``sh_degree``, if it is given."""
     if sh_degree is not None:
         gaussians = replace(gaussians, shN=gaussians.shN[:, : (sh_degree + 1) ** 2 - 1])
     if frame is IDENTITY:
         return gaussians, cameras
-    wide = replace(gaussians, means=gaussians.means.astype(np.float64))  # until they are written
-    return frame.move_gaussians(wide), frame.move(cameras)
+    in_float64 = replace(gaussians, means=gaussians.means.astype(np.float64))  # until the file is written
+    return frame.move_gaussians(in_float64), frame.move(cameras)

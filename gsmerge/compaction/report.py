@@ -1,4 +1,4 @@
-"""The report of a run: what it holds, its JSON document with a stable schema, and its lines for people."""
+"""The report of a run: its content, its JSON document with a stable schema, and its lines of text."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from gsmerge.runtime.memory import human_bytes, human_share
 
 @dataclass(frozen=True)
 class Covered:
-    """PSNR where the input covers the input views, which lacks some of their pixels.
+    """PSNR over the pixels of the input views that the input covers, if it does not cover all.
 
     Args:
-        share: Share of the scored pixels that the input covers: where a file lacks rows of some pixels those that have
-            one, and otherwise those in which it is opaque by half.
+        share: Share of the scored pixels that the input covers. If a file lacks the rows of some pixels, it covers the
+            pixels that have a row; otherwise it covers the pixels in which its opacity is at least a half.
         before: Mean PSNR (dB) of these pixels rendered from the input.
-        after: The same from the result.
+        after: The same, rendered from the result.
     """
 
     share: float
@@ -40,11 +40,11 @@ def compared_psnr(
 
 @dataclass(frozen=True)
 class PhotoFiles:
-    """PSNR on the photos as their files have them, where a run changed their colours or what covers them.
+    """PSNR on the photos as their files have them, if a run changed their colours or what covers them.
 
     Args:
         before: Mean PSNR (dB) of the input views rendered from the input.
-        after: The same from the result.
+        after: The same, rendered from the result.
     """
 
     before: float
@@ -59,29 +59,29 @@ class CompactReport:
         num_input: Gaussians in the scene.
         num_output: Gaussians in the result.
         seconds: Wall time of each stage.
-        psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
-            quarter of each unless a quality was asked for; None where neither photos nor pixels are known.
+        psnr_before: Mean PSNR (dB) of the input views rendered from the input; None if neither photos nor pixels are
+            known. Of many views only some are scored, and only a fixed quarter of each unless a quality was asked for;
             :func:`gsmerge.evaluate` is exact.
-        new_views: What new views are expected to have, from photos that a short fit left out; None with fewer than four
+        new_views: Expected PSNR of new views, estimated on photos that a short fit left out; None with fewer than four
             photos, in drafts, and in blocks.
-        psnr_after: The same from the result; where a file is written and rounds positions visibly, from the file.
-        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit), and ``pruned``: how many
-            Gaussians were left out because no photo shows them. Where there are no photos and the rows belong to no
-            pixels, ``fidelity`` is the ``psnr`` (dB) against renders of the input, in so many ``views``: of the scene,
-            or ``held_out`` ones that were placed for lack of cameras.
+        psnr_after: Like ``psnr_before``, rendered from the result; if a file is written that rounds positions visibly,
+            rendered from the rounded values.
+        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit), and ``pruned``, the
+            number of Gaussians that were left out because no photo shows them. Without photos and without pixels,
+            ``fidelity`` has the ``psnr`` (dB) against renders of the input and the number of ``views`` for it; these
+            are ``held_out`` if they were placed because the scene has no cameras.
         notes: Warnings about the input and adaptations to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
-        unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
-        worse: That the result shows the scene's own photos by more than .5 dB worse than the input does or, where
-            ``fidelity`` is measured, that it is below 30 dB: a sentence that is among the notes, too. None where
-            neither holds, or cannot be said: of odd photos, or with a crop.
-        psnr_reference: What PSNR of the input views is measured against: "photos", or "the model's own pixels"; None
-            where it is not measured.
-        covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
-            not.
-        photo_files: PSNR on the photos as their files have them, where the run changed some; None where it did not.
-        protected: PSNR over the pixels that ``protect`` names, and their share of all; None without.
+        unmet: Why a target that was asked for is not met, and how near the result came; None if it is met.
+        worse: A warning, also among the notes: the result shows the scene's own photos more than .5 dB worse than the
+            input does or, if ``fidelity`` is measured, its PSNR against the input is below 30 dB. None if neither is
+            the case, or if it cannot be measured, as with a crop.
+        psnr_reference: What the PSNR of the input views is measured against: "photos" or "the model's own pixels"; None
+            if it is not measured.
+        covered: PSNR over the pixels that the input covers; None if it lacks at most 2 % of them.
+        photo_files: PSNR on the photos as their files have them; None if the run changed no photo.
+        protected: PSNR over the pixels that ``protect`` names, and their share of all; None without such pixels.
 
     Example:
         >>> report = gsmerge.compact("demo", effort="draft", budget=300).report
@@ -118,7 +118,7 @@ class CompactReport:
         return html_table([*self._facts(), *notes])
 
     def _facts(self) -> list[tuple[str, str]]:
-        """List what a reader wants first, by name."""
+        """List the main facts, each with its name."""
         share = human_share(self.num_output / max(1, self.num_input))
         facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share})")]
         if new := self.new_views:
@@ -126,11 +126,11 @@ class CompactReport:
         if self.psnr_before is not None and self.psnr_after is not None:
             facts += [("PSNR of its own views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
         if files := self.photo_files:
-            facts += [("on photos as they are", f"{files.before:.2f} -> {files.after:.2f} dB")]
+            facts += [("PSNR of unchanged photos", f"{files.before:.2f} -> {files.after:.2f} dB")]
         if protected := self.protected:
-            facts += [("where they are protected", f"{protected.before:.2f} -> {protected.after:.2f} dB")]
-        if judged := self.choices.get("fidelity"):
-            facts += [("PSNR", f"{psnr_words(judged['psnr'])} {_judged_by(judged)}")]
+            facts += [("PSNR of protected pixels", f"{protected.before:.2f} -> {protected.after:.2f} dB")]
+        if fidelity := self.choices.get("fidelity"):
+            facts += [("PSNR", f"{psnr_words(fidelity['psnr'])} {_describe_views(fidelity)}")]
         return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
 
 
@@ -150,23 +150,22 @@ def report_document(
 ) -> dict[str, Any]:
     """Return the report of one ``compact`` run as plain JSON types.
 
-    ``seconds_before`` and ``seconds_after``: wall time by name before the report's stages (imports,
-    reading) and after them (writing). ``coarser``: file and report of each further level of detail.
-    ``recognised``: facts about the input besides path, bytes and count. ``notes``: of the reader,
-    before the report's own. ``hashed``: also hash the input, which takes time on large files.
-    ``written_at``: the files of an output, as they are before they are renamed. ``cameras_path``: the file of
-    the views for viewers, if any.
+    ``seconds_before`` and ``seconds_after``: wall time by name before the report's stages (imports, reading) and after
+    them (writing). ``coarser``: file and report of each coarser level of detail. ``recognised``: facts about the input
+    in addition to path, bytes and count. ``notes``: notes of the reader, which come before those of the report.
+    ``hashed``: also hash the input, which takes time on large files. ``written_at``: the temporary files of each
+    output, before they are renamed. ``cameras_path``: the file of the views for viewers, if any.
 
     Returns:
-        ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
-        ``new_views``: ``before`` and ``after``, the PSNR that new views are expected to have, estimated on so many
-        ``views`` that a short fit left out; null with fewer than four photos, or where it was not asked for.
-        ``psnr_reference``: what ``psnr_input_views`` are measured against: "photos", or what stands in for them.
-        ``psnr_covered``: ``share``, ``before``, ``after`` over the pixels that the input covers, where it lacks some.
-        ``psnr_photo_files``: ``before``, ``after`` on the photos as their files have them, where the run changed some.
-        ``psnr_protected``: ``share``, ``before``, ``after`` over the pixels that ``protect`` names.
-        ``worse``: that the result, or the first level that does, shows the photos worse than the input, or that the
-        result is below 30 dB from the input where there are no photos; or null.
+        ``schema_version`` 1; within a version keys are only added. ``unmet``: why a target is not met, or null.
+        ``new_views``: the expected PSNR of new views ``before`` and ``after``, estimated on so many ``views`` that a
+        short fit left out; null with fewer than four photos, or if it was not asked for. ``psnr_reference``: what
+        ``psnr_input_views`` are measured against: "photos", or what stands in for them. ``psnr_covered``: ``share``,
+        ``before``, ``after`` over the pixels that the input covers, if it lacks some. ``psnr_photo_files``: ``before``,
+        ``after`` on the photos as their files have them, if the run changed some. ``psnr_protected``: ``share``,
+        ``before``, ``after`` over the pixels that ``protect`` names. ``worse``: a warning that the result, or else a
+        level, shows the photos worse than the input or, without photos, has a PSNR below 30 dB against the input; or
+        null.
     """
     numbers, at = asdict(report), written_at or {}
     return {
@@ -217,9 +216,9 @@ def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Sequence[Pa
 
 
 def result_table(document: Mapping[str, Any], next_step: str | None = None, *, columns: int | None = None) -> list[str]:
-    """Return the closing table of ``compact`` in a terminal, ``columns`` wide, with a ``next_step`` if any.
+    """Return the closing table of ``compact`` in a terminal of ``columns`` characters, with a ``next_step`` if any.
 
-    Paths and the next step, which people copy, are never broken.
+    Paths and the next step are never broken into lines, because people copy them.
     """
     before, after, psnr = document["input"], document["output"], document["psnr_input_views"]
     ratio = human_share(document["ratio"])
@@ -244,9 +243,8 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     if protected := document.get("psnr_protected"):
         share = f"on the {100 * protected['share']:.1f} % that are protected"
         rows += [("", f"{protected['before']:.2f} dB", f"{protected['after']:.2f} dB", share)]
-    judged = document["choices"].get("fidelity")
-    if judged:
-        rows += [("PSNR", "", psnr_words(judged["psnr"]), _judged_by(judged))]
+    if fidelity := document["choices"].get("fidelity"):
+        rows += [("PSNR", "", psnr_words(fidelity["psnr"]), _describe_views(fidelity))]
     if pruned := document["choices"].get("pruned"):
         rows += [("left out", "", f"{pruned:,}", "Gaussians that no photo shows")]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
@@ -261,7 +259,8 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     return [after["path"], *wrapped, *(f"  {name:9}  {text}" for name, text in last.items() if text is not None)]
 
 
-def _judged_by(fidelity: Mapping[str, Any]) -> str:
+def _describe_views(fidelity: Mapping[str, Any]) -> str:
+    """Say in which views the PSNR against the input was measured."""
     return f"from the input in {fidelity['views']} {'held-out' if fidelity['held_out'] else 'of its'} views"
 
 
@@ -276,9 +275,9 @@ def level_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def curve_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return the scene's curve as a small table: quality of short fits on held-out patches of the photos.
+    """Return the scene's curve as a small table: quality of short fits on what they left out of the photos.
 
-    The row nearest the number of Gaussians in the result is marked; the result may lie between two rows.
+    The row nearest to the number of Gaussians in the result is marked; the result may lie between two rows.
     """
     points, count = document["choices"].get("curve"), document["output"]["num_gaussians"]
     if not points:
@@ -292,16 +291,16 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
         + (f"  <- the result has {result}" if p is nearest else "")
         for p in points
     ]
-    return ["after short fits, on photos that they left out, or patches of them:", head, *rows]
+    return ["quality of short fits, on photos or patches that they left out:", head, *rows]
 
 
 def summary_line(document: Mapping[str, Any]) -> str:
-    """Return the line of the result: counts, ratio, bytes, PSNR, seconds per stage, the cameras beside it."""
+    """Describe the result in one line: counts, ratio, bytes, PSNR, seconds per stage, the cameras beside it."""
     before, after = document["input"], document["output"]
     psnr, path = document["psnr_input_views"], document.get("viewer_cameras")
     cameras = f"; cameras for viewers in {os.path.basename(path)}" if path else ""
-    judged = document["choices"].get("fidelity")
-    quality = f"; {psnr_words(judged['psnr'])} {_judged_by(judged)}" if judged else ""
+    fidelity = document["choices"].get("fidelity")
+    quality = f"; {psnr_words(fidelity['psnr'])} {_describe_views(fidelity)}" if fidelity else ""
     if psnr["before"] is not None and psnr["after"] is not None:
         quality = f"; a sample of {_own(document)} {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
     if new := document["new_views"]:

@@ -25,9 +25,8 @@ SEAM_STEPS = 100  # fewest steps of the fit
 SEAM_VIEW_STEPS = 2  # steps for each view
 # Share of Gaussians at seams from which on the blocks are one room, and the steps for each view then
 ROOM_SHARE, ROOM_VIEW_STEPS = 0.5, 4
-SEAM_RATE = (
-    0.6  # step sizes, relative to the usual first ones: the Gaussians are fitted already, beside older neighbours
-)
+# Step sizes, relative to the usual first ones: the Gaussians are fitted already, but beside older neighbours
+SEAM_RATE = 0.6
 SEAM_DECAY = 0.1  # factor on the step sizes at the end
 
 

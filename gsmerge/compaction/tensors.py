@@ -1,4 +1,4 @@
-"""Compaction of arrays and tensors in memory, whose conventions are checked."""
+"""Compact arrays and tensors in memory, after their conventions were checked."""
 
 from __future__ import annotations
 
@@ -46,11 +46,12 @@ if TYPE_CHECKING:
     from gsmerge.settings.keywords import CompactKeywords
 
 ORDERS = ("view-major", "none")
-_TOLERANCE = 1e-3  # by which opacities and images may leave [0, 1]
-_NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may have it
-_EXACT = 1e-5  # the same difference from which on they are normalised
-_MAX_COLOR = 2.0  # of colours, which harmonics may take a little beyond 1
-_CORNER = 0.1  # pixels by which the rows are off from the corners of their pixels where these are taken for centres
+_TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by so much
+_NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may exceed it
+_EXACT = 1e-5  # the same difference from which on quaternions are normalised
+_MAX_COLOR = 2.0  # largest colour; harmonics may take colours a little beyond 1
+# Offset (pixels) up to which Gaussians lie at the corners of their pixels, if Ks take the corners for the centres
+_CORNER = 0.1
 _REMEDIES = {
     C2W_OPENCV: "pass their inverse, torch.linalg.inv(viewmats)",
     W2C_OPENGL: "negate the second and the third row of each",
@@ -82,7 +83,7 @@ def compact_tensors(
     progress: Progress | None = None,
     **settings: Unpack[CompactKeywords],
 ) -> CompactResult:
-    """Compact Gaussians given as arrays or tensors, as :func:`gsmerge.compact` does a scene.
+    """Compact Gaussians given as arrays or tensors, as :func:`gsmerge.compact` compacts a scene.
 
     Arrays are NumPy's or torch's, on any device, and are copied without gradients. Leading axes are
     flattened, so ``[1,n,3]`` and ``[V,H,W,3]`` mean ``[n,3]``. Rows with NaN or infinities are left out.
@@ -108,10 +109,11 @@ def compact_tensors(
         **settings: Settings of :func:`gsmerge.compact`, such as ``budget="4%"``, ``k=2``.
 
     Returns:
-        The result of :func:`gsmerge.compact`; tensors on the device of ``means`` if that is one, with its precision.
+        The result of :func:`gsmerge.compact`, with the precision of ``means``; of tensors on its device if ``means`` is
+        a tensor.
 
     Raises:
-        SceneError: If an array has another shape or convention; it says what to pass instead.
+        SceneError: If an array has another shape or convention; the message says what to pass instead.
         ValueError: If a setting is unknown or out of range.
 
     Example:
@@ -135,12 +137,12 @@ def compact_tensors(
     cameras, photos = NO_CAMERAS, None
     if order != "none" or viewmats is not None or images is not None:
         cameras, photos = _read_views(viewmats, Ks, images, shape)
-    scene, more = make_scene(gaussians, valid, cameras, photos, names, order)
+    scene, scene_notes = make_scene(gaussians, valid, cameras, photos, names, order)
     if scene.has_own_pixels and check_rotations:
         _check_rotations(scene)
-    more += _rotation_notes(scene, check_rotations=check_rotations)
+    scene_notes += _rotation_notes(scene, check_rotations=check_rotations)
     result = compact(scene, progress=progress, **settings)
-    result.report.notes[:0] = notes + more
+    result.report.notes[:0] = notes + scene_notes
     if gaussians.means.dtype == np.float32:
         result = result.to_single()
     return result.to(means.device if hasattr(means, "detach") else None)
@@ -169,9 +171,9 @@ def make_scene(
         problem = f"expected one Gaussian per pixel, {sizes} (views x height x width), found {len(gaussians)}"
         raise SceneError("means", problem, 'pass shape=(V, H, W) as the model has it, or order="none"')
     cameras, notes = _check_pixels(gaussians, cameras, valid, views)
-    there = valid.reshape(len(cameras), cameras.height, cameras.width)
-    kept = gaussians if valid.all() else gaussians[valid]
-    return Scene(kept, cameras, images, Pixels.of_grid(there), views), notes
+    has_gaussian = valid.reshape(len(cameras), cameras.height, cameras.width)
+    gaussians = gaussians if valid.all() else gaussians[valid]
+    return Scene(gaussians, cameras, images, Pixels.of_grid(has_gaussian), views), notes
 
 
 def _to_numpy(name: str, values: Any) -> np.ndarray:
@@ -195,9 +197,9 @@ def _rows(name: str, values: Any, *tail: int) -> np.ndarray:
 
 
 def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
-    """Make Gaussians from columns, which are changed in place; rows that are not finite become transparent.
+    """Make Gaussians from columns, which are changed in place; rows with NaN or infinities become transparent.
 
-    Returns the Gaussians, a mask of the finite rows, and notes.
+    Returns the Gaussians, a mask ``[n]`` of valid rows, which are finite and not empty, and notes.
     """
     n = len(out["means"])
     for name, column in out.items():
@@ -223,7 +225,7 @@ def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, l
 
 
 def _read_base(sh0: Array | None, colors: Array | None) -> np.ndarray:
-    """Return ``sh0 [n,1,3]``, given or computed from colours."""
+    """Return ``sh0 [n,1,3]`` as given, or compute it from colours."""
     if (sh0 is None) == (colors is None):
         found = "neither" if sh0 is None else "both"
         raise SceneError("sh0", f"expected either sh0 or colors, found {found}")
@@ -235,6 +237,7 @@ def _read_base(sh0: Array | None, colors: Array | None) -> np.ndarray:
 
 
 def _read_harmonics(shN: Array | None, n: int) -> np.ndarray:
+    """Return ``shN [n,k-1,3]``, with k = 1 if there are no higher harmonics; SceneError for any other shape."""
     shape = (0, 3) if shN is None else _to_numpy("shN", shN).shape
     if shape[-2:] == (0, 3):
         return np.zeros((n, 0, 3), np.float32)
@@ -247,7 +250,7 @@ def _read_harmonics(shN: Array | None, n: int) -> np.ndarray:
 
 
 def _check_values(out: dict[str, np.ndarray], valid: np.ndarray) -> None:
-    """Refuse log scales, logits, and quaternions that are not of length 1."""
+    """Raise SceneError for log scales, logits, and quaternions that do not have length 1."""
     scales, opacities = out["scales"][valid], out["opacities"][valid]
     negative = float((scales < 0).any(1).mean())
     if negative > 0:
@@ -266,7 +269,7 @@ def _check_values(out: dict[str, np.ndarray], valid: np.ndarray) -> None:
 
 
 def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
-    """Raise SceneError for colours far outside [0, 1], and name the range that they seem to have."""
+    """Raise SceneError for colours more than ``slack`` outside [0, 1]; the message names the range they seem to have."""
     low, high = float(values.min(initial=0)), float(values.max(initial=0))
     if -slack <= low and high <= 1 + slack:
         return
@@ -281,7 +284,7 @@ def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
 def _read_views(
     viewmats: Array | None, Ks: Array | None, images: Array | None, shape: Sequence[int] | None
 ) -> tuple[Cameras, np.ndarray | None]:
-    """Return the cameras and ``images [v,h,w,3]``, each checked alone."""
+    """Return the cameras and ``images [v,h,w,3]``, after each was checked alone."""
     if viewmats is None or Ks is None:
         raise SceneError("viewmats" if viewmats is None else "Ks", "expected one matrix for each view, found none")
     photos = None if images is None else _to_numpy("images", images)
@@ -313,6 +316,7 @@ def _read_views(
 
 
 def _matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: int) -> np.ndarray:
+    """Return one float64 matrix for each view; SceneError if its shape is none of ``shapes``."""
     array = _to_numpy(name, values).astype(np.float64)
     if array.shape[-2:] not in shapes or array.size != views * array.shape[-2] * array.shape[-1]:
         expected = " or ".join(str([views, *shape]) for shape in shapes)
@@ -321,7 +325,7 @@ def _matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: 
 
 
 def _view_shape(shape: Sequence[int] | None, photos: np.ndarray | None) -> tuple[int, int, int]:
-    """Return views, height and width as given, or those of the images."""
+    """Return the number of views, height and width: as given, or those of the images."""
     if shape is not None:
         if len(shape) != 3:
             raise SceneError("shape", f"expected views, height and width, found {list(shape)}")
@@ -337,7 +341,7 @@ def _view_shape(shape: Sequence[int] | None, photos: np.ndarray | None) -> tuple
 
 
 def _image_error(photos: np.ndarray, expected: str) -> SceneError:
-    """Return the error for images of another shape, with a remedy."""
+    """Return the error for images of a wrong shape, with a remedy."""
     first = photos.ndim >= 4 and photos.shape[-3] == 3 != photos.shape[-1]
     remedy = "channels come first: pass images.permute(0, 2, 3, 1)" if first else "resize them to the model's input"
     return SceneError("images", f"expected shape {expected}, found {list(photos.shape)}", remedy)
@@ -346,7 +350,7 @@ def _image_error(photos: np.ndarray, expected: str) -> SceneError:
 def _check_pixels(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, names: tuple[str, ...]
 ) -> tuple[Cameras, list[str]]:
-    """Check that Gaussians project into their own pixels; return the cameras, slightly moved if needed, and notes."""
+    """Check that Gaussians project into their own pixels; return the cameras, moved slightly if needed, and notes."""
     pairs = sample_pixels(gaussians, cameras, valid)
     alignment = check_pairs(pairs, cameras)
     if alignment.ok:
@@ -371,7 +375,7 @@ def _check_pixels(
 
 
 def _check_rotations(scene: Scene) -> None:
-    """Refuse rotations that follow the surface far better in another convention."""
+    """Raise SceneError for rotations that follow the surface far better in another convention."""
     choice, note = choose_rotations(scene)
     if choice == "wxyz":
         return
@@ -381,7 +385,10 @@ def _check_rotations(scene: Scene) -> None:
 
 
 def _rotation_notes(scene: Scene, *, check_rotations: bool) -> list[str]:
-    """Note quaternions whose w may come last; if pixels are known, the surface decides, otherwise the caller."""
+    """Return a note on quaternions whose w may come last, or none.
+
+    If pixels are known, the surface decides. Otherwise there is a note unless the caller has turned off the check.
+    """
     if not w_seems_last(scene.gaussians.quats):
         return []
     last_w = choose_rotations(scene)[0] == "xyzw" if scene.has_own_pixels else check_rotations
@@ -389,7 +396,7 @@ def _rotation_notes(scene: Scene, *, check_rotations: bool) -> list[str]:
 
 
 def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> list[str]:
-    """Refuse poses that see the Gaussians only in another convention; return notes."""
+    """Raise SceneError for poses that see the Gaussians only in another convention; return notes on other poses."""
     poses, check, note = choose_poses(gaussians, valid, cameras, photo_array(images), W2C_OPENCV)
     if poses is not None:
         raise _convention_error(poses.convention, poses.description, check.description)

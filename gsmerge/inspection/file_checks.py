@@ -1,4 +1,4 @@
-"""Read files completely, and list the reasons for which ``compact`` would refuse each one."""
+"""Read files completely, and list the reasons why ``compact`` would refuse each of them."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ class FileCheck:
 
     path: str
     kind: str  # "Gaussians", "cameras", "networks" or "Feature Gaussians"; "" if the file cannot be read
-    count: int = 0  # of Gaussians or Feature Gaussians, views of cameras, or parameters of networks
-    layout: str = ""  # of the columns, or of the camera file
+    count: int = 0  # Number of Gaussians, Feature Gaussians, views of cameras, or parameters of networks
+    layout: str = ""  # Layout of the columns, or of the camera file
     file_bytes: int = 0
-    problems: tuple[str, ...] = ()  # one sentence each, without a full stop
-    notes: tuple[str, ...] = ()  # unusual content that is not wrong, and content that was not read
-    num_views: int = 0  # of a scene with cameras
-    num_photos: int = 0  # of a scene with photos
+    problems: tuple[str, ...] = ()  # One sentence each, without a full stop
+    notes: tuple[str, ...] = ()  # Unusual content that is not wrong, and content that was not read
+    num_views: int = 0  # Views of a scene with cameras
+    num_photos: int = 0  # Photos of a scene
 
     @property
     def line(self) -> str:
@@ -71,7 +71,7 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
 
 
 def holds_scene(path: Path) -> bool:
-    """Return whether a path is read as a scene, and not as cameras, networks, levels or a state."""
+    """Return whether a path is read as a scene, not as cameras, networks, levels or a state."""
     suffix = path.suffix.lower()
     if suffix in SEVERAL_USES:
         return os.path.exists(path) and may_hold_gaussians(path)
@@ -83,7 +83,7 @@ def holds_scene(path: Path) -> bool:
 
 
 def list_damage(path: Path) -> list[str]:
-    """List problems that reading a file does not notice: bytes after its content, and wrong checksums of its parts."""
+    """List problems that reading a file does not show: bytes after its content, and wrong checksums of its parts."""
     suffix = path.suffix.lower()
     if os.path.isdir(path):
         return [f"{file.name}: {problem}" for file in list_plys(path) for problem in list_damage(file)]
@@ -124,7 +124,7 @@ def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileChe
 
 
 def _read_cameras(path: Path) -> FileCheck:
-    """Read the cameras of a file; if it has several scenes, of all."""
+    """Read the cameras of a file, of all its scenes if it has several."""
     count = 0
     for cameras in read_all_cameras(path):
         count += len(cameras)

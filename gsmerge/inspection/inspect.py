@@ -1,4 +1,4 @@
-"""Inspection of a scene's files: one document of their content, and of the result that ``compact`` would make."""
+"""Inspect a scene's files: one document describes their content, and the result that ``compact`` would make."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import PicturedScene, Scene, StrPath
 
-_OPAQUE = 0.995  # opacity from which optical depth is capped
-_SATURATED = 1e-6  # of an opacity's distance to 0 or 1: its logit changes in float32
-_OWN = "gsmerge"  # the exporter's name of files that gsmerge wrote
+_OPAQUE = 0.995  # opacity from which on the optical depth is capped
+_SATURATED = 1e-6  # distance of an opacity to 0 or 1 up to which float32 changes its logit
+_OWN = "gsmerge"  # name of the exporter of files that gsmerge wrote
 _FILE_KEYS = (
     "path", "layout", "format", "count", "bytes_by_attribute", "extra_columns", "extra_elements", "sh_degree",
     "opacity_encoding", "num_nonfinite", "num_empty", "num_clipped_scales", "num_zero_quats",
@@ -70,31 +70,31 @@ def inspect(
 
     Args:
         path: The scene.
-        cameras: As of :func:`gsmerge.read_scene`.
-        images: As there.
-        masks: As there.
-        opacity: As there.
-        threads: How many; None: all processors.
-        hints: As there.
+        cameras: As in :func:`gsmerge.read_scene`.
+        images: As in :func:`gsmerge.read_scene`.
+        masks: As in :func:`gsmerge.read_scene`.
+        opacity: As in :func:`gsmerge.read_scene`.
+        threads: Number of threads; None: one for each processor.
+        hints: As in :func:`gsmerge.read_scene`.
 
     Returns:
-        Plain JSON types, None for what is not known. Of the file: ``path``, ``bytes``, ``bytes_by_attribute``,
+        Plain JSON types, None for unknown values. About the file: ``path``, ``bytes``, ``bytes_by_attribute``,
         ``layout``, ``format``, ``exporter``, ``extra_columns``, ``extra_elements``, ``sh_degree``,
         ``opacity_encoding``, ``batches`` (of a state: ``num_views``, ``num_input``, ``num_new``, and the names of its
-        ``views``). Of the rows: ``count``, ``num_nonfinite``, ``num_empty``, ``num_clipped_scales``,
+        ``views``). About the rows: ``count``, ``num_nonfinite``, ``num_empty``, ``num_clipped_scales``,
         ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255), ``num_saturated``
-        (within 1e-6 of 0 or 1), ``extents``. Of the views: ``cameras``, ``camera_format``, ``images``, ``num_views``,
-        ``width``, ``height``, ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order),
-        ``alignment`` or ``alignment_problem``, ``num_unseen`` (Gaussians of a result that no view shows),
-        ``sight``, ``coverage``, ``num_sky_views``, ``agreement``:
-        shares of the pixels whose depth other views confirm or contradict, or that no other view sees (``confirmed``,
-        ``contradicted``, ``alone``), ``new_views``: ``before``, ``after``, ``low``, ``high`` of a result, see the
-        report of a run. ``compact``: the estimate of a run, None where it would refuse the scene; ``auto``: ``share``,
-        ``num_gaussians`` and ``why`` of ``--budget auto``. ``notes``: warnings.
+        (within 1e-6 of 0 or 1), ``extents``. About the views: ``cameras``, ``camera_format``, ``images``,
+        ``num_views``, ``width``, ``height``, ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows``
+        (order of the rows), ``alignment`` or ``alignment_problem``, ``num_unseen`` (Gaussians of a result that no view
+        shows), ``sight``, ``coverage``, ``num_sky_views``. ``agreement``: shares of the pixels whose depth other views
+        confirm or contradict, or that no other view sees (``confirmed``, ``contradicted``, ``alone``). ``new_views`` of
+        a result: ``before``, ``after``, ``low``, ``high``, see the report of a run. ``compact``: the estimate of a run,
+        None if it would refuse the scene. ``auto``: ``share``, ``num_gaussians`` and ``why`` of ``--budget auto``.
+        ``notes``: warnings.
 
     Raises:
-        SceneError: If the ``.ply`` cannot be read, or a named file does not exist; cameras that are missing or do not
-            fit are reported instead.
+        SceneError: If the ``.ply`` cannot be read, or a named file does not exist. Cameras that are missing or do not
+            fit raise no error; the document reports them.
 
     Example:
         >>> facts = gsmerge.inspect("demo")
@@ -115,6 +115,7 @@ def inspect(
 
 
 def _describe_file(ply: GaussianFile) -> dict[str, Any]:
+    """Describe a file of Gaussians, without views."""
     info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
     return {
         **{name: getattr(info, name) for name in _FILE_KEYS},
@@ -128,7 +129,7 @@ def _describe_file(ply: GaussianFile) -> dict[str, Any]:
 
 
 def _photo_notes(scene: Scene) -> list[str]:
-    """Describe which photos do not look like their Gaussians, as a run would."""
+    """Return the notes of a run on photos that do not look like their Gaussians."""
     with record_part(silent=True) as record:
         if scene.images is not None and len(scene) and len(scene.gaussians):
             compare_photos(PicturedScene.with_pictures(canonicalise(scene)[0], scene.images, scene.masks))
@@ -136,11 +137,12 @@ def _photo_notes(scene: Scene) -> list[str]:
 
 
 def _measure_agreement(scene: Scene) -> Agreement | None:
+    """Measure how far views confirm each other's depth; None without views or Gaussians."""
     return confirm_depths(canonicalise(scene)[0]) if len(scene) and len(scene.gaussians) else None
 
 
 def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] | None:
-    """Describe the number that an automatic budget takes by the depths of several views; None for other scenes."""
+    """Describe the number of Gaussians of an automatic budget; None if the views' depths cannot be compared."""
     if agreement is None:
         return None
     count = int(agreement.share * scene.num_gaussians)
@@ -148,6 +150,7 @@ def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] 
 
 
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
+    """Describe the views of a scene, and whether its rows belong to their pixels."""
     is_result, expected = is_from_gsmerge(ply.info.comments), read_new_views(ply.info.comments)
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
@@ -195,7 +198,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
 
 
 def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
-    """Describe a scene that was read: its views, what they see of it, and what compact would make of it."""
+    """Describe a scene that was read: its views, what they see, and the result that ``compact`` would make."""
     scene, sight, num_sky_views = load.scene, None, 0
     if len(scene):
         gaussians = scene.gaussians
@@ -203,9 +206,9 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
         means = gaussians.means[np.isfinite(gaussians.means).all(1)]
         num_sky_views = len(sky_regions(means, scene.cameras, images))
-    once = without_repeats(scene)[0]  # as a run takes it
-    agreement, odd = _measure_agreement(once), unlike_captures(scene.gaussians)
-    doubts = [odd, None if agreement is None else agreement.doubt]
+    once = without_repeats(scene)[0]  # each view once, as in a run
+    agreement = _measure_agreement(once)
+    doubts = [unlike_captures(scene.gaussians), None if agreement is None else agreement.doubt]
     facts: dict[str, Any] = {
         "notes": [*load.notes, *views_notes(scene), *_photo_notes(scene), *filter(None, doubts)],
         "num_views": len(load.views.used),
@@ -217,7 +220,9 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         "auto": _describe_auto(once, agreement),
         "agreement": agreement and agreement.to_dict(),
     }
-    if is_result and len(scene) and load.recovery is None:  # those of views hide each other where these overlap
+    if (
+        is_result and len(scene) and load.recovery is None
+    ):  # with pixels, Gaussians of overlapping views hide each other
         facts["num_unseen"] = int((count_views_in_world(scene.gaussians, scene.cameras) == 0).sum())
     if not is_result:
         is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)
@@ -269,7 +274,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _batch_lines(batches: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Describe each batch of a state, by whose number ``extend --remove`` takes it out again."""
+    """Describe each batch of a state, with the number by which ``extend --remove`` removes it."""
     lines = []
     for number, batch in enumerate(batches, 1):
         count, before, after = (batch.get(name, 0) for name in ("num_views", "num_input", "num_new"))
@@ -280,13 +285,14 @@ def _batch_lines(batches: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _ignored(scene: Mapping[str, Any]) -> list[str]:
-    """List the columns and elements that mean nothing to gsmerge; elements with the camera are not among them."""
+    """List the columns and elements that gsmerge does not use; elements with the camera are used."""
     used = _CAMERA_ELEMENTS if scene["cameras"] is None and scene["camera_format"] else ()
     elements = [name for name in scene["extra_elements"] if name not in used]
     return [*scene["extra_columns"], *(f"element {name}" for name in elements)]
 
 
 def _describe_cameras(scene: Mapping[str, Any]) -> str:
+    """Say where the cameras are, their number and their format."""
     if not scene["num_views"]:
         return scene["cameras"] or "none found"
     inside = set(_CAMERA_ELEMENTS) <= set(scene["extra_elements"])
@@ -295,7 +301,7 @@ def _describe_cameras(scene: Mapping[str, Any]) -> str:
 
 
 def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe which row is which pixel, and at which distance; or why that is unknown."""
+    """Describe which row belongs to which pixel, and how far off the rows are; or say why that is unknown."""
     alignment, problem = scene["alignment"], scene["alignment_problem"]
     if problem is not None and scene["compact"] is None:
         return []  # the error says why
@@ -315,25 +321,25 @@ def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe the shares that the views show, and the view that shows least."""
-    views, seen = scene["coverage"], scene["sight"]
-    if not views or seen is None:
+    """Describe which shares of pixels or Gaussians the views show, and name the view that shows least."""
+    views, sight = scene["coverage"], scene["sight"]
+    if not views or sight is None:
         return []
     colors = ""
-    if seen["color_ratio"] is not None:
-        colors = f"; colours {seen['color_ratio']:.2f} times as far from their own pixels as from any others"
+    if sight["color_ratio"] is not None:
+        colors = f"; colours {sight['color_ratio']:.2f} times as far from their own pixels as from any others"
     pixelwise = views[0]["share_of_pixels"] is not None
-    key, what = ("share_of_pixels", "pixels") if pixelwise else ("share_of_gaussians", "Gaussians")
+    key, unit = ("share_of_pixels", "pixels") if pixelwise else ("share_of_gaussians", "Gaussians")
     shares = [view[key] for view in views]
     low, high = f"{100 * min(shares):.0f}", f"{100 * max(shares):.0f}"
-    each = f"{high} % of the {what} in every view"
+    each = f"{high} % of the {unit} in every view"
     if low != high:
-        each = f"{low} to {high} % of the {what} per view, least in {views[shares.index(min(shares))]['name']}"
-    return [f"coverage   {each}; {100 * seen['share_seen']:.0f} % of the Gaussians lie in some picture{colors}"]
+        each = f"{low} to {high} % of the {unit} per view, least in {views[shares.index(min(shares))]['name']}"
+    return [f"coverage   {each}; {100 * sight['share_seen']:.0f} % of the Gaussians lie in some picture{colors}"]
 
 
 def _agreement_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe how far views confirm each other's depth."""
+    """Describe for which share of the pixels other views confirm the depth."""
     agreement = scene["agreement"]
     if agreement is None:
         return []
@@ -342,7 +348,7 @@ def _agreement_lines(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _new_views_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe what new views of a result are expected to gain."""
+    """Describe the PSNR that new views of a result are expected to gain."""
     expected = scene["new_views"]
     if expected is None:
         return []

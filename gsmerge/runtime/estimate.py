@@ -1,4 +1,9 @@
-"""Estimate the seconds and bytes of a run, within a factor of about two."""
+"""Estimate the seconds and bytes of a run before it starts, within a factor of about two.
+
+The costs are mean processor seconds of whole runs, on any settings. The forecast of a run that has started,
+``gsmerge/compaction/forecast.py``, has costs of its own: it measures the seconds itself and only needs the ratios of
+the costs between the parts of one run, which it needs more exactly.
+"""
 
 from __future__ import annotations
 

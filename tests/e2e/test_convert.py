@@ -17,7 +17,7 @@ from sweeps import sweep
 
 import gsmerge
 from gsmerge.compaction.convert import ConvertOptions, convert_files, join_gaussians
-from gsmerge.compaction.placement import find_placement, turn_to
+from gsmerge.compaction.placement import find_placement, rotation_between
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import covariances
 from gsmerge.io import CameraFile
@@ -178,11 +178,11 @@ def test_turns_are_the_smallest(tmp_path: Path) -> None:
     for seed in range(20):
         start, end = np.random.default_rng(seed).normal(size=(2, 3))
         start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
-        turn = turn_to(start, end)
+        turn = rotation_between(start, end)
         np.testing.assert_allclose(turn @ start, end, atol=1e-9)
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
         np.testing.assert_allclose((np.trace(turn) - 1) / 2, start @ end, atol=1e-9)
-        np.testing.assert_allclose(turn_to(start, -start) @ start, -start, atol=1e-9)
+        np.testing.assert_allclose(rotation_between(start, -start) @ start, -start, atol=1e-9)
 
 
 def test_several_files_are_joined(result: Path, tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def test_a_poor_result_is_a_warning(compacted_scene: Path, tmp_path: Path, run: 
 
 def test_dry_run_says_what_decides_the_count(compacted_scene: Path, tmp_path: Path, run: Run) -> None:
     words = ("compact", compacted_scene / "small.ply", "-o", tmp_path / "few.ply", "--dry-run")
-    assert names(run(*words, code=0).out, "or more until 32.5 dB from the input are kept", "fit: full")
+    assert names(run(*words, code=0).out, "or more until the PSNR against the input is 32.5 dB", "fit: full")
     assert "or more until" not in run(*words, "--budget", "5%", code=0).out
 
 

@@ -64,9 +64,9 @@ def test_gaussians_of_two_scales_are_marked_as_flat(tmp_path: Path) -> None:
 def test_files_of_different_modes_are_joined_without_one(tmp_path: Path) -> None:
     inputs = [marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z"), marked(tmp_path / "b.ply")]
     document = convert_files(ConvertOptions(inputs, tmp_path / "both.ply"))
-    assert [note for note in document["notes"] if note.startswith("not all files are marked")] == [
-        "not all files are marked 'SplatRenderMode: mip': the joined one is not",
-        "not all files are marked 'Vertical axis: z': the joined one is not",
+    assert [note for note in document["notes"] if note.startswith("not all files have the mark")] == [
+        "not all files have the mark 'SplatRenderMode: mip', so the joined file has not",
+        "not all files have the mark 'Vertical axis: z', so the joined file has not",
     ]
     assert marks(tmp_path / "both.ply") == []
     convert_files(ConvertOptions([inputs[0], inputs[0]], tmp_path / "same.ply"))
@@ -83,9 +83,7 @@ def test_files_of_different_modes_are_joined_without_one(tmp_path: Path) -> None
 def test_what_a_format_does_not_keep_is_said(ending: str, lost: list[str], tmp_path: Path) -> None:
     path = marked(tmp_path / "a.ply", "antialiased 1", "Vertical axis: z")
     notes = convert_files(ConvertOptions([path], tmp_path / f"b{ending}"))["notes"]
-    assert [note for note in notes if "mark" in note] == [
-        f"{ending} has no room for the mark {mark!r}" for mark in lost
-    ]
+    assert [note for note in notes if "mark" in note] == [f"{ending} cannot store the mark {mark!r}" for mark in lost]
 
 
 def test_upward_is_what_the_file_is_marked_with(tmp_path: Path) -> None:
