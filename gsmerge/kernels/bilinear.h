@@ -1,8 +1,8 @@
-// Lookups between the pixels of a picture of float32, channels last.
+// Bilinear interpolation in a float32 picture, channels last.
 #pragma once
 #include "native.h"
 
-// Places in a row and the share of the second for x in pixels, with its ends repeated outside.
+// The two neighbouring places of coordinate x in a row, and the share of the second one; the ends repeat outside.
 typedef struct {
   int64_t first, second;
   float share;
@@ -16,7 +16,7 @@ static inline between neighbours(float x, int64_t n) {
   return (between){first, mini(first + 1, n - 1), x - (float)first};
 }
 
-// The channels of a picture at (x, y) in pixels, whole ones in their middles.
+// The channels of a picture at (x, y) in pixels; whole numbers are the centres of pixels.
 static inline void sample_at(const float *restrict picture, float x, float y, int64_t height, int64_t width,
                              int64_t channels, float *restrict out) {
   between h = neighbours(x, width), v = neighbours(y, height);

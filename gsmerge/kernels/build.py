@@ -1,7 +1,7 @@
 """Build the native library: called by ``pip install``, and by ``python tasks.py native`` after a change.
 
-It runs before anything is installed, so it needs the standard library alone. One compiler for all, the clang of the
-PyPI wheel ``ziglang``, makes the code of every target; ``GSMERGE_CC`` names another one, whose rounding may differ.
+It runs before anything is installed, so it needs only the standard library. One compiler, the clang of the PyPI wheel
+``ziglang``, builds every target. ``GSMERGE_CC`` names another compiler, whose rounding may differ.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ LINK = ("-shared", "-nostdlib")
 class Target:
     """A kind of processor that the library is built for."""
 
-    name: str  # of the library's file, and of GSMERGE_TARGET
-    zig: tuple[str, ...]  # options of the clang of ziglang
-    other: tuple[str, ...]  # options of another compiler
+    name: str  # in the library's file name, and in GSMERGE_TARGET
+    zig: tuple[str, ...]  # options for the clang of ziglang
+    other: tuple[str, ...]  # options for other compilers
 
 
 V3 = Target("v3", ("-mcpu=x86_64_v3",), ("-march=x86-64-v3",))
@@ -44,29 +44,29 @@ ARM64 = Target("arm64", (), ())
 class Platform:
     """A system and a family of processors that share a wheel."""
 
-    system: str  # linux, macosx or win, as tags of wheels begin
+    system: str  # linux, macosx or win, as at the start of a wheel's tag
     machine: str  # x86_64 or arm64
 
     @property
     def suffix(self) -> str:
-        """End of the file names of libraries."""
+        """Suffix of library files."""
         return {"macosx": ".dylib", "win": ".dll"}.get(self.system, ".so")
 
     @property
     def targets(self) -> tuple[Target, ...]:
-        """The targets, the least demanding first."""
+        """The targets, those that need the fewest instruction sets first."""
         return (V3, V4) if self.machine == "x86_64" else (ARM64,)
 
     @property
     def triple(self) -> str:
-        """The platform as the compiler names it; a C library is part of the name, but none is linked."""
+        """The target triple of the compiler; it names a C library, but none is linked."""
         kind = "x86_64" if self.machine == "x86_64" else "aarch64"
         system = {"macosx": "macos.11.0", "win": "windows-gnu"}.get(self.system, "linux-gnu.2.17")
         return f"{kind}-{system}"
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """Further options: without a C library there is nothing to probe the stack."""
+        """Further options; stack probes are off, since they would need a C library."""
         return ("-mno-stack-arg-probe",) if self.system == "win" else ()
 
     def library_name(self, target: Target) -> str:
@@ -75,7 +75,7 @@ class Platform:
 
 
 def find_platform(tag: str | None = None) -> Platform:
-    """Return the platform of a wheel's tag, such as ``manylinux_2_17_aarch64``; None: this machine's."""
+    """Return the platform of a wheel's tag, such as ``manylinux_2_17_aarch64``; by default that of this machine."""
     name = (tag or sysconfig.get_platform()).lower()
     system = next((system for system in ("macosx", "win") if name.startswith(system)), "linux")
     return Platform(system, "arm64" if name.endswith(("arm64", "aarch64")) else "x86_64")
@@ -139,10 +139,10 @@ def build(
     """Build the libraries of all targets into a folder.
 
     Args:
-        folder: Where they go.
-        extra: Further options of the compiler.
-        platform: Tag of a wheel; None: this machine's.
-        link: Options that make a library of the objects.
+        folder: Folder of the libraries.
+        extra: Further options for the compiler.
+        platform: Tag of a wheel; by default that of this machine.
+        link: Options that link the objects to a library.
     """
     where = find_platform(platform)
     with ThreadPoolExecutor() as pool:

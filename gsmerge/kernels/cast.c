@@ -1,21 +1,21 @@
-// Casting of rays of a pinhole camera against shapes, and light with shadow maps; see cast.py.
+// Cast rays of a pinhole camera against shapes, and add light with shadow maps; see cast.py.
 #include "trig.h"
 
 enum { QUAD, BOX, ELLIPSOID, CONE, LEAF, BLOB };
-enum { WAVES = 4, MARCH = 24, HALVINGS = 10 };  // of a blob: most steps, halvings of the last one
-static const double NEAR = 1e-4;  // of the depth unit: hits nearer than this do not count
+enum { WAVES = 4, MARCH = 24, HALVINGS = 10 };  // of a blob: waves, most steps of a ray, bisections of the last step
+static const double NEAR = 1e-4;  // depth below which hits do not count
 static const double MISS = 1e30;
 
 typedef struct {
   double o[3], d[3];  // origin and direction
 } ray;
 
-// One shape, with what is the same for all rays.
+// One shape, with the values that all rays share.
 typedef struct {
   int32_t kind;
   const double *rotation, *size, *waves;
   double origin[3], columns[3][3];  // of rays in the shape's frame, directions by pixel coordinates
-  double reach, slope;  // the most that the waves add up to, and the steepest that they get
+  double reach, slope;  // upper bounds of the sum of the waves and of its slope
 } shape;
 
 typedef struct {
@@ -28,8 +28,8 @@ static inline double dot3(const double *a, const double *b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-// What the sines of the waves, or with a quarter their cosines, are at a point, times their
-// amplitudes.
+// The sines of the waves at a point times their amplitudes, summed; their cosines if shifted by a
+// quarter period.
 static inline void swing(const double *waves, double x, double y, double z, int64_t quarters,
                          double *out) {
   for (int k = 0; k < WAVES; k++) {
@@ -38,7 +38,7 @@ static inline void swing(const double *waves, double x, double y, double z, int6
   }
 }
 
-// Distance from a blob in its own frame, about; 0 on its surface.
+// Approximate distance from a blob in its own frame; 0 on its surface.
 static inline double find_level(const double *waves, const ray *r, double t) {
   double x = r->o[0] + t * r->d[0], y = r->o[1] + t * r->d[1], z = r->o[2] + t * r->d[2], w[WAVES];
   swing(waves, x, y, z, 0, w);
@@ -77,7 +77,7 @@ static inline span cut_sphere(double radius, const ray *r) {
   return (span){(-b - root) / a, (-b + root) / a};
 }
 
-// Side or ends of a tapered cylinder; x and z come in units of the radii at -y, y in half heights.
+// Hit of the side or the ends of a tapered cylinder; x and z are in units of the radius at -y, y in half heights.
 static inline double hit_cone(const double *s, const ray *r) {
   double best = MISS, mean = 0.5 * (1.0 + s[3]), slope = 0.5 * (s[3] - 1.0);
   double ox = r->o[0], oy = r->o[1], oz = r->o[2], dx = r->d[0], dy = r->d[1], dz = r->d[2];
@@ -94,14 +94,14 @@ static inline double hit_cone(const double *s, const ray *r) {
   return best;
 }
 
-// First change of sign of a blob's level between two depths, by steps that hardly cross the
-// surface; pace is the most that the level may change per unit of depth.
+// First change of sign of a blob's level between two depths. Steps are so short that they hardly
+// cross the surface; pace bounds the change of the level per unit of depth.
 static double march(const double *waves, double pace, double first, double last, const ray *r) {
   first = maxd(first, NEAR);
   if (!(last > first)) return MISS;
   double least = (last - first) / MARCH, t = first, level = find_level(waves, r, t);
   bool outside = level > 0.0;
-  for (int step = 0; t < last && step < 2 * MARCH; step++) {  // the least step may round to none
+  for (int step = 0; t < last && step < 2 * MARCH; step++) {  // a step may round to zero, so their number is bounded
     double before = t;
     t = mind(t + maxd(absf8(level) / pace, least), last);
     level = find_level(waves, r, t);
@@ -201,7 +201,7 @@ static inline ray make_ray(const shape *s, const double *lens, double step, int6
   return r;
 }
 
-// Point in the shape's frame and unit normal in the world, towards the camera, where a ray hits.
+// Point of a hit in the shape's frame, and unit normal in the world, towards the camera.
 static inline void describe_hit(const shape *s, const ray *r, double t, float *point,
                                 float *normal) {
   double p[3], n[3];
@@ -221,7 +221,7 @@ API int32_t cast(const double *restrict eye, const double *restrict axes,
                  const double *restrict sizes, const double *restrict waves,
                  const int32_t *restrict rects, double *restrict depth, int32_t *restrict ids,
                  float *restrict points, float *restrict normals, int64_t m, int64_t h, int64_t w) {
-  for (int64_t pass = 0; pass < 2; pass++)  // depths of all shapes first, then what is at them
+  for (int64_t pass = 0; pass < 2; pass++)  // first the depths of all shapes, then points and normals
     for (int64_t n = 0; n < m; n++) {
       const int32_t *rect = rects + 4 * n;
       if (rect[0] < 0 || rect[1] < 0 || rect[2] > w || rect[3] > h) return OUTSIDE;

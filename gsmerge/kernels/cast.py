@@ -1,15 +1,15 @@
-"""Casting of rays of a pinhole camera against a list of shapes: the nearest hit of every pixel.
+"""Cast rays of a pinhole camera against a list of shapes, and find the nearest hit of every pixel.
 
-Every shape has a frame of its own (centre, rotation local to world) and half sizes x, y, z along its axes:
+Every shape has its own frame (centre, rotation local to world) and half sizes x, y, z along its axes:
 
 - QUAD: the rectangle z = 0
 - BOX: a box
 - ELLIPSOID: an ellipsoid
-- CONE: a cylinder about y, whose radius is ``extra`` times as large at +y as at -y, with both ends closed
+- CONE: a cylinder about y with closed ends, whose radius at +y is ``extra`` times that at -y
 - LEAF: the part of z = 0 where ``|x| <= hx (1 - (y / hy)^2)``
 - BLOB: an ellipsoid whose radius is 1 + waves, in units of the half sizes
 
-``waves[m,4,5]`` are sines: three wave numbers, phase and amplitude each.
+``waves[m,4,5]`` are four sines per shape, each with three wave numbers, a phase and an amplitude.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ QUAD, BOX, ELLIPSOID, CONE, LEAF, BLOB = range(6)
     ids=i4("h", "w", out=True), points=f4("h", "w", 3, out=True), normals=f4("h", "w", 3, out=True),
 )  # fmt: skip
 def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, depth, ids, points, normals):
-    """Fill depth along z (untouched where nothing is hit nearer), shape, point in its frame, and world normal.
+    """Write the hit of each pixel: depth along z, id of the shape, point in its frame, and normal in the world.
+
+    Pixels without a hit in front of their present depth do not change.
 
     Args:
         eye: ``[3]`` float64 position of the camera.
@@ -35,8 +37,8 @@ def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, 
         kinds: ``[m]`` int32 kinds of the shapes, 0 to 5.
         sizes: ``[m,4]`` float64 half sizes and ``extra``.
         rects: ``[m,4]`` int32 samples x0, y0, x1, y1 that can see the shape.
-        depth: ``[h,w]`` float64, the farthest before.
-        ids: ``[h,w]`` int32, -1 before.
+        depth: ``[h,w]`` float64, filled with the largest depth before.
+        ids: ``[h,w]`` int32, filled with -1 before.
         normals: ``[h,w,3]`` float32, towards the camera.
     """
 
@@ -46,14 +48,14 @@ def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, 
     bias=f8(), weights=f8("k"), out=f4("n", out=True),
 )  # fmt: skip
 def add_light(points, normals, axes, centre, radius, maps, bias, weights, out):
-    """Add up the share of each light that reaches points, times the cosine and its weight.
+    """Add the light at points: for each light the share that reaches the point, times the cosine and the weight.
 
     Args:
         normals: ``[n,3]`` float32 of length 1.
         axes: ``[k,3,3]`` float64 rows right, down and forward of the lights' parallel rays.
         centre: ``[3]`` float64 middle of the shadow maps.
-        radius: Half their side.
-        maps: ``[k,s,s]`` float32: how far forward of the middle the first surface lies.
-        bias: How far behind it a point is still lit.
-        out: ``[n]`` float32, added to.
+        radius: Half the side of the shadow maps.
+        maps: ``[k,s,s]`` float32 distance of the first surface from the middle, along the light.
+        bias: Largest distance behind that surface at which a point is still lit.
+        out: ``[n]`` float32; the light is added.
     """

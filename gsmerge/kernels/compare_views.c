@@ -1,17 +1,17 @@
-// What pixels of one view say about another: how far two photos agree, and which pixels show the same surface.
+// Compare pixels of two views: measure how far their photos agree, and find pixels that show the same surface.
 //
-// Products that are not to be fused are statements of their own.
+// Products that must not be fused with a sum are separate statements.
 #include "bilinear.h"
 #include "exp_log.h"
 #include "gaussians/select.h"
 
 enum { MIN_SEEN = 50 };  // pixels that two views must share
-static const double SAME_DEPTH = 0.15;  // logarithm of depths that may belong to one surface
-// Times the median residual from which on a pixel counts less; the least of it, grey.
+static const double SAME_DEPTH = 0.15;  // largest difference of the logarithms of two depths of one surface
+// Scale of the robust weights: that many median absolute residuals, and its least value in grey levels, 0 to 1.
 static const double DOUBT = 1.5, MIN_DOUBT = 0.01;
-static const double CLEAR = 0.03;  // residual, grey, from which on what two poses leave is compared by its logarithm
+static const double CLEAR = 0.03;  // residual, grey levels 0 to 1, above which the cost grows only logarithmically
 
-typedef struct { double world[3], x, y, z, u, v; } Place;  // a point, its place over its depth, its depth, its pixel
+typedef struct { double world[3], x, y, z, u, v; } Place;  // point in the world; x / z, y / z and z in a camera; pixel
 
 // Columns of values of the pixels that two views share.
 typedef struct { double *world[3], *x, *y, *z, *right, *down, *residual, *value; int64_t *order; } Columns;
@@ -22,14 +22,14 @@ static inline double times(double a, double b, double c, double d) {
   return left + right;
 }
 
-// The sum of three products, in the order of multiply_matrices; `step` is between the factors of the second.
+// The sum of three products, in the order of multiply_matrices; `step` is the stride of the second factor.
 static inline double dot3(const double *a, const double *b, int step) {
   double sum = 0.0;
   for (int t = 0; t < 3; t++) sum += a[t] * b[t * step];
   return sum;
 }
 
-// Where a camera sees a point in the frame of another camera.
+// The place in one camera of a point that is given in the frame of another camera.
 static inline Place place_of(const double *point, const double *from, const double *to, const double *K, double near) {
   Place p;
   double away[3], camera[3];
@@ -52,7 +52,7 @@ static double median_of(const double *values, int64_t *order, int64_t n) {
   return (lower + upper) / 2.0;
 }
 
-// Normal equations of the pose of the second camera, from the columns; `doubt` is a square.
+// Normal equations of the pose of the second camera, from the columns; `doubt` is the squared scale of the weights.
 static void sum_normal(const Columns *s, const double *viewmat, double doubt, int64_t n, double *restrict curvature,
                        double *restrict slope) {
   for (int k = 0; k < 36; k++) curvature[k] = 0.0;
@@ -72,8 +72,8 @@ static void sum_normal(const Columns *s, const double *viewmat, double doubt, in
   }
 }
 
-// Pairs of views from `first` to before `last`: the pixels of the first view of each, in its camera's frame, are looked
-// up in the photo [h,w,3] of the second, which has the grey and how it changes.
+// For each pair of views from `first` to before `last`, project the pixels of the first view into the photo [h,w,3] of
+// the second view, and sample its grey level and gradient there.
 API int32_t compare_views(const double *points, const float *greys, const int64_t *starts, const int64_t *pairs,
                           const double *viewmats, const double *given, const double *Ks, const float *pictures,
                           const double *depths, double near, double border, double scale, int64_t first, int64_t last,
@@ -96,7 +96,7 @@ API int32_t compare_views(const double *points, const float *greys, const int64_
           && now.v < (double)h - border;
       if (!inside) continue;
       int64_t pixel = (b * h + (int64_t)now.v) * w + (int64_t)now.u;
-      if (!(absf8(log8(depths[pixel] / now.z)) < SAME_DEPTH)) continue;  // nor where there is none
+      if (!(absf8(log8(depths[pixel] / now.z)) < SAME_DEPTH)) continue;  // also true for a depth of NaN
       Place before = place_of(points + 3 * i, given + 16 * a, given + 16 * b, K, near);
       double du = now.u - before.u, dv = now.v - before.v;
       float sample[3];
@@ -114,7 +114,7 @@ API int32_t compare_views(const double *points, const float *greys, const int64_
       continue;
     }
     flows[k] = scale * median_of(s.value, order, m);
-    double middle = median_of(s.residual, order, m), doubt, sum = 0.0;  // exposure
+    double middle = median_of(s.residual, order, m), doubt, sum = 0.0;  // the median is a difference in exposure
     for (int64_t i = 0; i < m; i++) {
       s.residual[i] -= middle;
       s.value[i] = absf8(s.residual[i]);
@@ -131,8 +131,8 @@ API int32_t compare_views(const double *points, const float *greys, const int64_
   return 0;
 }
 
-// Which of some pixels of a view show a surface that another view shows, too: writes their places in `rows`, ascending,
-// and the pixels there; returns how many there are.
+// Find the pixels of a view whose surface another view shows too. Write their positions in `rows`, ascending, and the
+// pixels of the other view; return their number.
 API int64_t find_surfaces(const float *means, const int64_t *rows, const float *others, const uint8_t *valid,
                           const double *viewmat, const double *K, int64_t width, double near, double same,
                           int64_t *ids, int64_t *places, int64_t pixels, int64_t n, int64_t size) {
@@ -156,8 +156,8 @@ API int64_t find_surfaces(const float *means, const int64_t *rows, const float *
   return count;
 }
 
-// Adds to `sums` at some pixels how far their colours are from those of the picture [h,w,3], and one, where a camera
-// shows them in it: at `start` and `depths` times `along`, columns, rows and depths one array after the other.
+// Add to `sums`, for pixels that a camera shows in the picture [h,w,3], the difference of their colour from it, and 1.
+// Points are `start` plus `depths` times `along`, whose rows are columns, rows and depths in that camera.
 API int32_t add_differences(const float *picture, const double *along, const double *start, const double *depths,
                             const float *colors, const int64_t *pixels, float *sums, int64_t h, int64_t w, int64_t n,
                             int64_t height, int64_t width) {

@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i8, native, u1
 
-COLUMNS = 10  # of scratch
+COLUMNS = 10  # rows of scratch
 
 
 @native(
@@ -21,18 +21,22 @@ def compare_views(
     points, greys, starts, pairs, viewmats, given, Ks, pictures, depths, near, border, scale, first, last, scratch,
     order, curvatures, slopes, costs, flows,
 ):  # fmt: skip
-    """Write how far the pixels of one view disagree with the photo of another, for the pairs ``first`` to ``last``.
+    """Compare pixels of one view with the photo of another, for the pairs of views ``first`` to ``last``.
 
-    Pixels are ``points`` in their camera's frame, with their ``greys``; view i has ``starts[i]`` to ``starts[i + 1]``.
+    Pixels are ``points`` in the frame of their camera, with their ``greys``; those of view i are ``starts[i]`` to
+    ``starts[i + 1]``.
 
     Args:
-        pictures: Grey, and how it changes to the right and down; looked up no nearer than ``border`` to its rim.
-        depths: Of the Gaussians at the pixels' middles; NaN where there is none.
-        given: Poses that ``flows``, in ``scale`` a pixel, are measured from.
+        pictures: Grey level, and its derivatives to the right and down; pixels nearer than ``border`` to the edge of a
+            picture are not used.
+        depths: Depths of the Gaussians at the pixels' centres; NaN without any.
+        given: Poses from which ``flows`` are measured.
+        scale: Unit of ``flows`` per pixel.
         scratch: ``[COLUMNS, most pixels of a view]``.
-        curvatures: Of half the squared differences by a motion of the second camera, with their ``slopes``.
-        costs: Means over the pixels of how much they disagree.
-        flows: Median distances of the pixels.
+        curvatures: Written: Gauss-Newton's curvature of half the weighted squared differences by a motion of the
+            second camera; ``slopes`` are their derivatives.
+        costs: Written: mean over the pixels of a robust function of their differences.
+        flows: Written: median distances that the pixels have moved since ``given``.
     """
 
 
@@ -44,10 +48,11 @@ _find_surfaces = declare(
 
 
 def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
-    """Find which pixels ``rows`` of a view show a surface that another view shows: their places, and the pixels there.
+    """Find the pixels ``rows`` of a view whose surface another view shows too.
 
-    Pixels of both have points ``[pixels,3]``; those of the ``others`` count where they are ``valid``, and where the
-    logarithms of the two depths differ by less than ``same``.
+    ``means`` and ``others`` are the points ``[pixels,3]`` of the pixels of both views. A pixel shows the same surface
+    if the other view's point is ``valid`` and the logarithms of the two depths differ by less than ``same``. Returns
+    the positions of these pixels in ``rows``, and the pixels of the other view.
     """
     ids, places = np.empty((2, len(rows)), np.int64)
     count = _find_surfaces(means, rows, others, valid.view(np.uint8), viewmat, K, width, near, same, ids, places)
@@ -59,8 +64,8 @@ def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
     sums=f4("height", "width", 2, out=True),
 )  # fmt: skip
 def add_differences(picture, along, start, depths, colors, pixels, sums):
-    """Add to ``sums`` at some ``pixels`` how far their ``colors`` are from a picture, and one, where it shows them.
+    """Add to ``sums``, for ``pixels`` that a picture shows, the difference of their ``colors`` from it, and 1.
 
-    Points lie at ``start`` and ``depths`` times ``along`` in a camera whose intrinsics are applied: columns, rows and
-    depths, one array after the other.
+    Points are ``start`` plus ``depths`` times ``along``, in the camera of the picture after its intrinsics. The rows of
+    ``along`` are columns, rows and depths.
     """

@@ -1,7 +1,7 @@
-"""Elementary functions of arrays whose bits are the same on every processor: NumPy's are not, for these.
+"""Compute elementary functions of arrays with equal bits on every processor, which NumPy does not ensure for these.
 
-They are within two units of the last place, take what NumPy's take, and return float32 for float32 arrays, otherwise
-float64.
+Results are within two units of the last place. The functions take the same arguments as NumPy's. They return float32
+for float32 arrays, otherwise float64.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _make(name: str, doc: str, arguments: tuple[str, ...] = ("values",), narrow:
     floats = declare(f"{name}_floats", **{key: f4("n") for key in arguments}, out=f4("n", out=True)) if narrow else None
 
     def function(*arrays: ArrayLike) -> Any:
-        if all(isinstance(a, float) for a in arrays):  # in half of the time
+        if all(isinstance(a, float) for a in arrays):  # takes half of the time
             single = np.empty(1)
             wide_each(*(np.array([a]) for a in arrays), single)
             return single[0]

@@ -1,5 +1,5 @@
-// exp, log and the like within two units of the last place, of plain arithmetic: loops over them vectorise and give the
-// same bits on every processor.
+// exp, log and similar functions within two units of the last place, in plain arithmetic: loops over them vectorise and
+// give the same bits on every processor.
 #pragma once
 #include "native.h"
 
@@ -18,7 +18,7 @@ static inline float exp4(float x) {
   p = p * r + 1.6666665459e-1f;
   p = p * r + 5.0000001201e-1f;
   p = p * (r * r) + r + 1.f;
-  int32_t power = (int32_t)(shifted.u - 0x4b400000u), half = power >> 1;  // anything for NaN
+  int32_t power = (int32_t)(shifted.u - 0x4b400000u), half = power >> 1;  // undefined value for NaN
   bits4 low = {.u = (uint32_t)(half + 127) << 23}, high = {.u = (uint32_t)(power - half + 127) << 23};
   return p * low.f * high.f;
 }
@@ -96,7 +96,7 @@ static inline double log8(double x) {
   return x >= 0.0 ? result : __builtin_nan("");
 }
 
-// log(1 + x) = log(u) + (x - (u - 1)) / u with u = 1 + x as it is rounded: what that loses is added.
+// log(1 + x) = log(u) + (x - (u - 1)) / u with the rounded u = 1 + x: the second term corrects the rounding.
 static inline double log1p8(double x) {
   double u = 1.0 + x, lost = (x - (u - 1.0)) / u;
   bool plain = u > 0.0 && u <= 1.7976931348623157e308;

@@ -16,9 +16,9 @@ REMEDY = "run python tasks.py native, or pip install again"
 
 @lru_cache(maxsize=1)
 def load_library() -> ctypes.CDLL:
-    """Return the library of the most demanding target that this processor runs, or of ``GSMERGE_TARGET``.
+    """Return the library of the most advanced target that this processor runs, or of ``GSMERGE_TARGET``.
 
-    ``GSMERGE_NATIVE`` names another folder of libraries. Raises UsageError where none fits, or where it is missing or
+    ``GSMERGE_NATIVE`` names another folder of libraries. Raises UsageError if no library fits, or if it is missing or
     older than the sources beside it.
     """
     able, wanted = _able_targets(), os.environ.get("GSMERGE_TARGET")
@@ -33,7 +33,7 @@ def _able_targets() -> list[Target]:
     least, *more = find_platform().targets
     if least.name == "arm64":
         return [least]
-    library = _open(least)  # the function that asks the processor is made of plain instructions
+    library = _open(least)  # its function that identifies the processor uses only instructions of all processors
     level = library.processor_level()
     if level < 3:
         raise UsageError("expected a processor with AVX2 and FMA (x86-64-v3, from 2013 on), found an older one")
@@ -48,7 +48,7 @@ def _open(target: Target) -> ctypes.CDLL:
         _check_end(path)
         library = ctypes.CDLL(str(path))
         built = ctypes.c_char_p.in_dll(library, "sources_hash").value or b""
-    except (OSError, ValueError) as error:  # the latter where it is none of ours
+    except (OSError, ValueError) as error:  # ValueError if it is not a library of this package
         if path.exists():
             raise UsageError(f"{path}: the native library cannot be loaded ({error}); {REMEDY}") from None
         raise UsageError(f"{path}: the native library is missing; {_find_shadow() or REMEDY}") from None
@@ -58,8 +58,8 @@ def _open(target: Target) -> ctypes.CDLL:
 
 
 def _find_shadow() -> str | None:
-    """Say what to do where this package is a folder of sources in front of the installed package; else None."""
-    from importlib import metadata  # 8 ms that only this needs
+    """Return a remedy if this package is a folder of sources that hides the installed package; otherwise None."""
+    from importlib import metadata  # here because it takes 8 ms
 
     package = FOLDER.parent
     for installed in metadata.distributions(name=package.name):
@@ -71,7 +71,7 @@ def _find_shadow() -> str | None:
 
 
 def _check_end(path: Path) -> None:
-    """Raise OSError if an ELF file ends before its section table, which is last: loading it could crash the process."""
+    """Raise OSError if an ELF file is cut off before its section table, since loading it could crash the process."""
     with path.open("rb") as file:
         head = file.read(64).ljust(64, b"\0")
     table, size, count = struct.unpack_from("<40xQ10xHH", head)

@@ -1,16 +1,17 @@
-// Products, linear equations and symmetric eigenvalues of float64 matrices, in one written order.
+// Products, linear equations and symmetric eigenvalues of float64 matrices, in a fixed order of
+// operations.
 //
-// Every element of a product is the sum of its terms in their order, fused; a loop over the columns
-// of a row vectorises and changes no bit.
+// Every element of a product is the fused sum of its terms in their order. Loops run over the columns
+// of a row, so they vectorise without changing a bit.
 #include "native.h"
 
 enum { PANEL = 16 };   // columns that are eliminated together, so that large matrices stay in the caches
-enum { ROWS = 4, COLUMNS = 8 };  // of a product, whose sums stay in registers
-enum { TERMS = 256 };            // of each sum, so that those of b stay in the nearest cache
+enum { ROWS = 4, COLUMNS = 8 };  // block of a product whose sums stay in registers
+enum { TERMS = 256 };            // terms that are added at a time, so that their part of b stays in the first cache
 enum { SWEEPS = 50 };  // of Jacobi's method at most; it needs about six
 static const double TINY = 1e-300;
 
-// out[i,k] += a[i,j] b[j,k] over the terms from..to of each sum, of some rows and columns, in registers.
+// out[i,k] += a[i,j] b[j,k] over the terms from..to, for a block of rows and columns whose sums stay in registers.
 static inline void add_terms(const double *restrict a, const double *restrict b, double *restrict out,
                              int64_t from, int64_t to, int64_t j, int64_t k, int64_t rows,
                              int64_t columns) {
@@ -42,7 +43,7 @@ static inline void multiply_rows(const double *restrict a, const double *restric
   }
 }
 
-// The same of points, whose sums stay in registers.
+// The same for points (three columns), whose sums stay in registers.
 static inline void turn_points(const double *restrict a, const double *restrict b, double *restrict out, int64_t i) {
   for (int64_t row = 0; row < i; row++) {
     double sums[3] = {0.0};
@@ -77,12 +78,12 @@ static void swap_rows(double *restrict a, double *restrict b, int64_t n) {
 
 // a -= factor b
 static inline void take_off(double *restrict a, const double *restrict b, double factor, int64_t n) {
-  if (factor == 0.0) return;  // many are, where unknowns have few neighbours
+  if (factor == 0.0) return;  // many factors are zero in sparse matrices
   for (int64_t c = 0; c < n; c++) a[c] -= factor * b[c];
 }
 
-// Replaces the columns first..last of a by those of L and U, with the rows below and of b in the
-// order of the pivots; false where a pivot is zero.
+// Replaces the columns first..last of a by those of L and U, and brings the rows below and those of b
+// into the order of the pivots; false if a pivot is zero.
 static bool factor_panel(double *a, double *b, int64_t d, int64_t k, int64_t first, int64_t last) {
   for (int64_t c = first; c < last; c++) {
     int64_t best = c;
@@ -126,7 +127,7 @@ API int32_t solve_equations(double *a, double *b, int64_t n, int64_t d, int64_t 
   return 0;
 }
 
-// One rotation of the symmetric a that zeroes a[p][q]; the columns of v turn with it.
+// One rotation of the symmetric a that zeroes a[p][q]; the columns of v are rotated alike.
 static void rotate_pair(double *a, double *v, int64_t d, int64_t p, int64_t q) {
   double off = a[p * d + q];
   if (!(absf8(off) > TINY)) return;

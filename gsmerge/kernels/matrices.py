@@ -1,6 +1,6 @@
-"""Linear algebra of small float64 matrices whose bits are the same on every processor: those of BLAS are not.
+"""Compute with small float64 matrices with equal bits on every processor, which BLAS does not ensure.
 
-Sums are taken in float64; results are float32 where all arrays are, otherwise float64.
+Sums are taken in float64. Results are float32 if all arrays are, otherwise float64.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def matmul(a: ArrayLike, b: ArrayLike) -> Array:
     (left, right), kind = _wide(a, b)
     rows, columns = left.ndim == 1, right.ndim == 1
     left, right = left[None] if rows else left, right[:, None] if columns else right
-    if right.ndim == 2:  # one for all: all rows of the left are those of one matrix
+    if right.ndim == 2:  # one matrix for all, so all rows of the left are treated as one matrix
         lead = left.shape[:-2]
         first, second = left.reshape(1, math.prod(left.shape[:-1]), left.shape[-1]), right[None]
     else:
@@ -101,7 +101,7 @@ def transform(matrices: ArrayLike, vectors: ArrayLike) -> Array:
 
 
 def solve_symmetric(a: ArrayLike, b: ArrayLike, rcond: float = 1e-12) -> Array:
-    """Solve ``a x = b`` for a matrix ``[d,d]`` of normal equations and ``b [d]`` or ``[d,k]``, by the shortest x.
+    """Solve ``a x = b`` for a symmetric matrix ``[d,d]`` and ``b [d]`` or ``[d,k]``; return the shortest solution.
 
     Eigenvalues of at most ``rcond`` times the largest count as zero.
     """
@@ -119,9 +119,9 @@ def determinant(matrices: ArrayLike) -> Array:
 
 
 def closest_rotation(matrix: ArrayLike) -> Array:
-    """Return the rotation R ``[3,3]`` with the largest trace of ``R^T matrix``: the nearest by least squares.
+    """Return the rotation R ``[3,3]`` nearest to a matrix by least squares, with the largest trace of ``R^T matrix``.
 
-    Computed by the eigenvector of a matrix of quaternions (Horn 1987), which never gives a reflection.
+    It is computed from an eigenvector, a quaternion (Horn 1987), so it is never a reflection.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, np.float64)
     quaternions = np.array(

@@ -1,6 +1,6 @@
-// What all files share: vectors of sixteen floats, clamping, and exp and log whose bits are the same everywhere.
+// Shared by all files: vectors of sixteen floats, clamping, and exp and log with equal bits on every processor.
 //
-// Sums over lanes have one written order. Functions of the C library are not used: their last bit differs.
+// Sums over lanes have a fixed order. Functions of the C library are not used, because their last bit differs.
 #pragma once
 #include <stdbool.h>
 #include <stdint.h>
@@ -24,7 +24,7 @@ typedef int32_t v16i __attribute__((vector_size(64), aligned(4)));
 static inline v16f splat(float x) { return x - (v16f){0}; }
 static inline v8f splat8(float x) { return x - (v8f){0}; }
 
-// a where the mask is set, b elsewhere. Masks are what comparisons give: all bits or none.
+// a where the mask is set, b elsewhere. Masks are results of comparisons, with all bits set or none.
 static inline v16f sel(v16i mask, v16f a, v16f b) {
   return (v16f)((mask & (v16i)a) | (~mask & (v16i)b));
 }
@@ -76,7 +76,7 @@ static inline double maxd(double a, double b) { return a > b ? a : b; }
 static inline int64_t mini(int64_t a, int64_t b) { return a < b ? a : b; }
 static inline int64_t maxi(int64_t a, int64_t b) { return a > b ? a : b; }
 
-// A float between two whole numbers, as an integer; NaN gives the lower one.
+// A float clamped between two whole numbers, as an integer; NaN gives the lower one.
 static inline int32_t whole(float x, float low, float high) {
   x = x > low ? x : low;
   return (int32_t)(x < high ? x : high);
@@ -84,7 +84,7 @@ static inline int32_t whole(float x, float low, float high) {
 
 // Whether one of m indices is outside an array of n.
 static inline bool any_outside(const int32_t *ids, int64_t m, int64_t n) {
-  uint32_t most = 0;  // negative ones are above all others
+  uint32_t most = 0;  // as unsigned numbers negative indices are above all others
   for (int64_t i = 0; i < m; i++) most = (uint32_t)ids[i] > most ? (uint32_t)ids[i] : most;
   return m > 0 && most >= mini(n, INT64_C(1) << 31);
 }

@@ -1,10 +1,10 @@
-// Gaussians as the whole numbers of a page, each less that of the row before; see page_rows.py.
+// Pack Gaussians as the whole numbers of a page, each minus that of the row before; see page_rows.py.
 #include "exp_log.h"
 
-enum { LOOKS = 10, MOST_COLUMNS = 64 };  // columns before the harmonics, and of all
+enum { LOOKS = 10, MOST_COLUMNS = 64 };  // columns before the harmonics, and most columns
 enum { BLOCK = 256 };                    // rows that are packed column by column, in loops that vectorise
 
-typedef int32_t column[BLOCK + 1];  // numbers of the rows of a block, after that of the row before it
+typedef int32_t column[BLOCK + 1];  // the number of the row before a block, then those of its rows
 
 // Rounds halves to even numbers.
 static inline double nearest(double x) {
@@ -19,7 +19,7 @@ static inline int32_t to_byte(double x) {
   return (int32_t)(x < 255.0 ? x : 255.0);
 }
 
-// The difference of a number from the one before, its sign as the lowest bit.
+// The difference of a number from the one before, with the sign in the lowest bit.
 static inline uint32_t step_from(int32_t before, int32_t now) {
   uint32_t by = (uint32_t)now - (uint32_t)before;
   return (by << 1) ^ (by >> 31 ? UINT32_MAX : 0);
@@ -40,7 +40,7 @@ static inline void gather(const int64_t *restrict rows, const float *restrict va
   for (int64_t i = 0; i < count; i++) out[i] = values[width * rows[i]];
 }
 
-// Products and sums are statements of their own, so that they are rounded as NumPy rounds them.
+// Products and sums are separate statements, so that they are rounded as in NumPy.
 static void pack_opacities(const double *restrict opacities, int32_t step, int64_t count, int32_t *restrict out) {
   for (int64_t i = 0; i < count; i++) {
     double opacity = 255.0 * opacities[i];
@@ -117,7 +117,7 @@ API int32_t pack_looks(const int64_t *rows, const float *opacities, const float 
       gather(block, scales + c, 3, count, values);
       pack_scales(values, steps[2], count, looks[4 + c] + 1);
     }
-    for (int64_t i = 1; i <= count; i++) {  // from green, which says most of the others
+    for (int64_t i = 1; i <= count; i++) {  // as differences from green, with which they are highly correlated
       looks[1][i] -= looks[2][i];
       looks[3][i] -= looks[2][i];
     }

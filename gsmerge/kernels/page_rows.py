@@ -1,4 +1,4 @@
-"""Gaussians as the whole numbers of a page: columns of steps, each less that of the row before, the sign lowest."""
+"""Pack Gaussians as whole numbers for a page: differences from the row before, with the sign in the lowest bit."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ LOOKS = 10  # columns before the harmonics
     out=u4("columns", "m", out=True),
 )  # fmt: skip
 def pack_looks(rows, opacities, sh0, scales, quats, shN, sh_scale, color_scale, steps, levels, out):
-    """Pack what the Gaussians ``rows`` look like, as the numbers of a ``.spz`` in coarser steps.
+    """Pack the appearance of the Gaussians ``rows``, as the numbers of a ``.spz`` in coarser steps.
 
     Args:
-        sh_scale: From ``sh0`` to colours.
-        color_scale: Of a ``.spz``.
-        steps: ``[3]`` int32 of opacities, colours and log scales.
-        levels: Of a rotation: tangents of a quarter of its angle, along its axis, are from -1 to 1 times that.
-        out: Columns of opacity, red less green, green, blue less green, log scales, rotation, and as many harmonics
-            as there is room for.
+        sh_scale: Factor from ``sh0`` to colours.
+        color_scale: Scale of colours in a ``.spz``.
+        steps: ``[3]`` int32 steps of opacities, colours and log scales.
+        levels: Factor of a rotation, which is stored as its axis times the tangent of a quarter of its angle, from -1
+            to 1.
+        out: Columns of opacity, red minus green, green, blue minus green, log scales, rotation, and as many harmonics
+            as fit.
     """
 
 
@@ -31,11 +32,13 @@ def pack_looks(rows, opacities, sh0, scales, quats, shN, sh_scale, color_scale, 
     out=u4(4, "m", out=True),
 )  # fmt: skip
 def pack_pixels(rows, ids, means, viewmats, Ks, width, height, pixel_parts, depth_parts, out):
-    """Pack where Gaussians of pixels are; return the number of rows before one that is not in front of its camera.
+    """Pack the positions of Gaussians of pixels, up to the first row that is not in front of its camera.
+
+    Returns the number of packed rows.
 
     Args:
-        ids: ``[n]`` int64 among all pixels of all views.
-        pixel_parts: Of a pixel.
-        depth_parts: Of the logarithm of a depth.
-        out: Columns of id, shifts right and down from the middle of the pixel, and log depth.
+        ids: ``[n]`` int64 pixels of the rows, among all pixels of all views.
+        pixel_parts: Number of steps per pixel.
+        depth_parts: Number of steps per unit of the logarithm of a depth.
+        out: Columns of id, shifts right and down from the centre of the pixel, and log depth.
     """

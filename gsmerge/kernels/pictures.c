@@ -1,4 +1,4 @@
-// Filters and lookups in pictures of float32, channels last.
+// Filter and sample float32 pictures, channels last.
 #include "bilinear.h"
 
 // Place of index i in a row of n that is mirrored at both ends without repeating them.
@@ -10,7 +10,7 @@ static inline int64_t mirrored(int64_t i, int64_t n) {
   return i;
 }
 
-// to[i] = sum of taps[t] from[i + t stride], thirty-two values at a time: sums stay in registers.
+// to[i] = sum of taps[t] from[i + t stride], thirty-two values at a time, so that sums stay in registers.
 static void weigh(const float *restrict from, const float *restrict taps, int64_t count,
                   int64_t stride, float *restrict to, int64_t n) {
   int64_t i = 0;
@@ -30,9 +30,9 @@ static void weigh(const float *restrict from, const float *restrict taps, int64_
   }
 }
 
-// Convolves a picture [height,width,channels] with one odd filter along its rows and another down
-// its columns. `padded` is a row with its mirrored ends; `rows` is what the first filter gives, with
-// the mirrored rows above and below.
+// Convolves a picture [height,width,channels] with a filter along its rows and another along its
+// columns; both have odd lengths. `padded` holds a row with mirrored ends; `rows` holds the result of
+// the first filter, with mirrored rows above and below.
 API int32_t filter_picture(const float *restrict picture, const float *restrict across,
                            const float *restrict down, float *restrict padded,
                            float *restrict rows, float *restrict out, int64_t height,
@@ -58,7 +58,7 @@ API int32_t filter_picture(const float *restrict picture, const float *restrict 
   return 0;
 }
 
-// Looks up a picture at places (x, y) in pixels, whole ones in their middles; bilinear.
+// Samples a picture bilinearly at (x, y) in pixels; whole numbers are the centres of pixels.
 API int32_t sample_picture(const float *restrict picture, const float *restrict x,
                            const float *restrict y, float *restrict out, int64_t height,
                            int64_t width, int64_t channels, int64_t n) {

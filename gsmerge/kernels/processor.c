@@ -1,4 +1,4 @@
-// What the library tells about itself and about the processor.
+// Report the sources of the library, and the level of the processor.
 #include "native.h"
 
 // Hash of the sources that the library was made of.
@@ -9,7 +9,7 @@ static inline void ask(uint32_t leaf, uint32_t *a, uint32_t *b, uint32_t *c, uin
   __asm__ volatile("cpuid" : "=a"(*a), "=b"(*b), "=c"(*c), "=d"(*d) : "a"(leaf), "c"(0));
 }
 
-// The processor's level of x86-64: 4 (AVX-512), 3 (AVX2 and FMA), or 0. Made of instructions that all of them have.
+// The processor's level of x86-64: 4 (AVX-512), 3 (AVX2 and FMA), or 0. Uses only instructions of all processors.
 __attribute__((target("arch=x86-64"))) API int32_t processor_level(void) {
   const uint32_t fma = 1u << 12, movbe = 1u << 22, osxsave = 1u << 27, avx = 1u << 28, f16c = 1u << 29;
   const uint32_t bmi1 = 1u << 3, avx2 = 1u << 5, bmi2 = 1u << 8;
@@ -20,7 +20,7 @@ __attribute__((target("arch=x86-64"))) API int32_t processor_level(void) {
   if (highest < 7) return 0;
   ask(1, &a, &b, &c, &d);
   if ((c & first) != first) return 0;
-  // which registers the system keeps: bits 1 and 2 AVX's, 5 to 7 AVX-512's
+  // registers that the system saves: bits 1 and 2 for AVX, 5 to 7 for AVX-512
   __asm__ volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
   if ((low & 0x6) != 0x6) return 0;
   ask(0x80000001u, &a, &b, &c, &d);

@@ -1,4 +1,4 @@
-// How far points are from where cameras saw them.
+// Measure the distances of projected points from their pixels.
 #include "native.h"
 
 // Rows of a matrix times a vector, in the order of multiply_matrices.
@@ -17,13 +17,13 @@ API int32_t pixel_errors(const double *points, const int64_t *views, const doubl
     for (int c = 0; c < 3; c++) camera[c] = row_times(viewmat + 4 * c, points + 3 * i) + viewmat[4 * c + 3];
     for (int c = 0; c < 3; c++) image[c] = row_times(K + 3 * c, camera);
     double x = image[0] / image[2] - pixels[2 * i], y = image[1] / image[2] - pixels[2 * i + 1];
-    double xx = x * x, yy = y * y, error = sqrtf8(xx + yy);  // statements of their own are not contracted
+    double xx = x * x, yy = y * y, error = sqrtf8(xx + yy);  // separate products are not fused with the sum
     errors[i] = camera[2] > 0.0 && error < __builtin_inf() ? error : __builtin_inf();
   }
   return 0;
 }
 
-// Where a camera shows a point, pixels; whether that is in its picture.
+// Project a point into a camera, pixels; return 1 if it is inside the image, otherwise 0.
 static inline int show(const float *point, const double *viewmat, const double *K, int64_t width, int64_t height,
                        double place[2]) {
   double world[3] = {point[0], point[1], point[2]}, camera[3], image[3];
@@ -46,7 +46,7 @@ API void nearest_centres(const float *points, const double *viewmats, const doub
       if (!show(points + 3 * i, viewmats + 16 * view, Ks + 9 * view, width, height, place)) continue;
       int64_t column = (int64_t)place[0], row = (int64_t)place[1];
       double right = place[0] - ((double)column + 0.5), down = place[1] - ((double)row + 0.5);
-      double xx = right * right, yy = down * down, square = xx + yy;  // statements of their own are not contracted
+      double xx = right * right, yy = down * down, square = xx + yy;  // separate products are not fused with the sum
       count++;
       if (square < nearest) nearest = square, id = (view * height + row) * width + column;
     }
@@ -54,8 +54,9 @@ API void nearest_centres(const float *points, const double *viewmats, const doub
   }
 }
 
-// The longest ascending series of keys, of each point at most one (Schensted 1961): tails [length] are the smallest
-// keys with which series of each length end, ends their numbers i * v + view, before the numbers that precede each.
+// Find the longest ascending series of keys with at most one key of each point (Schensted 1961). tails [length] is the
+// smallest last key of all series of that length, ends its number i * v + view, and before the number that precedes
+// each key in its series.
 API int64_t follow_pixels(const float *points, const double *viewmats, const double *Ks, int64_t *ids, int64_t *tails,
                           int32_t *ends, int32_t *before, int64_t *keys, int32_t *views, int64_t width,
                           int64_t height, int32_t mixed, int64_t n, int64_t v, int64_t m) {
@@ -72,7 +73,7 @@ API int64_t follow_pixels(const float *points, const double *viewmats, const dou
       for (; at > 0 && keys[at - 1] < key; at--) keys[at] = keys[at - 1], views[at] = views[at - 1];
       keys[at] = key, views[at] = (int32_t)view;
     }
-    for (int64_t k = 0; k < count; k++) {  // the largest first, so that none follows another one of its point
+    for (int64_t k = 0; k < count; k++) {  // largest key first, so that no key follows another one of the same point
       int64_t low = 0, high = length;
       while (low < high) {
         int64_t middle = (low + high) / 2;
@@ -92,7 +93,7 @@ API int64_t follow_pixels(const float *points, const double *viewmats, const dou
   return length;
 }
 
-// Products are statements of their own, so that they are rounded one by one.
+// Products are separate statements, so that each is rounded by itself.
 static inline double minus(double a, double b, double c, double d) {
   double left = a * b, right = c * d;
   return left - right;

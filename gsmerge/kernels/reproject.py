@@ -1,4 +1,4 @@
-"""Measure how far points are from where cameras saw them, and from the centres of pixels."""
+"""Measure the distances of projected points from their pixels and from the centres of pixels."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from gsmerge.kernels.signature import COUNT, STATUS, f4, f8, i4, i8, native
     errors=f8("n", out=True),
 )  # fmt: skip
 def pixel_errors(points, views, viewmats, Ks, pixels, errors):
-    """Write the distances, pixels, between pixels and the projections of points into one view each.
+    """Write the distances, pixels, between each point's projection into its view and its pixel.
 
-    They are inf behind a camera.
+    They are inf for points behind the camera.
     """
 
 
@@ -21,9 +21,10 @@ def pixel_errors(points, views, viewmats, Ks, pixels, errors):
     squares=f8("n", out=True), seen=i4("n", out=True), width=i8(least=1), height=i8(least=1),
 )  # fmt: skip
 def nearest_centres(points, viewmats, Ks, ids, squares, seen, width, height):
-    """Write the pixel ``(view·H + y)·W + x`` whose centre each point projects nearest to, of all views.
+    """Write the pixel ``(view·H + y)·W + x`` of all views whose centre is nearest to the projection of each point.
 
-    Also the square of that distance, pixels, and in how many pictures the point lies; -1 and inf for 0.
+    Also writes the squared distance, pixels, and the number of views that show the point. For a number of 0 the pixel
+    is -1 and the squared distance is inf.
     """
 
 
@@ -33,10 +34,10 @@ def nearest_centres(points, viewmats, Ks, ids, squares, seen, width, height):
     views=i4("v", out=True), width=i8(least=1), height=i8(least=1), mixed=i4(least=0, most=1),
 )  # fmt: skip
 def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, width, height, mixed):
-    """Write the pixel of each point, -1 for none, so that as many as possible come in the order of the pixels.
+    """Write the pixel of each point, -1 for none, so that as many points as possible are in the order of the pixels.
 
-    That is view by view and line by line, or if ``mixed`` line by line with the views of a pixel side by side. Returns
-    how many have one; arrays after ``ids`` are scratch, ``before`` of n·v values.
+    The order is view by view and line by line. If ``mixed``, it is line by line, and the views of a pixel follow each
+    other. Returns the number of points with a pixel. Arrays after ``ids`` are scratch; ``before`` has n·v values.
     """
 
 
@@ -47,7 +48,7 @@ def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, w
 def linearise(points, pixels, K, pose, jacobian, residuals):
     """Write the projection errors of a view's points, and their derivatives by motions of the camera.
 
-    ``residuals [2n]``: errors to the right for all points, then errors downwards. Columns of ``jacobian [2n,6+f]``:
-    rotation and shift of the camera; with f = 1 the logarithm of the focal length, with f = 2 those of both focal
-    lengths, with f = 4 also the principal point.
+    ``residuals [2n]`` are the errors to the right of all points, then the errors downwards. The columns of ``jacobian
+    [2n,6+f]`` are rotation and shift of the camera, and f intrinsics: with f = 1 the logarithm of the focal length,
+    with f = 2 the logarithms of both focal lengths, with f = 4 also the principal point.
     """

@@ -1,11 +1,11 @@
-"""Declare functions of the native library: what they take is checked here, so that C sees memory that it may use.
+"""Declare functions of the native library, and check their arguments, so that C code accesses only valid memory.
 
     @native(values=f4("n"), ids=i4("m", least=0, below="n"), out=f4("m", out=True))
     def take(values, ids, out):
         \"\"\"Write the values at the ids.\"\"\"
 
-calls ``void take(const float *values, const int32_t *ids, float *out, int64_t n, int64_t m)``: the arguments in their
-order, then the sizes that have names, in the order in which they appear.
+calls ``void take(const float *values, const int32_t *ids, float *out, int64_t n, int64_t m)``. The arguments are passed
+in their order, followed by the named sizes in the order of their first appearance.
 """
 
 from __future__ import annotations
@@ -32,17 +32,19 @@ Size = int | str  # a number, or the name of a size or of an integer argument
 
 @dataclass(frozen=True)
 class Argument:
-    """Argument of a native function: an array in C order, or a scalar where there is no shape.
+    """Argument of a native function: an array in C order, or a scalar if there is no shape.
+
+    Rules for values (``least``, ``below``, ``most``) may be numbers, or names of sizes and integer arguments.
 
     Args:
         code: NumPy's name of the type.
-        shape: Sizes of the array's axes: numbers, or names that stand for the same size everywhere.
+        shape: Sizes of the array's axes: numbers, or names; a name has the same size in all arguments.
         least: Smallest value, None for any.
-        below: What all values are below, None for any.
-        most: Largest value, None for any. Rules may name sizes and integers.
-        ascending: No value is below the one before it.
+        below: Exclusive upper bound of the values, None for any.
+        most: Largest value, None for any.
+        ascending: No value may be below the one before it.
         out: The array is written.
-        optional: None is allowed and becomes a null pointer; its names must appear elsewhere.
+        optional: None is allowed and becomes a null pointer; names in its shape must appear in other arguments.
     """
 
     code: str
@@ -77,7 +79,7 @@ class Argument:
 
     @property
     def has_rules(self) -> bool:
-        """Whether values are checked once all sizes are known: arrays, and scalars with rules that name sizes."""
+        """True if values are checked after all sizes are known: arrays, and scalars with rules that name sizes."""
         rules = [rule for rule in (self.least, self.below, self.most) if rule is not None]
         return self.ascending or any(self.shape or isinstance(rule, str) for rule in rules)
 
@@ -93,8 +95,8 @@ u1, i1, i2, u4, i4, u8, i8, f4, f8 = (
     partial(_argument, code) for code in ("u1", "i1", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 )
 
-STATUS = i4()  # what a function returns that checks indices on its way: 0, or another number for one outside its array
-COUNT = i8()  # the same of a function that counts: a number from 0 on, or a negative one for an index outside
+STATUS = i4()  # result of a function that checks indices: 0, or another number for an index outside its array
+COUNT = i8()  # result of a function that counts and checks indices: a count, or a negative number for an index outside
 
 
 PROTOTYPES: dict[str, str] = {}  # of all functions declared so far, in C: tests compare them with the sources
@@ -103,12 +105,12 @@ PROTOTYPES: dict[str, str] = {}  # of all functions declared so far, in C: tests
 def native(returns: Argument | None = None, /, **arguments: Argument) -> Callable[[Callable[..., Any]], Any]:
     """Replace a function by the one of the same name in the native library.
 
-    The arguments are checked at every call: ValueError says which has another type, shape or range.
+    The arguments are checked at every call. A ValueError names the argument that has a wrong type, shape or range.
 
     Args:
-        returns: Scalar that the function returns; None for nothing. STATUS: nothing, or ValueError for an index that
-            points outside its array. COUNT: a number, or ValueError.
-        arguments: What each argument is, in their order.
+        returns: Scalar that the function returns; None for nothing. With STATUS the function returns nothing, or raises
+            ValueError for an index outside its array. With COUNT it returns a count, or raises ValueError.
+        arguments: Declarations of the arguments, in their order.
     """
 
     def wrap(function: Callable[..., Any]) -> Any:
@@ -120,9 +122,9 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
 
 
 def declare(name: str, returns: Argument | None = None, /, **arguments: Argument) -> Callable[..., Any]:
-    """Return a function of the native library, as :func:`native` does, for functions without documentation."""
+    """Return a function of the native library as :func:`native` does, but without documentation."""
     signature = inspect.Signature([inspect.Parameter(key, _POSITIONAL) for key in arguments])
-    entries: dict[ctypes.CDLL, Any] = {}  # the function in each library that was loaded: tests load several
+    entries: dict[ctypes.CDLL, Any] = {}  # the function in each loaded library, since tests load several
     kinds, names = list(arguments.items()), size_names(arguments)
     ruled = [(place, key, kind) for place, (key, kind) in enumerate(kinds) if kind.has_rules]
 
@@ -142,7 +144,7 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
         return None if returns is STATUS else result
 
     def prepare(*values: Any) -> Callable[[], None]:
-        """Check arguments once, and return a call with these arguments, whose memory must stay allocated."""
+        """Check arguments once, and return a function that calls with them; their memory must stay allocated."""
         sizes: dict[str, int] = {}
         passed = [_pass(name, key, kind, value, sizes) for (key, kind), value in zip(kinds, values, strict=True)]
         passed += [sizes.get(key, 0) for key in names]
@@ -160,7 +162,7 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
 
 
 class Table:
-    """A struct of the native library: addresses of arrays, then their sizes by name, then numbers, 8 bytes each."""
+    """A struct of the native library: addresses of arrays, then named sizes, then numbers, 8 bytes each."""
 
     def __init__(self, name: str, numbers: tuple[str, ...], **arrays: Argument) -> None:
         self.name, self.arrays = name, arrays
@@ -172,7 +174,7 @@ class Table:
 
 
 class FilledTable:
-    """Values of a :class:`Table`, with the arrays that it points to, which live as long."""
+    """Values of a :class:`Table`; it keeps the arrays that it points to alive."""
 
     def __init__(self, table: Table, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
         self.table, self.arrays, self._sizes = table, dict[str, np.ndarray[Any, Any]](), dict[str, int]()
@@ -216,7 +218,7 @@ def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments:
 
 
 def _pass(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]) -> Any:
-    """Check one argument and return its value for ctypes; ``sizes`` collects the values of named sizes."""
+    """Check one argument and return its value for ctypes; values of named sizes are added to ``sizes``."""
     if not kind.shape:
         if kind.code[0] != "f":
             value = int(value)
@@ -243,14 +245,14 @@ def _pass(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]
 
 
 def _address(array: np.ndarray[Any, Any], writeable: bool) -> int:
-    """Return the address of an array's values, through its buffer if possible, which takes a fifth of the time."""
+    """Return the address of an array's values; through the buffer, if possible, it takes a fifth of the time."""
     if writeable and array.size:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
     return int(array.__array_interface__["data"][0])
 
 
 def _check_values(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]) -> None:
-    """Check the values of an argument whose type and shape are sound."""
+    """Check the values of an argument whose type and shape are valid."""
     if value is None or (kind.shape and not value.size):
         return
     low, high = (value.min(), value.max()) if kind.shape else (value, value)

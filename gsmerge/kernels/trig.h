@@ -1,4 +1,4 @@
-// Sines, cosines and their inverses in float64, within two units of the last place, of plain
+// Sines, cosines and their inverses in float64, within two units of the last place, in plain
 // arithmetic: loops over them vectorise and give the same bits on every processor.
 #pragma once
 #include "native.h"

@@ -1,12 +1,12 @@
-// Children of groups of members, by repeated bisection across the widest direction.
+// Split groups of members into children, by repeated bisection across the widest direction.
 #include "trig.h"
 
-enum { FEATURES = 6, ROW = 8 };  // and features of a member in memory, the last two zero
+enum { FEATURES = 6, ROW = 8 };  // features of a member, and their number in memory, where the last two are zero
 static const double COLOR = 0.28209479177387814;  // from a spherical harmonic of degree 0 to rgb
-static const double PIXEL = 0.012;  // of colour: a difference that counts as much as one pixel
+static const double PIXEL = 0.012;  // difference in colour that counts as much as one pixel
 typedef double v8d __attribute__((vector_size(64), aligned(8)));
 
-// Members of one group in feature space: colour, then position; and whether errors are asked for.
+// Members of one group in feature space, colour then position; and True if errors are requested.
 typedef struct {
   double *features, *weights;
   int64_t *spare;
@@ -14,7 +14,7 @@ typedef struct {
   bool measured;
 } space;
 
-// One child: where it begins in the order, and what a cut across it needs.
+// One child: its start in the order, and the values that a cut across it needs.
 typedef struct {
   double spread, error, mean[ROW], axis[ROW];
 } run;
@@ -26,7 +26,7 @@ static inline double dot(v8d a, v8d b) {
   return (p[0] + p[4]) + (p[2] + p[6]) + ((p[1] + p[5]) + (p[3] + p[7]));
 }
 
-// Principal axis of a scatter by power iteration, its scatter as the length.
+// Principal axis of a scatter by power iteration; returns the scatter along it.
 static double find_axis(const v8d *scatter, double *axis) {
   int widest = 0;
   for (int c = 1; c < FEATURES; c++) widest = scatter[c][c] > scatter[widest][widest] ? c : widest;
@@ -56,8 +56,8 @@ static double find_thickness(const v8d *scatter) {
   return maxd(middle + 2.0 * p * cos8(angle + 2.0943951023931953), 0.0);  // 2 pi / 3
 }
 
-// Mean, axis and spread of some members, and their squared error: of colour and, weighted, of the
-// distance from a plane, as if every member weighed one.
+// Mean, axis and spread of some members, and their squared error. The error is that of colour plus
+// the weighted one of the distance from a plane, normalised as if every member weighed one.
 static void measure_run(const space *s, const int64_t *members, int64_t n, run *out) {
   double total = 0.0;
   v8d mean = {0}, scatter[FEATURES] = {{0}};
@@ -79,7 +79,7 @@ static void measure_run(const space *s, const int64_t *members, int64_t n, run *
   out->error = (double)n / total * (colour + s->plane_weight * find_thickness(scatter));
 }
 
-// Orders members by the side of the mean that they lie on; the size of the first side.
+// Orders members by the side of the mean on which they lie; returns the size of the first side.
 static int64_t part_members(const space *s, int64_t *members, int64_t n, const run *across) {
   v8d mean = *(const v8d *)across->mean, axis = *(const v8d *)across->axis;
   int64_t low = 0, high = n;
@@ -93,8 +93,8 @@ static int64_t part_members(const space *s, int64_t *members, int64_t n, const r
   return low;
 }
 
-// Cuts an order of n members into at most count runs, bounded by cuts; their number. The error of
-// the first r runs goes to errors[r - 1].
+// Cuts an order of n members into at most count runs, bounded by cuts; returns their number. The
+// error with r runs is written to errors[r - 1].
 static int64_t split(const space *s, int64_t *order, int64_t n, int64_t count, run *runs,
                      int64_t *cuts, double *errors) {
   int64_t num = 1;
@@ -126,7 +126,7 @@ static int64_t split(const space *s, int64_t *order, int64_t n, int64_t count, r
   return num;
 }
 
-// Features of the members of one group; false for rows that are none.
+// Writes the features of the members of one group; false if a row is outside the arrays.
 static bool fill_features(const space *s, const int32_t *rows, int64_t size, int64_t n,
                           const float *means, const float *sh0, const float *opacities,
                           const double *centre, double footprint) {

@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8
 
-# features to room are work space for the longest group and the most children; errors may have no columns
+# the arguments from features to room are work space for the longest group and the most children; errors may be empty
 _split_groups = declare(
     "split_groups", STATUS, starts=i8("ends", least=0, ascending=True), ids=i4("m"), means=f4("n", 3),
     sh0=f4("n", 1, 3), opacities=f4("n"), centres=f8("groups", 3), footprints=f8("groups"),
@@ -18,14 +18,14 @@ _split_groups = declare(
 
 
 def gather_groups(starts, ids, rows):
-    """Gather the members of the groups ``rows``, one after the other: their starts and ids."""
+    """Gather the starts and ids of the members of the groups ``rows``, group after group."""
     sizes = starts[rows + 1] - starts[rows]
     local = np.concatenate([[0], np.cumsum(sizes)])
     return local, ids[np.repeat(starts[rows] - local[:-1], sizes) + np.arange(local[-1])]
 
 
 def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children):
-    """Divide every group: the run of members with the largest spread is halved until there are ``num_children``.
+    """Divide every group: the child with the largest spread is halved until there are ``num_children``.
 
     A member's features are its colour, and its position relative to ``centres [g,3]`` in units of ``footprints [g]``.
     Groups of identical members give fewer children. Children nest: the children for 2 are unions of the children for 4.
@@ -41,9 +41,9 @@ def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children
 def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_children, plane_weight):
     """Compute the squared error ``[g,max_children]`` of every group with 1, 2, ... children.
 
-    It is NaN beyond the number that the members give. Children are those of :func:`bisect`. The error of a member is
-    its squared distance from the child's mean colour, plus ``plane_weight`` times that from the plane fitted to the
-    child, in features. Members weigh one on average, opaque members more.
+    It is NaN for more children than the group can be split into. Children are those of :func:`bisect`. The error of a
+    member is its squared distance from the child's mean colour, plus ``plane_weight`` times that from the plane fitted
+    to the child, in features. Members weigh one on average, opaque members more.
     """
     num_groups = len(starts) - 1
     counts, errors = np.full(num_groups, max_children, np.int64), np.full((num_groups, max_children), np.nan)

@@ -46,7 +46,7 @@ API double box_overlap(const double *restrict mean_a, const double *restrict cov
   return whole > 0.0 ? shared / whole : 0.0;
 }
 
-// In eight lanes: rows of sixteen floats cross the lines of the cache.
+// Eight lanes are used, since rows of sixteen floats would cross cache lines.
 static inline double find_cosine(const float *a, const float *b, int64_t d) {
   v8f sum = {0};
   int64_t c = 0;
@@ -97,7 +97,7 @@ static inline int64_t find_best(const double *left, int64_t k) {
   return best;
 }
 
-// Whether a cluster has a member of a view already; views below 0 are of none.
+// Return true if a cluster already has a member of a view; views below 0 mean no view.
 static inline bool has_view(const int64_t *candidates, int64_t k, const int64_t *clusters,
                             int64_t cluster, const int64_t *views, int64_t view) {
   for (int64_t e = 0; e < k && view >= 0; e++) {
@@ -159,7 +159,7 @@ API int32_t find_components(const int64_t *restrict neighbors, const double *res
       int64_t a = find_root(parents, i), b = find_root(parents, neighbors[e]);
       parents[maxi(a, b)] = mini(a, b);
     }
-  for (int64_t i = 0; i < n; i++) {  // a root comes before all that it is the root of
+  for (int64_t i = 0; i < n; i++) {  // a root comes before all members of its tree
     int64_t root = find_root(parents, i);
     clusters[i] = root == i ? count++ : clusters[root];
   }

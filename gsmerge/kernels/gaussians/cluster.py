@@ -1,4 +1,4 @@
-"""Overlap of neighbouring Gaussians, and clusters of those that overlap."""
+"""Measure the overlap of neighbouring Gaussians, and cluster those that overlap."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def edge_scores(neighbors, means, covars, colors, latents, views, max_color, sim
     """Write the overlap of every Gaussian with each of its neighbours.
 
     Args:
-        neighbors: ``[g,k]`` int64, below 0: none.
+        neighbors: ``[g,k]`` int64 ids of neighbours; below 0: none.
         covars: ``[g,6]`` float64, as xx xy xz yy yz zz.
         colors: ``[g,3]`` float64 base colours.
         latents: ``[g,d]`` float32 of length 1; d may be 0.
-        views: ``[g]`` int64; those below 0 are of none.
-        max_color: Largest difference of colours, where d is 0.
+        views: ``[g]`` int64; a view below 0 means no view.
+        max_color: Largest difference of colours; used if d is 0.
         similarity: Least cosine of the latents.
-        boxes: Whether :func:`box_overlap` is meant, in place of :func:`bhattacharyya`.
-        out: ``[g,k]`` float64; -1 where there is no neighbour, the two are of one view, or they are unlike.
+        boxes: Use :func:`box_overlap` in place of :func:`bhattacharyya`.
+        out: ``[g,k]`` float64; -1 if there is no neighbour, if both are of one view, or if they are not similar.
     """
 
 
@@ -44,16 +44,16 @@ _find_stars = declare(
 
 
 def leader_clusters(order, neighbors, scores, views, threshold, max_size):
-    """Cluster Gaussians in stars: each free one, in ``order``, leads its free neighbours that overlap enough.
+    """Cluster Gaussians around leaders: each free one, in ``order``, leads its free neighbours that overlap enough.
 
-    A cluster has at most ``max_size`` members, at most one per view, the best overlaps first. All members are
-    neighbours of the leader, so clusters cannot chain. Returns the cluster of each Gaussian and the number of clusters.
+    A cluster has at most ``max_size`` members, at most one per view, chosen by overlap. All members are neighbours of
+    the leader, so clusters cannot form chains. Returns the cluster of each Gaussian and the number of clusters.
 
     Args:
         order: ``[n]`` int64: all Gaussians.
-        neighbors: ``[n,k]`` int64, below 0: none.
+        neighbors: ``[n,k]`` int64 ids of neighbours; below 0: none.
         scores: ``[n,k]`` float64 overlaps with the neighbours.
-        views: ``[n]`` int64; those below 0 are of none.
+        views: ``[n]`` int64; a view below 0 means no view.
         threshold: Least overlap.
         max_size: Most Gaussians in a cluster.
     """
@@ -70,10 +70,10 @@ _find_components = declare(
 
 
 def connected_components(neighbors, scores, threshold):
-    """Find the connected components of the edges that overlap enough (paper section 4.4).
+    """Find the connected components of the graph of Gaussians that overlap enough (paper section 4.4).
 
-    Returns the cluster ``[n]`` int64 of each Gaussian and the number of clusters; neighbours and scores as
-    :func:`leader_clusters` takes them.
+    ``neighbors`` and ``scores`` are as in :func:`leader_clusters`. Returns the cluster ``[n]`` int64 of each Gaussian
+    and the number of clusters.
     """
     parents, clusters = np.empty((2, len(neighbors)), np.int64)
     count = np.zeros(1, np.int64)

@@ -1,9 +1,9 @@
-// Agreement of points with the Gaussians of other views: each view is read at one pixel.
+// Measure the agreement of points with the Gaussians of other views, in each view at one pixel.
 #include "exp_log.h"
 
 enum { COLUMNS = 6 };
 
-// What a point is compared with: Gaussians, which of them each pixel shows, and the limits of agreement.
+// The surface that points are compared with: Gaussians, the Gaussian of each pixel, and the limits of agreement.
 typedef struct {
   const int32_t *fronts;  // the Gaussian of each pixel, below 0: none
   const float *means, *opacities, *sh0;
@@ -15,7 +15,7 @@ static inline double along(const double *row, double x, double y, double z) {
   return row[0] * x + row[1] * y + row[2] * z + row[3];
 }
 
-// Adds what one view, at the pixel that a point projects to, says of it; false if there is no such Gaussian.
+// Compares a point with one view at the pixel that it projects to, and adds the result; false for an invalid Gaussian.
 static inline bool add_view(const surface *s, const double *m, const double *K, int64_t first,
                             const double *point, const float *color, double *out) {
   double x = point[0], y = point[1], z = point[2], depth = along(m + 8, x, y, z);
@@ -58,7 +58,7 @@ API int32_t sum_cross_view(const double *restrict points, const float *restrict 
     int64_t view = own[start], count = view < 0 ? views : most;
     for (stop = start + 1; stop < last && own[stop] == view; stop++);
     if (view >= views) return OUTSIDE;
-    for (int64_t q = 0; q < count; q++) {  // views outside: neighbouring points read neighbouring pixels
+    for (int64_t q = 0; q < count; q++) {  // the outer loop, since neighbouring points read neighbouring pixels
       int64_t v = view < 0 ? q : asked[most * view + q];
       for (int64_t i = start; i < stop && v != view; i++)
         if (!add_view(&s, viewmats + 16 * v, Ks + 9 * v, v * width * height, points + 3 * i,

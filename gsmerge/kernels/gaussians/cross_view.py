@@ -1,8 +1,8 @@
-"""Points and other views: the nearest points of other views, and agreement with their Gaussians, one per pixel.
+"""Find the nearest points of other views, and measure the agreement of points with the Gaussians of other views.
 
 Nearest points are found by a balanced k-d tree in arrays, searched without recursion. Node i of the tree is a run of
-``order``; its children 2 i + 1 and 2 i + 2 are the halves of the run, which is sorted about its middle along one axis.
-For agreement each view is read at one pixel.
+``order``. Its children 2 i + 1 and 2 i + 2 are the halves of the run, which is partitioned at its middle along one
+axis. Agreement is measured in each view at the single pixel that a point projects to.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i1, i4, i8, native
 
-LEAF = 16  # points up to which a run is not divided
-COLUMNS = 6
+LEAF = 16  # runs of at most so many points are not divided
+COLUMNS = 6  # of the sums of :func:`sum_cross_view`
 
 
 @native(
@@ -24,8 +24,8 @@ def build_tree(points, order, axes, splits):
 
     Args:
         order: ``[n]`` int64 rows of the points, in any order; reordered.
-        axes: ``[nodes]`` int8, written: along which axis each node is divided.
-        splits: ``[nodes]`` float64, written: where.
+        axes: ``[nodes]`` int8, written: axis along which each node is divided.
+        splits: ``[nodes]`` float64, written: coordinate at which each node is divided.
     """
 
 
@@ -47,13 +47,13 @@ def nearest_of_others(points, views, order, axes, splits, first, last, most, out
     """Write the nearest points of other views to rows ``first`` to ``last`` of ``out [n,k]``.
 
     Args:
-        points: As :func:`build_tree` took them.
-        views: ``[n]`` int64; points of views below 0 belong to none, and are of another one to each other.
-        order: As :func:`build_tree` left it, as are ``axes`` and ``splits``.
-        first: Of the rows.
-        last: After the last row.
-        most: Points that are looked at for each, whole leaves of the tree.
-        out: ``[n,k]`` int64: nearest first, -1 where there are fewer.
+        points: As given to :func:`build_tree`.
+        views: ``[n]`` int64; a point with a view below 0 belongs to no view, and any other point counts for it.
+        order: As written by :func:`build_tree`, like ``axes`` and ``splits``.
+        first: First row.
+        last: Last row, exclusive.
+        most: Number of points that are compared with each, in whole leaves of the tree.
+        out: ``[n,k]`` int64: nearest first, -1 if there are fewer.
     """
     _search_tree(points, views, order, axes, splits, first, last, most, np.empty(out.shape[1]), out)
 
@@ -62,12 +62,12 @@ def nearest_of_others(points, views, order, axes, splits, first, last, most, out
 def partition(values, order, low, high, place):
     """Reorder a run of an order so that one place holds the value that sorting would put there.
 
-    No value before the place is above it, and none after it below.
+    No value before the place is larger, and no value after it is smaller.
 
     Args:
-        values: ``[n]`` float64 numbers, left as they are.
+        values: ``[n]`` float64 numbers, unchanged.
         order: ``[m]`` int64 places in ``values``; those from ``low`` to before ``high`` are reordered.
-        place: In ``order``, from ``low`` to before ``high``.
+        place: Place in ``order``, from ``low`` to before ``high``.
     """
 
 
@@ -83,21 +83,22 @@ def sum_cross_view(
     points, colors, own, asked, viewmats, Ks, width, height, fronts, means, opacities, sh0, color_scale, near,
     far, min_opacity, first, last, out,
 ):  # fmt: skip
-    """Sum over the views that are asked and see each point, for the points from ``first`` to before ``last``.
+    """Compare the points from ``first`` to before ``last`` with other views, and sum the results over the views.
 
     Args:
-        colors: ``[g,3]`` float32 base colours less a half.
-        own: ``[g]`` int64 view of each, which is left out; below 0 for none: all views are asked.
-        asked: ``[v,most]`` int32 views that are asked about the points of each.
-        width: Of the views, pixels.
-        height: Of the views, pixels.
+        colors: ``[g,3]`` float32 base colours minus 0.5.
+        own: ``[g]`` int64 view of each point, which is left out; below 0: none, so all views are compared.
+        asked: ``[v,most]`` int32 views that are compared with the points of each view.
+        width: Width of the views, pixels.
+        height: Height of the views, pixels.
         fronts: ``[v,h,w]`` int32 Gaussian of each pixel, -1 for none.
-        color_scale: From ``sh0`` to colours.
+        color_scale: Factor from ``sh0`` to colours.
         near: Largest difference of the logarithms of two depths of one surface.
         far: Larger differences are clipped to this.
         min_opacity: More transparent Gaussians show no surface.
-        first: Of the points.
-        last: After the last point.
-        out: ``[g,6]`` float64, added to: views that see the point; of these, those whose surface is at it, behind it,
-            in front of it; absolute difference of colours where it is at it, difference of the logarithms of depths.
+        first: First point.
+        last: Last point, exclusive.
+        out: ``[g,6]`` float64; the sums are added: number of views that see the point; number of those whose surface is
+            at the point, behind it, and in front of it; absolute difference of colours if the surface is at the point;
+            difference of the logarithms of depths.
     """

@@ -1,22 +1,22 @@
-// Gaussians cut at the edges of photos: the moments of what lies inside.
+// Cut Gaussians at the edges of photos: compute the moments of the part inside.
 //
-// The planes through a camera and the four edges of its photo bound what it sees. The photo in which a Gaussian lies
-// deepest decides: that with the largest least distance from its four planes, in standard deviations of the Gaussian
-// across each plane. Where it reaches past the nearest of these planes, the part beyond is left out (moments of a
-// truncated normal distribution).
+// The planes through a camera and the four edges of its photo bound its field of view. The photo in which a Gaussian
+// lies deepest decides. Its depth in a photo is the least distance from the four planes, in standard deviations of the
+// Gaussian across each plane. If the Gaussian reaches past the nearest of these planes, the part beyond is left out
+// (moments of a truncated normal distribution).
 #include "native.h"
 
 enum { NUM_EDGES = 4, CUTS = 2 };  // planes of a photo; cuts of a Gaussian, as a corner has two edges
-static const double REACH = 2.0;   // standard deviations to which a Gaussian reaches; farther outside none is cut
+static const double REACH = 2.0;   // standard deviations to which a Gaussian reaches; beyond it no Gaussian is cut
 
 typedef struct {
-  double room, sigma;    // distance of the mean to the inside, and standard deviation across the plane
+  double room, sigma;    // distance of the mean inside the plane, and standard deviation across the plane
   const double *normal;  // outward, of unit length
 } Plane;
 
 static inline double dot3(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-// Covariance R diag(s^2) R' of a Gaussian, rows after rows.
+// Covariance R diag(s^2) R' of a Gaussian, row by row.
 static inline void covariance(double *c, const float *q, const float *s) {
   double w = q[0], x = q[1], y = q[2], z = q[3], unit = 2.0 / maxd(w * w + x * x + y * y + z * z, 1e-30);
   double r[9] = {1.0 - unit * (y * y + z * z), unit * (x * y - w * z), unit * (x * z + w * y),
@@ -28,7 +28,7 @@ static inline void covariance(double *c, const float *q, const float *s) {
       c[3 * i + j] = r[3 * i] * v[0] * r[3 * j] + r[3 * i + 1] * v[1] * r[3 * j + 1] + r[3 * i + 2] * v[2] * r[3 * j + 2];
 }
 
-// Whether some photo holds a ball as a whole.
+// True if a ball lies wholly inside of some photo.
 static inline bool is_held(const double *mean, double radius, const double *normals, const double *offsets, int64_t v) {
   for (int64_t view = 0; view < v; view++) {
     int inside = 0;
@@ -39,7 +39,7 @@ static inline bool is_held(const double *mean, double radius, const double *norm
   return false;
 }
 
-// The plane nearest to a Gaussian of the photo in which it lies deepest; of equal ones the first.
+// The plane nearest to a Gaussian, of the photo in which it lies deepest; the first of equal ones.
 static inline Plane nearest_plane(const double *mean, const double *c, const double *normals, const double *offsets,
                                   int64_t v) {
   Plane deepest = {-1e300, 1.0, normals};
@@ -56,7 +56,7 @@ static inline Plane nearest_plane(const double *mean, const double *c, const dou
   return deepest;
 }
 
-// Density over distribution of the normal distribution at x, for x in [-2, 2], to 1e-6: a Chebyshev interpolation.
+// Density over distribution function of the normal distribution at x in [-2, 2], to 1e-6, by Chebyshev interpolation.
 static inline double hazard(double x) {
   static const double terms[] = {0.7978845608028657, -0.6366256964745176, 0.10900567804265883, 0.019158206345196927,
                                  -0.00017911589947197377, -0.0013142822301547019, -0.0003737371729142186,
@@ -67,7 +67,7 @@ static inline double hazard(double x) {
   return sum;
 }
 
-// Move the mean and narrow the covariance to what lies inside of a plane.
+// Replace mean and covariance by those of the part inside of a plane.
 static inline void cut(double *mean, double *c, Plane plane) {
   const double *n = plane.normal;
   double across[3] = {dot3(c, n), dot3(c + 3, n), dot3(c + 6, n)}, h = hazard(plane.room);

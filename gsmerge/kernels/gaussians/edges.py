@@ -1,4 +1,4 @@
-"""Gaussians cut at the edges of photos: the moments of what lies inside."""
+"""Cut Gaussians at the edges of photos: compute the moments of the part inside."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ NUM_EDGES = 4  # planes of a photo
 def cut_at_edges(quats, scales, normals, offsets, first, last, means, covars, is_cut):
     """Cut rows ``first`` to ``last - 1`` of Gaussians that reach past the edges of all v photos.
 
-    The photo in which a Gaussian lies deepest decides, and the edge of it that is nearest, both in standard deviations
-    of the Gaussian across the edge's plane. Within two of them the Gaussian becomes the moments of its part inside
-    (truncated normal distribution), twice at most. Those farther outside stay as they are.
+    The photo in which a Gaussian lies deepest decides, and the nearest edge of that photo. Both are measured in
+    standard deviations of the Gaussian across the plane of the edge. Within two standard deviations of the edge the
+    Gaussian is replaced by the moments of its part inside (truncated normal distribution), at most twice. Gaussians
+    farther outside do not change.
 
     Args:
         normals: Outward unit normals of the planes through the cameras and the edges of their photos.
-        offsets: Of the planes: points x inside have ``normal @ x <= offset``.
-        means: Written where a Gaussian is cut.
-        covars: Covariances, written where a Gaussian is cut.
-        is_cut: Written, whether it is.
+        offsets: Offsets of the planes; points x inside have ``normal @ x <= offset``.
+        means: Means, written for Gaussians that are cut.
+        covars: Covariances, written for Gaussians that are cut.
+        is_cut: Written: 1 for Gaussians that are cut.
     """

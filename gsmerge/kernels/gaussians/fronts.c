@@ -1,9 +1,9 @@
-// Pixels of Gaussians by projection of their centres: no picture is drawn.
+// Find the pixels of Gaussians by projecting their centres, without drawing a picture.
 #include "exp_log.h"
 
 static const double REACH2 = 11.1;  // squared standard deviations at which a Gaussian ends: 2 ln 255
-static const double DILATION = 0.3;  // of Gaussians in a picture, pixels squared, as they are drawn
-static const float OPAQUE = 0.99f;  // largest opacity, as they are drawn
+static const double DILATION = 0.3;  // dilation of Gaussians by the rasterizer, square pixels
+static const float OPAQUE = 0.99f;  // largest opacity in the rasterizer
 
 static inline double along(const double *row, const float *p) {
   return row[0] * p[0] + row[1] * p[1] + row[2] * p[2] + row[3];
@@ -43,7 +43,7 @@ API int64_t project_centres(const float *restrict means, const float *restrict s
   return m;
 }
 
-// One pass through Gaussians, nearest first: what passes is kept for each pixel.
+// Pass over Gaussians, nearest first, and keep the transmittance of each pixel.
 API int32_t weigh_centres(const int32_t *restrict order, const int32_t *restrict ids,
                           const int32_t *restrict pixels, const float *restrict areas,
                           const float *restrict opacities, float *restrict passing,

@@ -1,7 +1,7 @@
-"""Pixels of Gaussians by projection of their centres: no picture is drawn.
+"""Find the pixels of Gaussians by projecting their centres, without drawing a picture.
 
-A Gaussian whose centre lies outside a picture into which it reaches may belong to the nearest pixel; it hides nothing
-there, and no pixel shows it.
+A Gaussian that reaches into a picture although its centre lies outside has the nearest pixel. It hides no other
+Gaussian there, and no pixel shows it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _weigh_centres = declare(
 
 
 def order_by_depth(depths):
-    """Return the order ``[m]`` int32 of depths ``[m]`` float32 above 0, nearest first; of equal ones the first row."""
+    """Return the order ``[m]`` int32 of depths ``[m]`` float32 above 0, nearest first; equal depths stay in order."""
     return depth_order(depths.view(np.uint32))
 
 
@@ -33,14 +33,14 @@ def project_centres(means, scales, viewmat, K, width, height, near):
 
     Args:
         viewmat: ``[4,4]`` float64, world to camera.
-        width: Of the picture, pixels.
-        height: Of the picture, pixels.
-        near: Depth beyond which Gaussians count, world units.
+        width: Width of the picture, pixels.
+        height: Height of the picture, pixels.
+        near: Gaussians at this depth or nearer are left out, world units.
 
     Returns:
-        Of m Gaussians: their rows ``[m]`` int32, ascending; their pixels ``[m]`` int32; their depths ``[m]`` float32;
-        and their areas ``[m]`` float32: the product of the two longest axes in pixels, negative and times the falloff
-        up to the picture where the centre is outside.
+        Of the m Gaussians that reach into the picture: rows ``[m]`` int32, ascending; pixels ``[m]`` int32; depths
+        ``[m]`` float32; and areas ``[m]`` float32, the product of the two longest axes in pixels. If the centre is
+        outside the picture, the area is negative and multiplied by the falloff up to the picture.
     """
     n = len(means)
     ids, pixels, depths, areas = (np.empty(n, kind) for kind in (np.int32, np.int32, np.float32, np.float32))
@@ -49,10 +49,10 @@ def project_centres(means, scales, viewmat, K, width, height, near):
 
 
 def weigh_centres(order, ids, places, areas, opacities, fronts):
-    """Weigh Gaussians at the places of their centres.
+    """Compute the weights of Gaussians at the pixels or cells of their centres.
 
     Args:
-        order: ``[k]`` int32, those of the m Gaussians that count, nearest first.
+        order: ``[k]`` int32, the Gaussians that count, of m, nearest first.
         ids: ``[m]`` int32 rows.
         places: ``[m]`` int32, the pixel or cell ``row * w + column`` of each.
         areas: ``[m]`` float32, see :func:`project_centres`.
@@ -61,7 +61,7 @@ def weigh_centres(order, ids, places, areas, opacities, fronts):
             without any.
 
     Returns:
-        Opacity times transmittance times area ``[m]`` float32; 0 of those that do not count.
+        Opacity times transmittance times area ``[m]`` float32; 0 for Gaussians that do not count.
     """
     weights, passing = np.zeros(len(ids), np.float32), np.ones(fronts.shape, np.float32)
     fronts[:] = -1

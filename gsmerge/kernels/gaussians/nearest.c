@@ -1,10 +1,10 @@
-// Nearest points of other views: a balanced k-d tree in arrays, searched without recursion.
+// Find the nearest points of other views by a balanced k-d tree in arrays, searched without recursion.
 #include "select.h"
 
 enum { LEAF = 16, DEPTH = 64 };  // most points of a leaf; the stack of the tree of 2^60 points
 
 typedef struct {
-  int64_t node, low, high;  // of the tree, and its run of the order
+  int64_t node, low, high;  // a node of the tree, and its run of the order
 } branch;
 
 // Axis along which the points of a run are spread farthest.
@@ -59,8 +59,8 @@ typedef struct {
   double bound, offsets[3];  // squared distance of the query from the run's cell, and its parts
 } wait;
 
-// Goes down to the leaf of the query's side; the other sides are put on the stack. False for a tree
-// that is none.
+// Descends to the leaf on the query's side, and puts the other sides on the stack; false for an
+// invalid tree.
 static inline bool descend(const tree *t, const double *query, wait *at, wait *stack, int *top) {
   while (at->run.high - at->run.low > LEAF) {
     int64_t node = at->run.node, middle = (at->run.low + at->run.high) / 2;
@@ -78,7 +78,7 @@ static inline bool descend(const tree *t, const double *query, wait *at, wait *s
   return true;
 }
 
-// Puts a point where it belongs among the nearest so far.
+// Inserts a point into the sorted list of the nearest points.
 static inline void insert(double *distances, int64_t *ids, int64_t count, double distance,
                           int64_t id) {
   int64_t place = count - 1;
@@ -129,7 +129,7 @@ API int32_t search_tree(const double *restrict points, const int64_t *restrict v
   return 0;
 }
 
-// Quickselect on its own, for tests.
+// Quickselect by itself, for tests.
 API int32_t partition(const double *restrict values, int64_t *restrict order, int64_t low,
                       int64_t high, int64_t place, int64_t n, int64_t m) {
   if (low > place || place >= high || high > m) return OUTSIDE;

@@ -1,8 +1,8 @@
 // One optimiser step on all parameters of all Gaussians.
 //
 // A Gaussian's row of fourteen parameters is one vector: mean 3, log scale 3, quaternion 4, opacity
-// logit 1, colour 3, and two lanes that are not kept. What takes one number of a row, roots and
-// exponentials, is done for the rows of a block together.
+// logit 1, colour 3, and two unused lanes. Roots and exponentials, which take one number of a row,
+// are computed for all rows of a block together.
 #include "exp_log.h"
 
 enum { MEAN = 0, SIZE = 3, QUAT = 6, LOGIT = 10, COLOR = 11, COLUMNS = 14, BLOCK = 16 };
@@ -12,7 +12,7 @@ static const v16i OF_QUAT = {0, 0, 0, 0, 0, 0, -1, -1, -1, -1};
 static const v16i OF_LOGIT = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, -1};
 static const v16i OF_COLOR = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, -1, -1, -1};
 
-// A row, as two halves that overlap: what is beside it belongs to others.
+// A row, loaded as two overlapping halves, since the memory beside it belongs to other rows.
 static inline v16f load_row(const float *p) {
   v8f low = *(const v8f *)p, high = *(const v8f *)(p + COLUMNS - 8);
   return PICK(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 12, 13, 14, 15, 15, 15);
@@ -26,7 +26,7 @@ static inline void store_row(float *p, v16f v) {
 static inline v16f min16(v16f a, v16f b) { return sel(a < b, a, b); }
 static inline v16f max16(v16f a, v16f b) { return sel(a > b, a, b); }
 
-// Sums over the mean and over the quaternion, in each of their lanes; the others as they are.
+// Sums over the mean and over the quaternion, in each of their lanes; other lanes are unchanged.
 static inline v16f sum_groups(v16f v) {
   v16f z = {0};
   return (PICK(v, z, 0, 0, 0, 3, 4, 5, 6, 6, 6, 6, 10, 11, 12, 13, 14, 15) +
@@ -35,12 +35,12 @@ static inline v16f sum_groups(v16f v) {
           PICK(v, z, 16, 16, 16, 16, 16, 16, 9, 9, 9, 9, 16, 16, 16, 16, 16, 16));
 }
 
-// What all rows of a step share.
+// Values that all rows of a step share.
 typedef struct {
-  v16f rates;  // made up for first moments that began at zero
-  float beta1, beta2, second;  // decays of the moments, and what makes up for the second ones
+  v16f rates;  // learning rates, with the bias correction of first moments
+  float beta1, beta2, second;  // decays of the moments, and the bias correction of second moments
   float mean_limit, size_limit, logit_limit, ratio_limit, long_limit;
-  float opacity_reg, scale_reg;  // gradients of the weights of opacity, and of scales in sizes
+  float opacity_reg, scale_reg;  // gradients that are added to those of opacities, and of scales in sizes
 } Step;
 
 static inline double power(double base, int64_t exponent) {
@@ -49,17 +49,17 @@ static inline double power(double base, int64_t exponent) {
   return result;
 }
 
-// A block of rows: their parameters, and what is made of them for all together.
+// A block of rows: their parameters, and values that are computed for all of them together.
 typedef struct {
   float rows[BLOCK][LANES], distance[BLOCK], length[BLOCK], unit[BLOCK], share[BLOCK];
   float visible[BLOCK * 4];  // scales and opacity
 } Block;
 
-// Moments, and parameters before they are confined, of a row with the gradient in the block.
+// Update the moments and the parameters of a row with the gradient in the block; parameters are not yet confined.
 static inline void move(Block *b, int64_t j, Step s, const float *x, const float *x0, float *m,
                         float *v) {
   v16f gradient = load(b->rows[j]), energy = gradient * gradient;
-  // one second moment for the mean and one for the quaternion, which has three freedoms
+  // one second moment for the mean and one for the quaternion, which has three degrees of freedom
   energy = sel(OF_MEAN | OF_QUAT, sum_groups(energy) * (1.f / 3.f), energy);
   v16f first = s.beta1 * load_row(m) + (1.f - s.beta1) * gradient;
   v16f second = s.beta2 * load_row(v) + (1.f - s.beta2) * energy;
@@ -76,7 +76,7 @@ static inline void move(Block *b, int64_t j, Step s, const float *x, const float
   store(b->rows[j], moved);
 }
 
-// What means' distances from the start, and quaternions, are multiplied by.
+// Compute the factors of the means' distances from the start, and of the quaternions.
 static inline void confine_groups(Block *b, Step s) {
   for (int j = 0; j < BLOCK; j++) {
     float far = sqrtf4(b->distance[j]), reach = b->share[j] * s.mean_limit * b->unit[j];
@@ -86,7 +86,8 @@ static inline void confine_groups(Block *b, Step s) {
   }
 }
 
-// Parameters in the box about the start, with least size, colours in range, a unit quaternion.
+// Confine parameters to the box about the start, scales to the least size, colours to their range, and normalise the
+// quaternion.
 static inline v16f confine(const Block *b, int64_t j, Step s, v16f x0, float least) {
   const float inf = __builtin_inff();
   v16f x = load(b->rows[j]);
@@ -101,7 +102,7 @@ static inline v16f confine(const Block *b, int64_t j, Step s, v16f x0, float lea
   return sel(OF_MEAN, nearer, sel(OF_QUAT, x * b->length[j], inside));
 }
 
-// Log scales of which the largest is no longer than a ratio of the second, or than what counts as long.
+// Shorten the largest log scale to a ratio of the second one, or to a ratio of the least size if that is longer.
 static inline v16f shorten(v16f x, Step s, float least) {
   float a = x[SIZE], b = x[SIZE + 1], c = x[SIZE + 2];
   float low = a < b ? a : b, high = a < b ? b : a, second = c < low ? low : c < high ? c : high;
@@ -109,8 +110,8 @@ static inline v16f shorten(v16f x, Step s, float least) {
   return sel(OF_SIZE, min16(x, splat(wide > most ? wide : most)), x);
 }
 
-// The gradients as the rasterizer gives them, in the optimiser's parameters: means in units of the
-// Gaussian's size, log, logit.
+// Convert the gradients of the rasterizer to the optimiser's parameters: means in units of the
+// Gaussian's size, log scales, logits.
 static inline void gather(Block *b, int64_t j, Step s, const float *scale, float opacity,
                           const float *mean, const float *quat, const float *grad_scale,
                           float grad_opacity, const float *color) {

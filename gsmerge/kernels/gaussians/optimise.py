@@ -1,4 +1,4 @@
-"""One optimiser step on all parameters of all Gaussians."""
+"""Take optimiser steps on all parameters of Gaussians."""
 
 from __future__ import annotations
 
@@ -25,20 +25,19 @@ def adam(
 ):  # fmt: skip
     """Take an Adam step of rows ``ids[first]`` to ``ids[last - 1]`` of ``x [n,COLUMNS]``; clip to the box about ``x0``.
 
-    As of Nesterov, the first moment counts one step further, with the gradient at hand (Dozat, 2016).
-    The components of the mean share one second moment, and so do those of the quaternion, so that the step rotates with
-    the scene. The step is sparse: rows that a view does not show keep their parameters and moments.
+    With Nesterov momentum, the first moment of the next step is used, with the present gradient (Dozat, 2016). The
+    components of the mean share one second moment, and so do those of the quaternion, so that the step rotates with the
+    scene. The step is sparse: rows that a view does not show keep their parameters and moments.
 
     Args:
-        box_shares: ``[n]`` of the limits of mean and log scale that each Gaussian may use.
-        min_sizes: ``[n]`` least log scale of each, whatever the box.
-        fixed: ``[n]`` uint8, rows with another number than 0 keep their parameters and moments.
+        box_shares: ``[n]`` share of the limits of mean and log scale that each Gaussian may use.
+        min_sizes: ``[n]`` least log scale of each, even if that is outside the box.
         ids: ``[k]`` rows with a gradient, each once; the gradients have k rows.
-        rates: Of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
-        limits: Of the mean (in sizes), log scale, logit; by how much the largest log scale may exceed the second, or
-            the least one if that is more.
+        rates: Learning rates of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
+        limits: Half sides of the box for mean (in sizes), log scale and logit; then by how much the largest log scale
+            may exceed the second one, or ``min_sizes`` if that allows more.
         betas: Decay of the first and second moment.
         regs: Added to the gradients of the opacity, and of scales in units of the Gaussian's size.
-        step: From 1.
-        means, quats, scales, opacities, colors: What the new state means to the rasterizer, written.
+        step: Number of the step, from 1.
+        means, quats, scales, opacities, colors: Written: the new parameters as the rasterizer takes them.
     """

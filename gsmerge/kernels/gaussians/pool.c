@@ -1,8 +1,8 @@
-// Groups of members, their moments, and principal axes.
+// Group members, pool their moments, and compute principal axes.
 #include "exp_log.h"
 #include "select.h"
 
-enum { FEW = 64, SWEEPS = 8 };  // members whose median counting finds; most Jacobi sweeps
+enum { FEW = 64, SWEEPS = 8 };  // most members whose median is found by counting; most Jacobi sweeps
 static const double MAX_OPACITY = 0.995;  // optical depth is -ln(1 - opacity): 1 would be infinite
 static const double CAP = 3.0;  // members are shrunk to this many times the group's median extent
 static const double FLOOR = 0.1;  // smallest standard deviation of a group, in pixel footprints
@@ -10,11 +10,11 @@ static const double VOLUME = 15.749609945722419;  // (2 pi)^(3/2)
 
 typedef struct {
   const float *means, *quats, *scales, *opacities, *sh0, *shN, *footprints;
-  int64_t rest;  // coefficients of shN
+  int64_t rest;  // number of coefficients of shN
 } members;
 
-// Counting sort: member ids by label, in rising order, and where each label's begin; labels below 0
-// are left out.
+// Counting sort of member ids by label, ascending, with the start of each label's members; labels
+// below 0 are left out.
 API int32_t sort_labels(const int32_t *restrict labels, int64_t *restrict starts,
                         int32_t *restrict ids, int64_t n, int64_t ends) {
   if (n > INT32_MAX || ends < 1) return OUTSIDE;
@@ -36,8 +36,8 @@ API int32_t sort_labels(const int32_t *restrict labels, int64_t *restrict starts
 
 static inline double largest(const float *s) { return maxf(maxf(s[0], s[1]), s[2]); }
 
-// The median, of two the smaller one. Counting costs few members less than what quickselect
-// mispredicts.
+// The median, of two the smaller one. For few members counting is faster than the mispredicted
+// branches of quickselect.
 static double find_median(const double *values, int64_t *order, int64_t n) {
   int64_t middle = (n - 1) / 2;
   for (int64_t j = 0; j < n && n <= FEW; j++) {
@@ -53,8 +53,8 @@ static double find_median(const double *values, int64_t *order, int64_t n) {
   return values[order[middle]];
 }
 
-// Shrink factor of each member: at most CAP times the median extent of the group, extents in
-// footprints.
+// Shrink factor of each member, so that its extent is at most CAP times the median extent of the
+// group; extents are in footprints.
 static void cap_members(const members *m, const int32_t *ids, int64_t n, double *caps,
                         int64_t *order) {
   for (int64_t j = 0; j < n; j++)
@@ -64,7 +64,7 @@ static void cap_members(const members *m, const int32_t *ids, int64_t n, double 
 }
 
 // Adds w R diag(s)^2 R^T to a covariance xx xy xz yy yz zz, with the rotation R of a quaternion
-// wxyz of any length; the zero quaternion stands for no rotation.
+// wxyz of any length; the zero quaternion means no rotation.
 static inline void add_covariance(const float *quat, const double *s, double weight, double *c) {
   double w = quat[0], x = quat[1], y = quat[2], z = quat[3];
   double n = w * w + x * x + y * y + z * z, f = n > 0.0 ? 2.0 / n : 0.0;
@@ -93,8 +93,8 @@ static inline void sum_means(const members *m, const int32_t *ids, int64_t n, bo
   }
 }
 
-// Moments of one group; see pool.py. The weights of a fully transparent group are equal: it still
-// has a place.
+// Moments of one group; see pool.py. A fully transparent group gets equal weights, so that it has a
+// mean.
 static void pool_group(const members *m, const int32_t *ids, int64_t n, const double *caps,
                        bool own, double *out, float *out_sh) {
   double sums[5], mean[3], c[6] = {0}, mass = 0.0, extinction = 0.0;
@@ -175,15 +175,15 @@ static inline void rotate_pair(double a[3][3], double u[3][3], int p, int q) {
   }
 }
 
-// Unit quaternion wxyz, w >= 0, of orthonormal axes; a left-handed set has its first axis turned
-// round.
+// Unit quaternion wxyz, w >= 0, of orthonormal axes; the first axis of a left-handed set is
+// reversed.
 static inline void right_handed_quat(double r[3][3], double *out) {
   double det = r[0][0] * (r[1][1] * r[2][2] - r[1][2] * r[2][1])
       - r[0][1] * (r[1][0] * r[2][2] - r[1][2] * r[2][0])
       + r[0][2] * (r[1][0] * r[2][1] - r[1][1] * r[2][0]);
   if (det < 0.0)
     for (int i = 0; i < 3; i++) r[i][0] = -r[i][0];
-  // 4 q q^T has these four diagonals; the largest is the safe one to divide by
+  // 4 q q^T has these four diagonals; dividing by the largest one is safe
   double q[4] = {1 + r[0][0] + r[1][1] + r[2][2], 1 + r[0][0] - r[1][1] - r[2][2],
                  1 - r[0][0] + r[1][1] - r[2][2], 1 - r[0][0] - r[1][1] + r[2][2]};
   int best = 0;
@@ -211,13 +211,13 @@ API void decompose(const double *restrict covars, double *restrict out_scales,
       rotate_pair(a, u, 0, 2);
       rotate_pair(a, u, 1, 2);
     }
-    // rising order of the diagonal: the middle one is what the other two leave
+    // ascending order of the diagonal; the middle one is the remaining one
     int low = 0, high = 0;
     for (int k = 1; k < 3; k++) {
       low = a[k][k] < a[low][low] ? k : low;
       high = a[k][k] >= a[high][high] ? k : high;
     }
-    int order[3] = {low, 3 - low - high < 2 ? 3 - low - high : 2, high};  // NaN compares to nothing
+    int order[3] = {low, 3 - low - high < 2 ? 3 - low - high : 2, high};  // the limit is for NaN
     for (int k = 0; k < 3; k++) {
       out_scales[3 * n + k] = sqrtf8(maxd(a[order[k]][order[k]], 0.0));
       for (int i = 0; i < 3; i++) r[i][k] = u[i][order[k]];

@@ -2,9 +2,9 @@
 #pragma once
 #include "native.h"
 
-enum { TRIES = 32 };  // passes over as many values as the run has before the rest is sorted: no order is quadratic
+enum { TRIES = 32 };  // passes over the run before the rest is sorted, so that no order takes quadratic time
 
-// Lets the value at a place of a heap sink below those that are larger.
+// Moves the value at a place of a heap below larger values.
 static inline void sink(const double *values, int64_t stride, int64_t *heap, int64_t place,
                         int64_t count) {
   int64_t moved = heap[place];
@@ -29,8 +29,8 @@ static inline void sort_heap(const double *values, int64_t stride, int64_t *heap
 }
 
 // Reorders order[low] to order[high - 1] so that values[stride * order[place]] is the one that
-// sorting would put there: none before it is above it, none after it below. NaN compares to nothing
-// and may end up anywhere.
+// sorting would put there: no value before it is larger, no value after it is smaller. NaN may end up
+// anywhere.
 static inline void partition_run(const double *values, int64_t stride, int64_t *order, int64_t low,
                                  int64_t high, int64_t place) {
   int64_t last = high - 1, most = TRIES * (high - low);

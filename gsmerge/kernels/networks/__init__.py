@@ -1,1 +1,1 @@
-"""Layers of the networks, what they read, and the corrections that they make."""
+"""Kernels of the networks: their layers, their inputs, and the corrections that they output."""

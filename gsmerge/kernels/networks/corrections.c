@@ -1,12 +1,12 @@
-// Corrections of Gaussians and of Feature Gaussians, in float64. A correction of zero changes no bit.
+// Apply corrections to Gaussians and to Feature Gaussians, in float64. A correction of zero changes no bit.
 #include "exp_log.h"
 #include "trig.h"
 
 #define SH_C0 0.28209479177387814
 
-enum { COLUMNS = 13, MEAN = 0, SIZE = 3, TURN = 6, LOGIT = 9, COLOR = 10 };  // of a correction
+enum { COLUMNS = 13, MEAN = 0, SIZE = 3, TURN = 6, LOGIT = 9, COLOR = 10 };  // columns of a correction
 
-// A vector from a group's frame to the world.
+// Rotate a vector from a group's frame to the world.
 static inline void to_world(const float *frame, const double *v, double *out) {
   for (int i = 0; i < 3; i++) out[i] = frame[3 * i] * v[0] + frame[3 * i + 1] * v[1] + frame[3 * i + 2] * v[2];
 }
@@ -17,7 +17,7 @@ static inline double size_of(const float *scales) {
   return sqrtf8(maxd(mind(a, b), mind(maxd(a, b), c)) * maxd(a, maxd(b, c)));
 }
 
-// Where three columns of a correction, in units of a Gaussian's size, point to in the world.
+// Convert three columns of a correction, in units of a Gaussian's size, to a vector in the world.
 static inline void shift_of(const float *residual, const float *frame, double size, double *out) {
   double local[3];
   for (int i = 0; i < 3; i++) local[i] = residual[MEAN + i] * size;
@@ -61,7 +61,7 @@ static inline void stretch_of(const float *quat, const float *logs, double out[3
     }
 }
 
-// The covariance of what a linear change makes of it.
+// Transform a covariance by a linear change.
 static inline void change_covariance(double change[3][3], float *covar) {
   double before[3][3], half[3][3], after[3][3], turned[3][3];
   for (int i = 0; i < 3; i++)
@@ -93,7 +93,7 @@ API void correct_features(float *restrict means, float *restrict covars, float *
     masses[n] = (float)(masses[n] * exp8(depth + residual[SIZE] + disc));
     extinctions[n] = (float)(extinctions[n] * exp8(depth + disc));
     for (int i = 0; i < 3; i++) {
-      bool finite = absf8(shift[i]) <= 1.7976931348623157e308;  // not for means as far away as float32 allows
+      bool finite = absf8(shift[i]) <= 1.7976931348623157e308;  // false for means near the limit of float32
       means[3 * n + i] = (float)(means[3 * n + i] + (finite ? shift[i] : 0.0));
       sh0[3 * n + i] = (float)(sh0[3 * n + i] + residual[COLOR + i] / SH_C0);
     }

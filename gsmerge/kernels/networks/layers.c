@@ -1,7 +1,7 @@
-// Layers of the networks on tables of tokens. Every row is computed alone, so results do not depend on the table.
+// Layers of the networks on tables of tokens. Every row is computed by itself, so results do not depend on the table.
 #include "exp_log.h"
 
-enum { ROWS = 6 };  // that share the loads of the weights: their sums and a weight fit into sixteen short registers
+enum { ROWS = 6 };  // rows that share each load of weights; their sums and a weight fit into sixteen AVX2 registers
 enum { GELU = 1, TANH = 2 };  // activations
 enum { MOST_COLUMNS = 1 << 20 };
 
@@ -44,7 +44,7 @@ static inline void dense_block(const float *restrict x, const float *restrict we
   }
 }
 
-// activation(x W + b + residual). The weights come in blocks of sixteen outputs, the last one filled up with zeros.
+// activation(x W + b + residual). The weights are in blocks of sixteen outputs, the last one padded with zeros.
 API int32_t dense(const float *restrict x, const float *restrict weight, const float *restrict bias,
                   const float *restrict residual, int64_t activation, float *restrict out, int64_t rows, int64_t inputs,
                   int64_t blocks, int64_t outputs) {
@@ -86,9 +86,9 @@ API void normalise(const float *restrict x, const float *restrict gains, const f
 }
 
 typedef struct {
-  int64_t heads, size, padded;  // heads, width of one, and the same filled up to whole vectors
-  int64_t width, columns;  // of all heads' keys, and of keys and values
-  int64_t tokens, room;  // of a set, and the same filled up
+  int64_t heads, size, padded;  // number of heads, width of a head, and the same padded to whole vectors
+  int64_t width, columns;  // width of the keys of all heads, and of keys and values
+  int64_t tokens, room;  // number of tokens of a set, and the same padded to whole vectors
 } Shape;
 
 static inline float largest(v16f v) {
@@ -99,7 +99,7 @@ static inline float largest(v16f v) {
   return s[0];
 }
 
-// Softmax of one head's scores of a query: shares, and their sum.
+// Softmax of the scores of a query in one head: writes unnormalised shares, and returns their sum.
 static inline float attention_shares(const float *restrict query, const float *restrict keys,
                                      const float *restrict hidden, float *restrict shares, const Shape *s) {
   v16f top = splat(-__builtin_inff()), sum = {0};
@@ -119,7 +119,7 @@ static inline float attention_shares(const float *restrict query, const float *r
   return total(sum);
 }
 
-// One set: keys are turned so that sixteen of them are compared with a query at once.
+// Attend to one set; its keys are transposed so that sixteen of them are compared with a query at once.
 static inline void attend_set(const float *restrict query, const float *restrict pairs, const uint8_t *restrict mask,
                               float *restrict scratch, float *restrict out, int64_t queries, const Shape *s) {
   float *keys = scratch, *hidden = keys + s->width * s->room, *shares = hidden + s->room;

@@ -1,4 +1,4 @@
-"""Layers of the networks on tables of tokens, in float32; every row is computed alone."""
+"""Compute the layers of the networks on tables of tokens in float32; every row is computed by itself."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, f4, i8, native, u1
 
-LANES = 16  # floats of a vector; weights are filled up to whole ones
+LANES = 16  # floats of a vector; weights are padded to whole vectors
 PLAIN, GELU, TANH = range(3)  # activations of dense layers
 
 
@@ -15,9 +15,9 @@ PLAIN, GELU, TANH = range(3)  # activations of dense layers
     residual=f4("rows", "outputs", optional=True), activation=i8(least=0, most=2), out=f4("rows", "outputs", out=True),
 )  # fmt: skip
 def dense(x, weight, bias, residual, activation, out):
-    """Write ``activation(x W + b + residual)``; weights and bias are those of :func:`pack`.
+    """Write ``activation(x W + b + residual)`` with weights and bias from :func:`pack`.
 
-    ``activation``: PLAIN, GELU, or TANH, which is 0 for NaN. ``residual``: None for zero.
+    ``activation`` is PLAIN, GELU, or TANH, which is 0 for NaN. A ``residual`` of None is zero.
     """
 
 
@@ -35,11 +35,11 @@ def attend(query, pairs, mask, heads, scratch, out):
 
     Args:
         query: ``[sets,queries,width]``, head by head.
-        pairs: ``[sets,tokens,columns]``: the keys as wide as the queries, then the values, each head of these padded
-            to :func:`padded` columns.
+        pairs: ``[sets,tokens,columns]``: the keys, as wide as the queries, then the values, each head padded to
+            :func:`padded` columns.
         mask: ``[sets,tokens]`` uint8, 0 for tokens that do not count.
-        heads: Heads.
-        scratch: Room for the keys of a set, see :func:`scratch_size`.
+        heads: Number of heads.
+        scratch: Work space for the keys of a set, see :func:`scratch_size`.
         out: ``[sets,queries,mixed]``, written: the mixed values, each head padded.
     """
 
@@ -50,12 +50,12 @@ def padded(count: int) -> int:
 
 
 def scratch_size(tokens: int, width: int) -> int:
-    """Return the floats of scratch that :func:`attend` needs for sets of ``tokens`` with keys of ``width``."""
+    """Return the number of floats of scratch that :func:`attend` needs for ``tokens`` per set and keys of ``width``."""
     return (width + 2) * padded(tokens)
 
 
 def pack(weight: np.ndarray, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights ``[outputs,inputs]`` and bias ``[outputs]`` in blocks of sixteen outputs, the last with zeros."""
+    """Arrange weights ``[outputs,inputs]`` and bias ``[outputs]`` in blocks of sixteen outputs, padded with zeros."""
     outputs, inputs = weight.shape
     full, shift = np.zeros((padded(outputs), inputs), np.float32), np.zeros(padded(outputs), np.float32)
     full[:outputs], shift[:outputs] = weight, bias

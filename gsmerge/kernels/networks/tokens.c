@@ -1,14 +1,15 @@
-// What the networks read: numbers without a unit, in a frame of each group. Computed in float64, written as float32.
+// Compute the inputs of the networks: numbers without a unit, in the frame of each group. They are computed in float64
+// and written as float32.
 #include "exp_log.h"
 
 #define SH_C0 0.28209479177387814
-#define TINY 1e-12  // world units; lengths are at least this before a division or a logarithm
+#define TINY 1e-12  // least length before a division or a logarithm, world units
 
 enum { PART = 13, MEMBER = 19, NUMBERS = 19 };  // columns
 
 static inline double clampd(double x, double low, double high) { return mind(maxd(x, low), high); }
 
-// A float32 that is finite: 0 for NaN, the largest number for infinity.
+// Convert to a finite float32: 0 for NaN, the largest number for infinity.
 static inline float finite4(double x) {
   const double most = 3.4028234663852886e38;
   return x == x ? (float)clampd(x, -most, most) : 0.f;
@@ -31,8 +32,8 @@ static inline void normalise8(double *v) {
   for (int i = 0; i < 3; i++) v[i] = v[i] / norm;
 }
 
-// Image right, image down and the ray of each point as the columns of a frame; and sizes: the geometric mean of the two
-// largest scales.
+// Write for each point a frame with the columns image right, image down and ray, and a size, the geometric mean of the
+// two largest scales.
 API void place_frames(const float *restrict means, const float *restrict scales, const double *restrict viewmats,
                       const int64_t *restrict views, float *restrict frames, float *restrict sizes, int64_t g,
                       int64_t v) {
@@ -166,7 +167,7 @@ API int32_t describe_parts(const float *restrict means, const float *restrict qu
       row[3 + i] = finite4(clampd(log8(sorted[i] / pixel), -12.0, 12.0) / 4.0);
     }
     row[6] = finite4(logit8(opacities[p]) / 3.0);
-    // towards the camera; a round Gaussian has no normal, so that rounding cannot choose one
+    // towards the camera; a round Gaussian gets no normal, since rounding would choose it
     double flat = (1.0 - sorted[0] / sorted[1]) * (facing[2] > 0.0 ? -1.0 : facing[2] < 0.0 ? 1.0 : 0.0);
     for (int i = 0; i < 3; i++) {
       row[7 + i] = finite4(SH_C0 * ((double)sh0[3 * p + i] - group_sh0[3 * o + i]));

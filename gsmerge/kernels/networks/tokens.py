@@ -1,7 +1,7 @@
-"""What the networks read of Gaussians and groups, and their corrections, in a frame of each group.
+"""Compute the inputs of the networks for Gaussians and groups, and apply their corrections, in the frame of each group.
 
-Arrays are float32, ids int64. Corrections are made in place, and one of zero changes no bit; they have 13 columns, see
-:mod:`gsmerge.networks.corrections`; frames have axes as columns.
+Arrays are float32, and ids int64. Corrections have 13 columns, see :mod:`gsmerge.networks.corrections`. They are
+applied in place, and a correction of zero changes no bit. The columns of a frame are its axes.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def describe_groups(
 ):  # fmt: skip
     """Write the first 19 columns that describe groups.
 
-    Three log scales, logit of the opacity, mass, optical depth, number of members ``counts`` and their mean opacity,
-    three colours, six entries of the covariance, and two tangents of the angles to the view's axis.
+    They are three log scales, the logit of the opacity, the mass, the optical depth, the number of members ``counts``,
+    their mean opacity, three colours, six entries of the covariance, and two tangents of the angles to the view's axis.
     """
 
 
@@ -47,8 +47,8 @@ def describe_parts(
 ):
     """Write the first 13 columns that describe the parts ``ids`` relative to the groups ``owners``.
 
-    Three of the position, three log scales, logit of the opacity, three of the colour and three of the normal. With
-    ``members`` six more: the position in pixels, and the colour itself.
+    They are three of the position, three log scales, the logit of the opacity, three of the colour and three of the
+    normal. With ``members`` there are six more: the position in pixels, and the absolute colour.
     """
 
 

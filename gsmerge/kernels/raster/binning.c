@@ -3,12 +3,12 @@
 #include "walk.h"
 
 static const float CLOSED = 5e-5f;  // transmittance below which every pixel of a tile has stopped, with room for rounding
-static const float ROUNDING = 0.01f;  // of exponents
+static const float ROUNDING = 0.01f;  // tolerance for rounding errors of exponents
 
-enum { DIGIT = 11, PASSES = 3 };  // bits sorted per pass at most: 2048 counters and their streams stay in the first caches
+enum { DIGIT = 11, PASSES = 3 };  // most bits per pass and passes: 2048 counters and their streams fit the first caches
 
-// A least-significant-digit radix sort. Only the bits in which the range of values differs are sorted, in as few and as
-// even passes as possible.
+// A least-significant-digit radix sort. Only bits that differ in the range of values are sorted, in as few passes as
+// possible, with about equal numbers of bits.
 API void sort_bits(const uint32_t *bits, int32_t *order, uint64_t *keys, uint64_t *spare, int64_t m) {
   int64_t counts[PASSES][1 << DIGIT];
   if (m == 0) return;
@@ -43,11 +43,12 @@ API void sort_bits(const uint32_t *bits, int32_t *order, uint64_t *keys, uint64_
   for (int64_t i = 0; i < m; i++) order[i] = (int32_t)keys[i];
 }
 
-// Differences at the boxes' corners, then running sums: no loop over tiles, so nothing to mispredict.
+// Mark the corners of the boxes, then take running sums. Without a loop over the tiles of each box no branch is
+// mispredicted.
 API int32_t count_boxes(const int16_t *boxes, int64_t tile_height, int64_t tile_width, int64_t *corners,
                         int64_t *counts, int64_t m, int64_t num_corners, int64_t tiles) {
   int64_t stride = tile_width + 1;
-  uint64_t *marks = (uint64_t *)corners;  // sums of any numbers are defined
+  uint64_t *marks = (uint64_t *)corners;  // unsigned, so that overflow is defined
   if (num_corners != (tile_height + 1) * stride || tiles != tile_height * tile_width) return OUTSIDE;
   for (int64_t i = 0; i < m; i++) {
     int64_t x0 = boxes[4 * i], x1 = boxes[4 * i + 1], y0 = boxes[4 * i + 2], y1 = boxes[4 * i + 3];
@@ -75,7 +76,7 @@ API int32_t deal_tiles(const int32_t *order, const int16_t *boxes, int64_t tile_
     if (x0 < 0 || y0 < 0 || width <= 0 || height <= 0) continue;
     if (x0 + width > tile_width || (y0 + height) * tile_width > tiles) return OUTSIDE;
     int64_t tile = y0 * tile_width + x0, column = 0;
-    // One loop for both axes: most boxes hold a tile or two, and the end of a loop is mispredicted.
+    // One loop for both axes: most boxes have one or two tiles, and the end of each loop is mispredicted.
     for (int64_t n = width * height; n > 0; n--) {
       uint64_t slot = (uint64_t)cursors[tile];
       if (slot >= (uint64_t)intersections) return OUTSIDE;
@@ -90,8 +91,8 @@ API int32_t deal_tiles(const int32_t *order, const int16_t *boxes, int64_t tile_
   return 0;
 }
 
-// Part of the light that a Gaussian takes of every pixel of the tile at (left, top), at least. Exponents are concave, so
-// they are least in a corner.
+// Lower bound of a Gaussian's alpha over the pixels of the tile at (left, top). Exponents are concave, so their least
+// value is in a corner.
 static inline float least_share(const float *conic, float left, float top) {
   float least = 0.f;
   for (int corner = 0; corner < 4; corner++) {

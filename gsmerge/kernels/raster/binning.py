@@ -1,4 +1,4 @@
-"""Depth order and tile lists: every Gaussian is sorted once, then put into the lists of its tiles in that order."""
+"""Sort Gaussians by depth once, then append them in that order to the lists of their tiles."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from gsmerge.kernels.raster.project import CONIC
 from gsmerge.kernels.signature import STATUS, f4, i2, i4, i8, native, u4, u8
 
-MOST_TILES = 2**15 - 1  # in a row or a column, as boxes can name them
+MOST_TILES = 2**15 - 1  # per row and per column, since boxes have 16 bits
 
 
 @native(bits=u4("m"), order=i4("m", out=True), keys=u8("m", out=True), spare=u8("m", out=True))
@@ -28,13 +28,13 @@ def depth_order(bits):
     corners=i8("num_corners", out=True), counts=i8("tiles", out=True),
 )  # fmt: skip
 def count_boxes(boxes, tile_height, tile_width, corners, counts):
-    """Write the number of boxes over each tile; ``corners``, zero before, has an entry for every corner of a tile."""
+    """Write the number of boxes over each tile; ``corners`` is scratch, zero before, an entry for each tile corner."""
 
 
 def count_tiles(boxes, tile_height, tile_width):
     """Count the boxes over each tile: ``[tile_height * tile_width]`` int64.
 
-    ``boxes [m,4]`` int16: first and (exclusive) last tile column, first and last tile row.
+    ``boxes [m,4]`` int16 are first and (exclusive) last tile column, first and last tile row.
     """
     counts = np.empty(tile_height * tile_width, np.int64)
     count_boxes(boxes, tile_height, tile_width, np.zeros((tile_height + 1) * (tile_width + 1), np.int64), counts)
@@ -52,7 +52,7 @@ def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
         order: ``[m]`` int32 Gaussians in depth order.
         boxes: ``[m,4]`` int16 their boxes, in the same order.
         tile_width: Tiles per row.
-        cursors: ``[tiles]`` int64 where each list goes on, advanced.
+        cursors: ``[tiles]`` int64 ends of the lists in ``flatten_ids``, advanced.
     """
 
 
@@ -61,10 +61,10 @@ def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
     left=f4("tiles", out=True), cursors=i8("tiles", out=True), flatten_ids=i4("intersections", out=True),
 )  # fmt: skip
 def deal_open_tiles(order, boxes, conics, tile_width, first, last, left, cursors, flatten_ids):
-    """Append Gaussians to the lists of a range of tile lines, without Gaussians hidden behind others.
+    """Append Gaussians to the lists of a range of tile lines, but leave out hidden Gaussians.
 
     The lists are those of :func:`deal_tiles`, but each ends with the Gaussian after which every pixel of the tile has
-    stopped, so no pixel misses any.
+    stopped. So the pixels do not change.
 
     Args:
         order: ``[m]`` int32 Gaussians in depth order.
@@ -72,8 +72,8 @@ def deal_open_tiles(order, boxes, conics, tile_width, first, last, left, cursors
         conics: ``[m,CONIC]`` float32 of the Gaussians.
         tile_width: Tiles per row.
         first: First line of tiles.
-        last: The line after the last one.
-        left: ``[tiles]`` float32 light that may still pass each tile, 1 before; lowered.
-        cursors: ``[tiles]`` int64 where each list goes on, advanced.
-        flatten_ids: ``[intersections]`` int32, written; empty: the cursors alone are advanced.
+        last: Last line of tiles, exclusive.
+        left: ``[tiles]`` float32 upper bound of each tile's transmittance, 1 before; lowered.
+        cursors: ``[tiles]`` int64 ends of the lists, advanced.
+        flatten_ids: ``[intersections]`` int32, written; if it is empty, only the cursors are advanced.
     """

@@ -1,17 +1,17 @@
-// Front-to-back blending of one view, tile by tile, and sums over its blending weights.
+// Blend one view front to back, tile by tile, and sum over its blending weights.
 //
-// All kernels walk the same lists with the same weights. Gaussians are gathered 32 at a time into a small local batch,
+// All kernels use the same lists with the same weights. Gaussians are gathered 32 at a time into a small local batch,
 // with the rows of the tile in which they show.
 #include "walk.h"
 
-enum { CHANNELS = 4 };  // channels that one walk of weighted_sums adds up
+enum { CHANNELS = 4 };  // channels that weighted_sums adds up at a time
 
-// Sum and largest of the weights of one Gaussian over rows, by column.
+// Sum and maximum of the weights of one Gaussian over rows, by column.
 typedef struct { v8f sum, peak; } Weights;
 
 static inline v4f max4(v4f a, v4f b) { return (v4f)(((a > b) & (v4i)a) | (~(a > b) & (v4i)b)); }
 
-// Add the sums of both halves of a tile to own[0]; raise own[1] to their peak.
+// Add the sums of both halves of a tile to own[0]; raise own[1] to their maximum.
 static inline void add_total(float *own, const Weights w[2]) {
   v4f peaks[2];
   for (int i = 0; i < 2; i++)
@@ -21,8 +21,8 @@ static inline void add_total(float *own, const Weights w[2]) {
   own[1] = maxf(own[1], maxf(maxf(peak[0], peak[1]), maxf(peak[2], peak[3])));
 }
 
-// Blend Gaussian j of a batch over rows y0 to y1 of eight columns; planes 1 to 3 collect the colour, if there are such ->
-// its weights, if anybody asks.
+// Blend Gaussian j of a batch over rows y0 to y1 of eight columns. Planes 1 to 3, if there are any, collect the colour.
+// Return its weights, if they are used.
 static inline Weights blend_rows(float *columns, const v8f *alphas, const Batch *b, int64_t j, int32_t y0, int32_t y1,
                                  bool colored) {
   Weights weights = {{0}, {0}};
@@ -143,7 +143,7 @@ API int32_t weighted_sums(const float *restrict conics, const int32_t *restrict 
       for (int64_t j = 0; j < stop - start; j++) {
         int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
         float *slot = slots + CHANNELS * (start + j);
-        if (channels == 1)  // the count as a constant, so that each has a loop of its own
+        if (channels == 1)  // the number is a constant in each call, so that each loop unrolls
           sum_weights(state, &batch, j, y0, y1, 1, slot);
         else
           sum_weights(state, &batch, j, y0, y1, CHANNELS, slot);
@@ -170,7 +170,7 @@ API int32_t add_slots(const int32_t *restrict flatten_ids, const float *restrict
   return 0;
 }
 
-// Blend the whole image, black behind it, and gather mass and peak of every Gaussian's weights on the way.
+// Blend the whole image over black, and gather sum and maximum of every Gaussian's weights in the same pass.
 API int32_t survey(const float *restrict conics, const int32_t *restrict flatten_ids,
                    const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
                    float *restrict image, float *restrict totals, int64_t m, int64_t n, int64_t ends, int64_t h,
@@ -224,7 +224,7 @@ API int32_t contributions(const float *restrict conics, const int32_t *restrict 
   return 0;
 }
 
-// The part of one tile in which each Gaussian of a list shows, as the walks take it: first and last row, first column.
+// The part of one tile in which each Gaussian of a list shows, as all kernels use it: first and last row, first column.
 API int32_t parts_of_tile(const float *conics, const int32_t *flatten_ids, int64_t left, int64_t top, int32_t *parts,
                           int64_t m, int64_t n) {
   Lists lists = {conics, flatten_ids, 0, 1, m, n, 0};

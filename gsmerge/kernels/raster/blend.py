@@ -1,8 +1,8 @@
-"""Front-to-back blending of one view, tile by tile, sums over its blending weights, and the backward pass.
+"""Blend one view front to back, tile by tile, sum over its blending weights, and run the backward pass.
 
-All kernels here walk the same lists with the same weights, see ``gsmerge/kernels/raster/walk.h``. Backward, sums over
-a tile go to one row per intersection and are then added up in the order of the lists: nothing is shared between
-threads, and no result depends on them. The formula is in ``gsmerge/kernels/raster/blend_backward.c``.
+All kernels here use the same lists with the same weights, see ``gsmerge/kernels/raster/walk.h``. The backward pass
+writes the sums over a tile to one row per intersection, and then adds the rows up in the order of the lists. Threads
+share nothing, and results do not depend on their number. The formula is in ``gsmerge/kernels/raster/blend_backward.c``.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from gsmerge.kernels.raster.binning import MOST_TILES
 from gsmerge.kernels.raster.project import CONIC, MAX_SIZE, SUMS
 from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 
-CHANNELS = 4  # channels that one walk of weighted_sums adds up
-MAX_ALPHA = 0.99  # largest share of the light that one Gaussian takes (gsplat)
+CHANNELS = 4  # channels that weighted_sums adds up at a time
+MAX_ALPHA = 0.99  # largest alpha of a Gaussian at a pixel (gsplat)
 
-# Arguments of every walk, see the package; the library checks indices on its way.
+# Arguments of every kernel that reads tile lists, see the package; the library checks indices as it reads them.
 LISTS = {
     "conics": f4("m", CONIC),
     "flatten_ids": i4("n"),
@@ -31,7 +31,7 @@ TILES = {"first": i8(), "last": i8()}
 def blend(conics, flatten_ids, isect_offsets, tile_width, colors, first, last, top, background, image, transmittance):
     """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``.
 
-    These arrays hold the view's rows from ``top`` on; tiles that begin outside them are skipped.
+    These arrays have the view's rows from ``top`` on. Tiles that begin outside of them are skipped.
     """
 
 
@@ -71,9 +71,9 @@ def contributions(conics, flatten_ids, isect_offsets, tile_width, height, width,
     STATUS, conics=LISTS["conics"], flatten_ids=LISTS["flatten_ids"], left=i8(), top=i8(), parts=i4("n", 3, out=True),
 )  # fmt: skip
 def parts_of_tile(conics, flatten_ids, left, top, parts):
-    """Write the parts of the tile at a pixel in which Gaussians show, as all kernels use them.
+    """Write the part of the tile at a pixel in which each Gaussian shows, as all kernels use it.
 
-    ``parts``: first and last row, and the first of eight columns that are sufficient; -1 if eight are not.
+    ``parts`` are first and last row, and the first of eight columns that cover the Gaussian, -1 if eight are too few.
     """
 
 
@@ -88,11 +88,11 @@ def blend_backward(
     """Write the gradient sums of a range of tiles, one row per intersection.
 
     Args:
-        image: ``[h,w,3]`` float32, the blended image, background included.
-        transmittance: ``[h,w]`` float32, what is left of it.
+        image: ``[h,w,3]`` float32, the blended image with its background.
+        transmittance: ``[h,w]`` float32 remaining transmittance.
         grad_image: ``[h,w,3]`` float32, gradient with respect to ``image``.
-        grad_left: ``[h,w]`` float32, gradient with respect to ``transmittance``; None for none.
-        slots: ``[intersections,SUMS]`` float32, written in the tiles' part.
+        grad_left: ``[h,w]`` float32, gradient with respect to ``transmittance``; None for zero.
+        slots: ``[intersections,SUMS]`` float32, written at the intersections of these tiles.
     """
 
 

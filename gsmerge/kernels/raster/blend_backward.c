@@ -1,22 +1,23 @@
-// The backward pass of blending: what a loss wants of every Gaussian's conic and colour.
+// The backward pass of blending: gradients with respect to every Gaussian's conic and colour.
 //
-// The tiles are walked front to back again, with the weights of blend.c. With g the gradient of a pixel's colour and h
-// that of its transmittance, a pixel starts with the whole rest = g.C + h T (C its final colour, T its final
-// transmittance); every Gaussian takes its w (g.c) away, so what is left is what lies behind it, and
+// Tiles are processed front to back again, with the weights of blend.c. Let g be the gradient of a pixel's colour C,
+// and h that of its final transmittance T. A pixel starts with rest = g.C + h T. Every Gaussian subtracts its w (g.c),
+// so that the rest is the part behind it. Then
 //
 //     d loss / d ln alpha = w (g.c) - alpha / (1 - alpha) rest
 //
-// needs no list of what was blended and no division of transmittances.
+// needs no list of the blended Gaussians and no division of transmittances.
 #include "walk.h"
 
 enum { SUMS = 9 };
 
-// Sums over rows, by column, of what pixels want of one Gaussian: v are the gradients of ln alpha.
+// Sums over rows, by column, of the gradients of one Gaussian; v are the gradients of ln alpha.
 typedef struct {
   v8f red, green, blue, v, vy, vyy;
 } Wants;
 
-// Take Gaussian j of a batch off the pixels of rows y0 to y1, or of every second, of eight columns -> what they want.
+// Remove Gaussian j of a batch from the pixels of rows y0 to y1, or of every second row, of eight columns; return the
+// gradients.
 static inline Wants walk_rows(float *columns, const v8f *alphas, const Batch *b, int64_t j, int32_t y0, int32_t y1,
                               int32_t step) {
   float my = b->my[j], red = b->red[j], green = b->green[j], blue = b->blue[j];
@@ -39,7 +40,7 @@ static inline Wants walk_rows(float *columns, const v8f *alphas, const Batch *b,
   return w;
 }
 
-// Add all columns; x is the same in all rows of a lane, so its moments wait until here.
+// Sum over all columns; x is the same in all rows of a lane, so moments with x are computed here.
 static inline void add_columns(Wants a, Wants b, v16f dx, float *slot) {
   v16f v = join8(a.v, b.v), vy = join8(a.vy, b.vy), vx = v * dx;
   v16f sums[8] = {join8(a.red, b.red), join8(a.green, b.green), join8(a.blue, b.blue), v, vx, vy, vx * dx, vy * dx};
@@ -47,7 +48,7 @@ static inline void add_columns(Wants a, Wants b, v16f dx, float *slot) {
   slot[8] = total(join8(a.vyy, b.vyy));
 }
 
-// Take Gaussian j of a batch off the pixels of rows y0 to y1 and write what they want of it. Sixteen sums are kept by
+// Remove Gaussian j of a batch from the pixels of rows y0 to y1 and write its gradients. There are sixteen sums by
 // column: of both halves of the tile, or of the even and the odd rows of the eight columns in which it shows.
 static inline void walk_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
   Curve curve;
@@ -59,7 +60,7 @@ static inline void walk_one(float *state, const Batch *b, int64_t j, int32_t y0,
     fill_alphas(alphas, &curve, HALF, y0, y1);
     add_columns(left, walk_rows(state + HALF, alphas, b, j, y0, y1, 1), COLUMNS - b->mx[j], slot);
   } else {
-    int32_t odd = y0 > 0 && (y1 - y0) % 2 == 0, x = b->x0[j];  // whether the rows begin with the second of a pair
+    int32_t odd = y0 > 0 && (y1 - y0) % 2 == 0, x = b->x0[j];  // odd: the rows begin with the second one of a pair
     fill_alphas(alphas, &curve, x, y0, y1);
     Wants first = walk_rows(state + x, alphas, b, j, y0 + odd, y1, 2);
     Wants second = walk_rows(state + x, alphas, b, j, y0 + 1 - odd, y1, 2);
@@ -111,7 +112,7 @@ API int32_t blend_backward(const float *restrict conics, const int32_t *restrict
   return 0;
 }
 
-// Intersections of other ranges' Gaussians are left out without a branch, which would be mispredicted.
+// Intersections of Gaussians in other ranges are left out without a branch, which would be mispredicted.
 API int32_t gather_slots(const int32_t *restrict flatten_ids, const float *restrict slots, int64_t first, int64_t last,
                          float *restrict sums, int64_t n, int64_t m) {
   if (first < 0 || last > m) return OUTSIDE;

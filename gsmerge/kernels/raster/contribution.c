@@ -1,15 +1,16 @@
-// The superpixel of one view that every Gaussian adds most to (paper, supplement on non-pixel-aligned backbones).
+// Find the superpixel of one view to which each Gaussian contributes most (paper, supplement on non-pixel-aligned
+// backbones).
 //
-// Blending weights are summed per pair of Gaussian and superpixel while the tiles are walked. The pairs of one row of
-// tiles are kept, chained by Gaussian; at its end every Gaussian that does not reach into the next row is decided, and
-// the rest is carried over. So memory goes with a row of tiles, not with the view.
+// Blending weights are summed for each pair of Gaussian and superpixel, one row of tiles after another. The pairs of a
+// row are chained by Gaussian. At the end of the row, Gaussians that do not reach into the next row are finished, and
+// the sums of the others are carried over. So memory grows with a row of tiles, not with the view.
 #include "walk.h"
 
-enum { LABEL, SUM, NEXT, PAIR };  // columns of a pair, the last the next pair of the same Gaussian, -1 for none
+enum { LABEL, SUM, NEXT, PAIR };  // columns of a pair; NEXT is the next pair of the same Gaussian, -1 for none
 enum { LAST_ROW = 7 };            // column of a conic
-enum { NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS };  // what the kernels count, and the tile that comes next
+enum { NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS };  // numbers of pairs and active Gaussians, and the next tile
 
-// Write a pair and put it in front of its Gaussian's chain.
+// Write a pair and insert it at the front of its Gaussian's chain.
 static inline void chain(double *pairs, int64_t at, int32_t *heads, int64_t k, int64_t label, double value) {
   double *pair = pairs + PAIR * at;
   pair[LABEL] = (double)label;
@@ -18,10 +19,11 @@ static inline void chain(double *pairs, int64_t at, int32_t *heads, int64_t k, i
   heads[k] = (int32_t)at;
 }
 
-// A column of a pair as an index below n; -1 where it is none.
+// A column of a pair as an index below n; -1 for an invalid index.
 static inline int64_t index_of(double value, int64_t n) { return value >= 0.0 && value < (double)n ? (int64_t)value : -1; }
 
-// Number the superpixels of a tile from 0: lanes gets each pixel's number, names each number's label -> how many.
+// Number the superpixels of a tile from 0: lanes gets the number of each pixel, and names the label of each number.
+// Return how many there are.
 static int32_t number_labels(const int32_t *labels, const Tile *t, int64_t w, int32_t *stamps, int32_t *lanes,
                           int32_t *names) {
   int32_t count = 0;
@@ -38,7 +40,7 @@ static int32_t number_labels(const int32_t *labels, const Tile *t, int64_t w, in
   return count;
 }
 
-// Sum one Gaussian's weights by the tile's superpixels -> how many of them are touched.
+// Sum one Gaussian's weights in each superpixel of the tile; return the number of superpixels it touches.
 static inline int32_t sum_tile(const float *weights, const Batch *b, int64_t j, int32_t y0, int32_t y1, int32_t num_x,
                                const int32_t *lanes, float *sums, int32_t *touched) {
   int32_t x0, x1, count = 0;
@@ -54,8 +56,8 @@ static inline int32_t sum_tile(const float *weights, const Batch *b, int64_t j, 
   return count;
 }
 
-// Append the pairs of a row of tiles from counts[NEXT_TILE] on. A tile whose pairs may not fit is left for a call with
-// more room.
+// Append the pairs of a row of tiles from counts[NEXT_TILE] on. Stop at a tile whose pairs may not fit; the caller
+// continues with more room.
 API int32_t add_row(const float *restrict conics, const int32_t *restrict flatten_ids,
                     const int64_t *restrict isect_offsets, int64_t tile_width, int64_t line,
                     const int32_t *restrict labels, int32_t *restrict heads, double *restrict pairs,
@@ -100,7 +102,7 @@ API int32_t add_row(const float *restrict conics, const int32_t *restrict flatte
   return 0;
 }
 
-// Add up the pairs of every Gaussian; decide on those that end above bottom, carry over the others' sums.
+// Add up the pairs of every Gaussian; finish Gaussians that end above bottom, and carry over the sums of the others.
 API int32_t settle_row(int64_t bottom, const float *restrict conics, int32_t *restrict heads,
                        const double *restrict pairs, double *restrict carried, int32_t *restrict active,
                        double *restrict totals, int32_t *restrict seen, float *restrict out_values,
@@ -113,9 +115,9 @@ API int32_t settle_row(int64_t bottom, const float *restrict conics, int32_t *re
     if (k < 0 || k >= m) return OUTSIDE;
     for (int64_t pair = heads[k]; pair >= 0; pair = index_of(pairs[PAIR * pair + NEXT], num_pairs)) {
       int64_t label = pair < num_pairs ? index_of(pairs[PAIR * pair + LABEL], num_labels) : -1;
-      if (label < 0 || unread-- <= 0) return OUTSIDE;  // a pair belongs to one chain: one that is met again is a ring
+      if (label < 0 || unread-- <= 0) return OUTSIDE;  // more links than pairs: the chain is a ring
       if (totals[label] == 0.0) {
-        if (count == num_labels) return OUTSIDE;  // sums of 0 or below
+        if (count == num_labels) return OUTSIDE;  // only for sums of 0 or below
         seen[count++] = (int32_t)label;
       }
       totals[label] += pairs[PAIR * pair + SUM];

@@ -1,8 +1,10 @@
-"""The superpixel of one view that every Gaussian adds most to (paper, supplement on non-pixel-aligned backbones).
+"""Find the superpixel of a view to which each Gaussian contributes most.
 
-Blending weights are summed per pair of Gaussian and superpixel while the tiles are walked. The pairs of one row of
-tiles are kept, chained by Gaussian; at its end every Gaussian that does not reach into the next row is decided, and
-the rest is carried over. So memory goes with a row of tiles, not with the view.
+This is the rule of the paper's supplement on non-pixel-aligned backbones.
+
+Blending weights are summed for each pair of Gaussian and superpixel, one row of tiles after another. The pairs of a row
+are chained by Gaussian. At the end of the row, Gaussians that do not reach into the next row are finished, and the sums
+of the others are carried over. So memory grows with a row of tiles, not with the view.
 """
 
 from __future__ import annotations
@@ -14,9 +16,9 @@ from gsmerge.kernels.raster.blend import LISTS
 from gsmerge.kernels.raster.project import CONIC, TILE
 from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
 
-FIRST_PAIRS = 1 << 16  # room for pairs of Gaussian and superpixel to begin with
-PAIR = 3  # numbers of a pair: label, sum, the next pair of the same Gaussian or -1
-NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS = 0, 1, 2, 3  # what the kernels count, and the tile that comes next
+FIRST_PAIRS = 1 << 16  # initial room for pairs of Gaussian and superpixel
+PAIR = 3  # numbers of a pair: label, sum, and the next pair of the same Gaussian or -1
+NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS = 0, 1, 2, 3  # numbers of pairs and active Gaussians, and the next tile
 
 
 @native(
@@ -25,7 +27,7 @@ NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS = 0, 1, 2, 3  # what the kernels count,
     stamps=i4("num_labels", most=-1, out=True), counts=i8(COUNTS, out=True),
 )  # fmt: skip
 def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads, pairs, active, stamps, counts):
-    """Append the pairs of a row of tiles, from tile ``counts[NEXT_TILE]`` to the last tile that the buffers hold."""
+    """Append the pairs of a row of tiles, from tile ``counts[NEXT_TILE]`` to the last tile that fits in the buffers."""
 
 
 @native(
@@ -35,13 +37,14 @@ def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads,
     counts=i8(COUNTS, out=True),
 )  # fmt: skip
 def settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, out_values, out_labels, counts):
-    """Sum the pairs of every Gaussian: finish Gaussians that end above ``bottom``, and carry over other sums."""
+    """Sum the pairs of every Gaussian; finish Gaussians that end above ``bottom``, and carry over all other sums."""
 
 
 def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, count):
     """Return each Gaussian's largest sum of weights in one superpixel, and the label of that superpixel.
 
-    They are ``[m]`` float32 and ``[m]`` int32. Of equal sums the smallest label counts; 0 and -1 for unseen Gaussians.
+    They are ``[m]`` float32 and ``[m]`` int32. Of equal sums the one with the smallest label is returned. Unseen
+    Gaussians have 0 and -1.
 
     Args:
         labels: ``[h,w]`` int32, below ``count``.

@@ -1,30 +1,30 @@
-// The gradient of the fit's image loss: L1, structural similarity by sums over windows, and L1 of the
-// differences between neighbouring pixels.
+// Compute the gradient of the fit's image loss: L1, structural similarity by sums over windows, and L1
+// of the differences between neighbouring pixels.
 //
-// Rows go in groups of four, at multiples of four wherever a range begins: sums over seven rows
-// share what they have in common, and are always added up in the same order. A group is summed
-// down its columns, then along its rows, a chunk at a time, so that the sums stay in the first
+// Rows are processed in groups of four, which begin at multiples of four, wherever a range begins.
+// Sums over seven rows share their common terms and are always added up in the same order. A group is
+// summed down its columns, then along its rows, a chunk at a time, so that the sums stay in the first
 // cache.
 #include "native.h"
 
-enum { RADIUS = 3, PAD = 3 * RADIUS, GROUP = 4, TALL = GROUP + 2 * RADIUS };  // of three channels
+enum { RADIUS = 3, PAD = 3 * RADIUS, GROUP = 4, TALL = GROUP + 2 * RADIUS };  // PAD has three channels
 enum {
   CHUNK = 96,
   LINE = CHUNK + 2 * PAD
-};  // values of whole pixels and whole vectors; with sides
+};  // numbers of values that are whole pixels and whole vectors; with padding
 // Sums of x, y, x^2 + y^2, xy; derivatives by the means of x, x^2, xy.
 enum { MEANS = 4, TERMS = 3 };
 static const float C1 = 1e-4f, C2 = 9e-4f;  // SSIM's constants for a data range of 1
 static const float SHARE = 1.f / 49.f;
 
-// What the loops over groups share.
+// Values that the loops over groups share.
 typedef struct {
   const float *image, *photo, *weight;
   int64_t height, width;  // values per row, three for each pixel
   float plain, similar;
 } Loss;
 
-// Sums of the seven rows about each of four, of a value in ten rows. a3 to a6 are in all four.
+// Sums over the seven rows around each of four rows, of a value in ten rows; a3 to a6 are in all four sums.
 static inline void sum_seven(const float a[TALL], float sums[GROUP]) {
   float middle = (a[3] + a[4]) + (a[5] + a[6]), above = a[1] + a[2], below = a[7] + a[8];
   sums[0] = middle + (above + a[0]);
@@ -33,12 +33,12 @@ static inline void sum_seven(const float a[TALL], float sums[GROUP]) {
   sums[3] = middle + (below + a[9]);
 }
 
-// The same along a row of three channels.
+// The sum of seven values along a row of three channels.
 static inline float sum_along(const float *p) {
   return ((p[0] + p[3]) + (p[6] + p[9])) + ((p[12] + p[15]) + p[18]);
 }
 
-// Columns of ten rows of an image about a group, zero outside it.
+// Copy columns of the ten rows around a group; values outside the image are zero.
 static inline void copy_rows(Loss l, const float *image, int64_t row, int64_t column, int64_t count,
                              float rows[TALL][CHUNK]) {
   for (int k = 0; k < TALL; k++) {
@@ -49,7 +49,7 @@ static inline void copy_rows(Loss l, const float *image, int64_t row, int64_t co
   }
 }
 
-// Column sums of means, from ten rows of image and photo, at the end of the lines.
+// Column sums of the means, from ten rows of image and photo, appended to the lines.
 static inline void sum_means(const float *restrict x, const float *restrict y, int64_t stride,
                              float (*restrict sums)[MEANS][LINE], int64_t count) {
   for (int64_t i = 0; i < count; i++) {
@@ -83,14 +83,14 @@ static inline void append_means(Loss l, int64_t row, int64_t column, float (*sum
   }
 }
 
-// Move the last columns of a chunk to the front of the lines, where the next one needs them.
+// Move the last columns of a chunk to the front of the lines, where the next chunk needs them.
 static inline void slide(float *lines, int count) {
   for (int line = 0; line < count; line++)
     for (int i = 0; i < 2 * PAD; i++) lines[line * LINE + i] = lines[line * LINE + CHUNK + i];
 }
 
-// Weights of a row's pixels from a column on, for each channel; zero past the end. The count of
-// values is one of whole pixels.
+// Weights of a row's pixels from a column on, for each channel; zero past the end. `count` is a number
+// of values of whole pixels.
 static inline void repeat_weights(Loss l, int64_t row, int64_t column, float *wide, int64_t count) {
   const float *weight = l.weight + row * (l.width / 3) + column / 3;
   int64_t left = mini(count, l.width - column) / 3;
@@ -208,8 +208,8 @@ static void fill_gradient(Loss l, int64_t row, int64_t first, int64_t last,
     errors[y] = total(squares[y - row]);
 }
 
-// Differences of a row and the weights of its values, both with a pixel of weight zero after the
-// last; so are rows outside the image.
+// Differences of a row and the weights of its values, both followed by a pixel of weight zero. Rows
+// outside the image have weight zero, too.
 static void fill_row(Loss l, int64_t row, float *restrict off, float *restrict wide) {
   if (row < 0 || row >= l.height) {
     for (int64_t j = 0; j < l.width + 3; j++) off[j] = wide[j] = 0.f;
@@ -221,8 +221,8 @@ static void fill_row(Loss l, int64_t row, float *restrict off, float *restrict w
   repeat_weights(l, row, 0, wide, l.width + 3);
 }
 
-// What pairs of values add to the gradient of the first ones, and take from that of the second: the
-// sign of their difference, times the lesser weight.
+// Gradient of pairs of values, which is added to the first value and subtracted from the second: the
+// sign of their difference, times the smaller weight.
 static inline void pull(const float *off, const float *wide, const float *off2, const float *wide2,
                         float *restrict to, int64_t count) {
   for (int64_t i = 0; i < count; i++) {
@@ -231,7 +231,7 @@ static inline void pull(const float *off, const float *wide, const float *off2, 
   }
 }
 
-// What the next row needs of the last one: differences and weights, and pulls across.
+// Values of the last row that the next row needs: differences, weights and gradients of vertical pairs.
 typedef struct {
   float *here, *below, *along, *before, *after;  // rows of a given room, the first two pairs of them
   int64_t room;
@@ -247,7 +247,7 @@ static Edges start_edges(Loss l, float each, int64_t first, float *rows, int64_t
   return e;
 }
 
-// Add the gradient of the L1 of differences to a row, and go on to the next.
+// Add the gradient of the L1 of differences to a row, and advance to the next row.
 static void add_edges(Loss l, Edges *e, int64_t row, float *restrict gradient) {
   float *here = e->here, *below = e->below, *restrict along = e->along;
   float *restrict before = e->before, *restrict after = e->after, *restrict to = gradient + row * l.width;

@@ -1,10 +1,10 @@
-// The blending weights of one view, written out: one (pixel, weight) entry after the other.
+// Write the blending weights of one view as a list of (pixel, weight) entries.
 #include "walk.h"
 
 enum { CHANNELS = 4 };  // of an image row
 
-// Write the weights of tiles from progress[0] on behind the progress[1] entries that are there, and advance both. A tile
-// whose entries may not fit is not begun in earnest: it is left for a call with more room.
+// Append the weights of tiles from progress[0] on after the first progress[1] entries, and advance both numbers. Stop
+// at a tile whose entries may not fit; the caller continues with more room.
 API int32_t list_weights(const float *restrict conics, const int32_t *restrict flatten_ids,
                          const int64_t *restrict isect_offsets, int64_t tile_width, int64_t height, int64_t width,
                          int64_t *restrict starts, uint8_t *restrict lanes, float *restrict weights,
@@ -31,7 +31,7 @@ API int32_t list_weights(const float *restrict conics, const int32_t *restrict f
             float w = state[PLANE + y * TILE + x];
             lanes[count] = (uint8_t)(y * TILE + x);
             weights[count] = w;
-            count += w > 0.f;  // no branch: half of them would be mispredicted
+            count += w > 0.f;  // without a branch, which would be mispredicted half of the time
           }
         starts[start + j + 1] = count;
       }

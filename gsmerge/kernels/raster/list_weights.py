@@ -1,4 +1,4 @@
-"""The blending weights of one view, written out: one (pixel, weight) entry after the other."""
+"""Write the blending weights of one view as a list of (pixel, weight) entries, and multiply with them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from gsmerge.kernels.raster import blend
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native, u1
 
 LANES = 4  # channels of an image row
-FIRST_ENTRIES = 40  # entries for each pixel that there is room for to begin with
-BATCH_ENTRIES = 32 * 256  # most that a batch of Gaussians can have in a tile
+FIRST_ENTRIES = 40  # initial room for entries, per pixel
+BATCH_ENTRIES = 32 * 256  # most entries of a batch of Gaussians in a tile
 
 ENTRIES = {
     "starts": i8("more", least=0, most="entries", ascending=True),
@@ -21,7 +21,7 @@ ENTRIES = {
 }
 
 
-# Writes entries of tiles from progress[0] on behind progress[1] entries, as far as there is room.
+# Appends entries of tiles from progress[0] on after the first progress[1] entries, as far as they fit.
 _list_weights = declare(
     "list_weights", STATUS, **blend.LISTS, height=i8(least=1), width=i8(least=1), starts=i8("more", out=True),
     lanes=u1("room", out=True), weights=f4("room", out=True), progress=i8(2, least=0, out=True),

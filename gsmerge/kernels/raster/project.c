@@ -1,15 +1,15 @@
-// Projection of Gaussians into one view: culling, EWA conics, tile boxes.
+// Project Gaussians into one view: culling, EWA conics, tile boxes.
 #include "exp_log.h"
 #include "projection.h"
 
-enum { MOST_TILES = 1 << 15 };  // corners per side: columns and rows of tiles are kept in 16 bits
-enum { BLOCK = 64 };  // Gaussians; they are gathered into planes, the loops over which vectorise
+enum { MOST_TILES = 1 << 15 };  // corners per side, since columns and rows of tiles have 16 bits
+enum { BLOCK = 64 };  // Gaussians that are gathered into planes, so that loops over them vectorise
 
 static inline int32_t tile(float pixel) {
   return whole(pixel, 0.f, (MOST_TILES - 1) * (float)TILE) / TILE;
 }
 
-// Planes of a block: the pixels where a sphere may be seen, and whether it is seen at all.
+// Planes of a block: the pixels in which a sphere may be seen, and a flag that it may be seen at all.
 enum { X0, X1, Y0, Y1, SIDES };
 typedef struct {
   float side[SIDES][BLOCK];
@@ -35,8 +35,8 @@ static inline void bound(Bounds *b, int64_t j, Camera c, vec3 p, vec3 scale, flo
   b->seen[j] = seen;
 }
 
-// Replace seen by whether the tiles of the bounds contain some of those that are counted above and
-// left of each corner.
+// Clear `seen` unless the tiles of the bounds contain a wanted tile; `wanted` counts the wanted tiles
+// above and to the left of each corner.
 static inline void look_up(Bounds *b, const int32_t *wanted, int32_t lines, int32_t columns) {
   int32_t corners[SIDES][BLOCK];
   for (int j = 0; j < BLOCK; j++) {
@@ -88,8 +88,8 @@ typedef struct {
   int32_t box[4][BLOCK];
 } Block;
 
-// ln w(x, y) = lnop - (rate_x (x - mean_x - slope (y - mean_y)))^2 - rate_y (y - mean_y)^2 is what
-// a conic stands for: never above 0, however thin the Gaussian.
+// A conic means ln w(x, y) = lnop - (rate_x (x - mean_x - slope (y - mean_y)))^2
+// - rate_y (y - mean_y)^2, which is never above 0, however thin the Gaussian.
 static inline void project_one(Block *b, int64_t j, Camera c) {
   Ray ray = see(c, (vec3){b->mean[0][j], b->mean[1][j], b->mean[2][j]});
   float w = b->quat[0][j], x = b->quat[1][j], y = b->quat[2][j], z = b->quat[3][j];
@@ -100,7 +100,7 @@ static inline void project_one(Block *b, int64_t j, Camera c) {
   vec3 u = product(transposed(m.m0, m.m1, m.m2, ray.a), s);
   vec3 v = product(transposed(m.m0, m.m1, m.m2, ray.b), s);
   float uu = dot(u, u), vv = dot(v, v), uv = dot(u, v);
-  // |u x v|^2 = |u|^2 |v|^2 - (u.v)^2 without its cancellation: positive for thin ones, too
+  // |u x v|^2 = |u|^2 |v|^2 - (u.v)^2, but without cancellation, so it is positive for thin Gaussians, too
   vec3 normal = cross(u, v);
   float det0 = dot(normal, normal);
   float det = maxf(det0 + c.eps2d * (uu + vv + c.eps2d), 1e-20f);

@@ -1,14 +1,15 @@
-"""Projection of Gaussians into one view, and its backward pass: culling, EWA conics, tile boxes.
+"""Project Gaussians into one view, and run the backward pass: culling, EWA conics, tile boxes.
 
-The conventions are those of gsplat: 0.3 px dilation, conics from the first-order (EWA) projection with the
-direction clamped 15 % outside the image, no contribution below 1/255. A conic is stored with its square
-completed, so that the exponent of a pixel is never positive, however thin the Gaussian::
+The conventions are those of gsplat: the dilation is 0.3 square pixels, conics follow from the first-order (EWA)
+projection with directions clamped 15 % outside the image, and contributions below 1/255 are left out. A conic is stored
+with its square completed, so that the exponent of a pixel is never positive, however thin the Gaussian::
 
     ln w(x, y) = lnop - (rate_x (x - mean_x - slope (y - mean_y)))^2 - rate_y (y - mean_y)^2
 
-The backward pass leads from sums over an image to means, rotations, scales and opacities (EWA: Zwicker et al. 2001; the
-derivatives as in Ye et al., "Mathematical supplement for the gsplat library", 2023): conic, half axes, rotation and
-scale, and the mean through its image position and through the projection's derivative.
+The backward pass computes gradients of means, rotations, scales and opacities from sums over an image. It follows Ye et
+al., "Mathematical supplement for the gsplat library", 2023 (EWA: Zwicker et al. 2001). Gradients pass through the conic
+to half axes, rotation and scale. They reach the mean through its image position and through the derivative of the
+projection.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ from __future__ import annotations
 from gsmerge.kernels.signature import STATUS, f4, i2, i4, i8, native, u1
 
 TILE = 16  # pixels per side; one row of a tile is one AVX-512 vector
-MAX_SIZE = 32767 * TILE  # pixels per side of a view: tile columns and rows are kept in 16 bits
+MAX_SIZE = 32767 * TILE  # most pixels per side of a view, since tile columns and rows have 16 bits
 CONIC = 8  # numbers per conic: mean_x, mean_y, rate_x, slope, rate_y, lnop, first row, last row
-SUMS = 9  # per Gaussian: those of w g (3), of v = d loss / d exponent, and of v times x, y, xx, xy, yy from the mean
+SUMS = 9  # sums per Gaussian: w g (3), v = d loss / d exponent, and v times x, y, xx, xy, yy relative to the mean
 
 # Positions in the camera's array of numbers.
 ROTATION, SHIFT, FX, FY, CX, CY, WIDTH, HEIGHT, NEAR, FAR, EPS2D = 0, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20
 LIMIT_X, LIMIT_Y, ANTIALIASED = 21, 23, 25
 CAMERA = 26
-BLOCK = 128  # Gaussians whose gradients of the pose are summed
+BLOCK = 128  # Gaussians whose gradients of the pose are summed in one row
 POSE = 12  # numbers of a world-to-camera matrix: rotation (9, row by row), shift (3)
 
 
@@ -33,14 +34,14 @@ POSE = 12  # numbers of a world-to-camera matrix: rotation (9, row by row), shif
     wanted=i4("lines", "columns", optional=True), camera=f4(CAMERA), start=i4(), ids=i4("n", out=True),
 )  # fmt: skip
 def cull(means, scales, opacities, keep, wanted, camera, start, ids):
-    """List the Gaussians that may touch the image -> their number.
+    """List the Gaussians that may touch a wanted tile; return their number.
 
     Args:
-        keep: ``[n]`` uint8, 0 drops a Gaussian; None keeps all.
-        wanted: ``[tile_height + 1, tile_width + 1]`` int32: the number of tiles above and left of each corner that a
-            Gaussian has to touch one of; None wants all.
-        start: What the first Gaussian is called.
-        ids: ``[n]`` int32, the first ones are written: ascending.
+        keep: ``[n]`` uint8; 0 drops a Gaussian. None keeps all.
+        wanted: ``[tile_height + 1, tile_width + 1]`` int32 number of wanted tiles above and to the left of each corner;
+            None: all tiles are wanted.
+        start: Id of the first Gaussian.
+        ids: ``[n]`` int32; the ids of the listed Gaussians are written first, ascending.
     """
 
 
@@ -52,11 +53,11 @@ def project(means, quats, scales, opacities, ids, camera, conics, depths, boxes)
     """Project the listed Gaussians.
 
     Args:
-        quats: ``[n,4]`` wxyz; normalised here.
-        opacities: ``[n]``; above 1 they count as 1.
+        quats: ``[n,4]`` wxyz of any length.
+        opacities: ``[n]``; opacities above 1 count as 1.
         depths: ``[m]`` float32, written: camera z.
-        boxes: ``[m,4]`` int16, written: first and (exclusive) last tile column, first and last tile row; all 0
-            where nothing is drawn.
+        boxes: ``[m,4]`` int16, written: first and (exclusive) last tile column, first and last tile row; all 0 for
+            Gaussians that are not drawn.
     """
 
 
@@ -77,7 +78,7 @@ def project_backward(
         first: Start of the range, a multiple of BLOCK.
         last: End of the range, exclusive.
         grad_poses: ``[blocks,POSE]`` float32, written: gradient of the world-to-camera matrix, summed over blocks of
-            BLOCK Gaussians; None for none.
+            BLOCK Gaussians; None: not computed.
     """
 
 

@@ -1,10 +1,10 @@
-// The backward pass of projection: from sums over an image to means, rotations, scales, opacities.
+// The backward pass of projection: gradients of means, rotations, scales and opacities from sums over an image.
 #include "projection.h"
 
 enum { BLOCK = 128, POSE = 12, SUMS = 9 };
 
-// Planes of a block. In: mean, quaternion, scales, six of the sums over the image (their first is
-// the weight's, then x, y, xx, xy, yy), opacity. Out: gradients of these and of the camera's pose.
+// Planes of a block. Input: mean, quaternion, scales, opacity, and six of the sums over the image
+// (1, x, y, xx, xy, yy). Output: gradients of these parameters and of the camera's pose.
 typedef struct {
   float mean[3][BLOCK], quat[4][BLOCK], scale[3][BLOCK], sum[6][BLOCK], opacity[BLOCK];
   float grad_mean[3][BLOCK], grad_quat[4][BLOCK], grad_scale[3][BLOCK], grad_opacity[BLOCK];
@@ -25,9 +25,10 @@ typedef struct {
   float a, b, c, gxx, gxy, gyy;
 } Conic;
 
-// Conic A, B, C (the exponent is -1/2 (A xx + 2 B xy + C yy)), and the gradient of the covariance:
-// with the conic Q and half the second moments M it is Q M Q. What the dilation takes of the
-// density, with an antialiased s = thinning, adds s (inv(S) - Q), S the covariance before it.
+// Conic A, B, C (the exponent is -1/2 (A xx + 2 B xy + C yy)), and the gradient of the covariance.
+// With the conic Q and half the second moments M, the gradient is Q M Q. In antialiased mode the
+// dilation lowers the opacity, which adds s (inv(S) - Q), with s = thinning and the covariance S
+// before the dilation.
 static inline Conic conic_backward(vec3 u, vec3 v, float eps2d, float sxx, float sxy, float syy,
                                    float thinning) {
   float uu = dot(u, u), vv = dot(v, v), uv = dot(u, v);
@@ -47,8 +48,8 @@ static inline Conic conic_backward(vec3 u, vec3 v, float eps2d, float sxx, float
                  e10 * b + e11 * c + s * (uu * scale0 - c)};
 }
 
-// Gradient of a quaternion q, over h, from the gradients gc of a M and gd of b M, M its matrix:
-// only what is across it.
+// Gradient of a quaternion q, divided by h, from the gradients gc of a M and gd of b M, with its
+// matrix M; only the part perpendicular to q.
 static inline void rotation_backward(Block *block, int64_t j, float w, float x, float y, float z,
                                      float h, Ray ray, vec3 gc, vec3 gd) {
   vec3 g0 = mix(ray.a.x, gc, ray.b.x, gd);
@@ -67,7 +68,7 @@ static inline void rotation_backward(Block *block, int64_t j, float w, float x, 
   block->grad_quat[3][j] = h * (gz - along * z);
 }
 
-// Through J W, by the gradients ga, gb of its rows, and through the image position.
+// Gradient of the mean through J W, from the gradients ga, gb of its rows, and through the image position.
 static inline void position_backward(Block *block, int64_t j, Camera c, Ray ray, vec3 p, vec3 ga,
                                      vec3 gb, Conic conic) {
   float sx = block->sum[1][j], sy = block->sum[2][j];
@@ -115,7 +116,7 @@ static inline void backward_one(Block *block, int64_t j, Camera c) {
   block->grad_opacity[j] = opacity <= 1.f ? weight / opacity : 0.f;
 }
 
-// Planes past the size repeat the last Gaussian.
+// Gather the inputs of a block; entries past the size repeat the last Gaussian.
 static inline void gather(Block *b, const float *means, const float *quats, const float *scales,
                           const float *opacities, const int32_t *ids, const float *sums,
                           int64_t size) {

@@ -1,12 +1,12 @@
-// What projection and its backward pass share.
+// Shared by projection and its backward pass.
 #pragma once
 #include "native.h"
 
 enum { CONIC = 8, TILE = 16 };
 static const float LN_CUT = -5.541263545158426f;  // ln(1/255): smaller weights are not drawn
 static const float MIN_OPACITY = 1.f / 255.f;
-static const float MAX_SIGMA = 1e6f;  // pixels; wider conics are flat, their squares still fit
-static const float LEAST_SHARE = 0.005f * 0.005f;  // of the density that dilation may leave
+static const float MAX_SIGMA = 1e6f;  // pixels; wider conics are flat, and squares of this number do not overflow
+static const float LEAST_SHARE = 0.005f * 0.005f;  // least share of the density after dilation
 
 typedef struct {
   float x, y, z;
@@ -16,7 +16,7 @@ typedef struct {
 typedef struct {
   vec3 r0, r1, r2, t;  // rows of the rotation from world to camera, shift
   float fx, fy, cx, cy, width, height, near, far, eps2d;
-  float right, left, below, above;  // limits of x / z and y / z, beyond which EWA breaks down
+  float right, left, below, above;  // limits of x / z and y / z, beyond which EWA is too inexact
   float antialiased;
 } Camera;
 _Static_assert(sizeof(Camera) == 26 * sizeof(float), "as many as in project.py");
@@ -51,7 +51,7 @@ static inline vec3 cut_scales(vec3 s, float wide) {
   return (vec3){minf(s.x, wide), minf(s.y, wide), minf(s.z, wide)};
 }
 
-// The camera's view of a mean, and the projection's derivative J W.
+// A mean in the camera, and the derivative J W of the projection there.
 typedef struct {
   vec3 at;  // in the camera's axes
   float iz, ux, uy;  // 1 / z, x / z, y / z
@@ -81,7 +81,7 @@ typedef struct {
   vec3 m0, m1, m2;
 } Rows;
 
-// Rows of the rotation matrix of a quaternion, h = 2 / |q|^2, or 0 for no rotation.
+// Rows of the rotation matrix of a quaternion, with h = 2 / |q|^2, or h = 0 for no rotation.
 static inline Rows rotation(float w, float x, float y, float z, float h) {
   return (Rows){
       {1.f - h * (y * y + z * z), h * (x * y - w * z), h * (x * z + w * y)},

@@ -1,30 +1,31 @@
-// Colours of Gaussians seen from a point, and their gradients: real spherical harmonics of degrees
-// 0 to 4.
+// Evaluate the colours of Gaussians as seen from a point, and their gradients: real spherical
+// harmonics of degrees 0 to 4.
 //
-// A Gaussian's coefficients lie in memory as red, green, blue of the first harmonic, of the second
-// and so on. Fifteen at a time are five harmonics, whose values are repeated for the three colours.
+// A Gaussian's coefficients are stored as red, green and blue of the first harmonic, then of the
+// second, and so on. Fifteen coefficients at a time belong to five harmonics, whose values are
+// repeated for the three colours.
 #include "native.h"
 
 enum { BLOCK = 32, BASES = 24, FIVE = 5, WIDE = 15, ROW = 40 };
 static const float CONSTANT = 0.28209479177387814f;  // the harmonic of degree 0
-static const float LINEAR = 0.4886025119029199f;  // those of degree 1 over their coordinate
+static const float LINEAR = 0.4886025119029199f;  // harmonics of degree 1 divided by their coordinate
 static const v16i LANE = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
-// A block of Gaussians, seen from the eye. Rows hold a Gaussian's harmonics, planes a harmonic of
-// all; the constant one is in neither.
+// A block of Gaussians, seen from the eye. A row has all harmonics of one Gaussian, a plane has one
+// harmonic of all Gaussians; the constant harmonic is in neither.
 typedef struct {
   float x[BLOCK], y[BLOCK], z[BLOCK], inverse[BLOCK];  // direction, 1 / distance
   float planes[BASES][BLOCK], rows[BLOCK][ROW];
 } Block;
 
-// Degree of that many harmonics.
+// Degree for a number of harmonics.
 static inline int degree_of(int64_t num) {
   int degree = 0;
   while ((degree + 1) * (degree + 1) < num + 1) degree++;
   return degree;
 }
 
-// Directions of listed Gaussians; those past the size repeat the last.
+// Directions of the listed Gaussians; entries past the size repeat the last Gaussian.
 static inline void look(Block *b, const float *means, const int32_t *ids, int64_t size,
                         const float *eye) {
   for (int j = 0; j < BLOCK; j++) {
@@ -81,7 +82,7 @@ static inline void basis_4(Block *b, int j) {
   b->planes[23][j] = 0.6258357354491761f * (xx * (xx - 3.f * yy) - yy * (3.f * xx - yy));
 }
 
-// Rows of the first harmonics of a block from its planes. The loops over a known number unroll.
+// Rows of the first `count` harmonics of a block from its planes; loops over a constant number unroll.
 static inline __attribute__((always_inline)) void turn(Block *b, int count) {
   for (int j = 0; j < BLOCK; j++)
     for (int k = 0; k < count; k++) b->rows[j][k] = b->planes[k][j];
@@ -98,13 +99,13 @@ static inline void fill_rows(Block *b, int degree) {
   turn(b, BASES);
 }
 
-// Values of five harmonics from a place in a row, each three times.
+// Values of five harmonics from a place in a row on, each repeated three times.
 static inline v16f repeat(const float *row) {
   v16f v = load(row);
   return PICK(v, v, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 4);
 }
 
-// The same as load, but zero from `left` on, which lies in other rows or outside the array.
+// As load, but lanes from `left` on, which belong to other rows or lie outside the array, are zero.
 static inline v16f load_part(const float *p, const float *end, int64_t left) {
   if (end - p >= LANES) return sel(LANE < (int32_t)left, load(p), splat(0.f));
   v16f v = splat(0.f);
@@ -119,7 +120,7 @@ static inline v16f sum_colors(v16f v) {
   return four + PICK(v, v, 12, 13, 14, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
 }
 
-// Colours of at most three harmonics: too few for blocks.
+// Colours of at most three harmonics, which are too few for blocks.
 static inline __attribute__((always_inline)) void
 few_colors(const float *restrict means, const float *restrict sh0, const float *restrict shN,
            const int32_t *restrict ids, const float *restrict eye, int64_t first, int64_t last,
@@ -224,7 +225,7 @@ static inline Slope slope_4(const Block *b, int j) {
   return g;
 }
 
-// Gradients of the means from the weights of the harmonics, which are in the planes; in x, y, z.
+// Gradients of the means from the weights of the harmonics in the planes; written to x, y, z.
 static inline void means_backward(Block *b, int j, int degree) {
   Slope g = slope_to_2(b, j, degree);
   if (degree > 2) {
@@ -235,21 +236,21 @@ static inline void means_backward(Block *b, int j, int degree) {
     Slope more = slope_4(b, j);
     g = (Slope){g.x + more.x, g.y + more.y, g.z + more.z};
   }
-  // only what is across the direction moves it, the less the further away
+  // only the part perpendicular to the direction counts, divided by the distance
   float x = b->x[j], y = b->y[j], z = b->z[j], along = x * g.x + y * g.y + z * g.z;
   b->x[j] = (g.x - along * x) * b->inverse[j];
   b->y[j] = (g.y - along * y) * b->inverse[j];
   b->z[j] = (g.z - along * z) * b->inverse[j];
 }
 
-// Gradients of a Gaussian's coefficients; its row becomes the weights of the harmonics, the
+// Gradients of a Gaussian's coefficients. Its row is replaced by the weights of the harmonics: the
 // coefficients times the gradient of the colour.
 static inline void coefficients_backward(float *row, const float *shN, const float *end, v16f color,
                                          float *grad, const float *grad_end, int64_t num) {
   for (int64_t k = 0; k < num; k += FIVE) {
     int64_t left = 3 * (num - k);
     v16f slope = repeat(row + k) * color;
-    if (grad_end - (grad + 3 * k) >= LANES)  // what follows is written later
+    if (grad_end - (grad + 3 * k) >= LANES)  // the lanes that follow are overwritten later
       store(grad + 3 * k, slope);
     else
       for (int64_t q = 0; q < left && q < WIDE; q++) grad[3 * k + q] = slope[q];

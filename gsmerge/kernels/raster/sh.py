@@ -1,4 +1,4 @@
-"""Colours of Gaussians seen from a point, and their gradients: real spherical harmonics of degrees 0 to 4."""
+"""Evaluate the colours of Gaussians as seen from a point, and their gradients, by spherical harmonics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
     first=i8(least=0, most="m"), last=i8(least="first", most="m"), colors=f4("m", 3, out=True),
 )  # fmt: skip
 def view_colors(means, sh0, shN, ids, eye, first, last, colors):
-    """Write the colours of a range of the listed Gaussians as seen from ``eye [3]``, not below 0."""
+    """Write the colours of a range of the listed Gaussians as seen from ``eye [3]``, clipped at 0."""
 
 
 @native(
@@ -23,5 +23,5 @@ def view_colors_backward(means, shN, ids, eye, first, last, colors, grad_colors,
 
     Args:
         colors: ``[m,3]`` float32, as seen; no gradient passes where they are 0.
-        grad_means: ``[m,3]`` float32, through the viewing direction alone, written.
+        grad_means: ``[m,3]`` float32, written: gradient through the viewing direction only.
     """

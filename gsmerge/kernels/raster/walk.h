@@ -1,8 +1,8 @@
-// A Gaussian of a batch over the rows of a tile, eight pixels at a time: what the blending kernels share.
+// Shared by the blending kernels: evaluate a Gaussian of a batch over the rows of a tile, eight pixels at a time.
 //
-// A tile's state lives in planes of 16 x 16 floats. The weights are gsplat's: alpha clamped at 0.99, cut below 1/255,
-// and a pixel stops before the Gaussian that would take its transmittance to 1e-4 or below. Plane 0 of the state is the
-// transmittance; its sign bit marks pixels that stopped.
+// The state of a tile consists of planes of 16 x 16 floats. The weights are gsplat's: alpha is clamped at 0.99 and cut
+// below 1/255, and a pixel stops before the Gaussian that would lower its transmittance to 1e-4 or below. Plane 0 of
+// the state is the transmittance; its sign bit marks pixels that have stopped.
 #pragma once
 #include "native.h"
 
@@ -11,8 +11,8 @@ enum { TILE = 16, HALF = TILE / 2, PLANE = TILE * TILE, BATCH = 32, CONIC = 8, S
 #define LN_CUT -5.541263545158426f  // ln(1/255)
 #define MAX_ALPHA 0.99f
 #define MIN_TRANSMITTANCE 1e-4f
-#define HIDDEN -1e4f  // an exponent that shows nothing
-#define SPARE 0.02f  // rows and columns beside those in which a Gaussian shows, for rounding
+#define HIDDEN -1e4f  // an exponent with a weight of zero
+#define SPARE 0.02f  // tolerance for rounding, in rows and columns, around a Gaussian
 
 static const v16f COLUMNS = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 static const v16f PAIR_COLUMNS = {0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7};  // of two rows of half a tile
@@ -23,24 +23,25 @@ typedef struct {
   float mx[BATCH], my[BATCH], rate[BATCH], slope[BATCH], decay[BATCH], lnop[BATCH], first[BATCH], last[BATCH];
   float red[BATCH], green[BATCH], blue[BATCH];
   int32_t y0[BATCH], y1[BATCH];  // rows of the tile in which each shows
-  int32_t x0[BATCH];  // first of the eight columns in which each shows; WIDE where these are more
+  int32_t x0[BATCH];  // first of the eight columns in which each shows; WIDE if it shows in more columns
 } Batch;
 
-// Part of the light of eight pixels of a row that a Gaussian takes.
+// Share of a Gaussian in eight pixels of a row.
 typedef struct {
-  v8f alpha, weight;  // alpha times the transmittance; 0 where the pixel stops
-  v8f left;           // transmittance behind it; negative where the pixel stopped
-  v8i unclamped, goes;  // alpha is below 0.99; the pixel does not stop here or before
+  v8f alpha, weight;  // weight: alpha times the transmittance, 0 if the pixel stops
+  v8f left;           // transmittance behind the Gaussian; negative if the pixel has stopped
+  v8i unclamped, goes;  // masks: alpha is below 0.99; the pixel does not stop here or before
 } Share;
 
 // The tile on which a kernel works.
 typedef struct {
   int64_t left, top;
   int32_t num_x, num_y;  // columns and rows inside the image
-  int32_t y_low, y_high;  // rows in which a pixel still goes on
+  int32_t y_low, y_high;  // rows with pixels that have not stopped
 } Tile;
 
-// exp(p) = poly(p)^8 on [ln(1/255), 0]: minimax of relative error 8e-8 for exp(p / 8), coefficients scaled by 8^-k.
+// exp(p) = poly(p)^8 on [ln(1/255), 0]: a minimax polynomial with a relative error of 8e-8 for exp(p / 8), whose
+// coefficients are scaled by 8^-k.
 static inline v8f alphas_at(v8f p) {
   v8f e = 0.99999992f
       + p * (0.12499907f + p * (0.0078106653f + p * (3.2416797e-4f + p * (9.7100983e-6f + p * 1.7842896e-7f))));
@@ -111,7 +112,7 @@ static inline void narrow_rows(Batch *b) {
   }
 }
 
-// A batch of Gaussians without effect: lanes that are not filled are calculated with, too.
+// Make a batch of Gaussians without effect, since unused lanes are computed, too.
 static inline void clear_batch(Batch *b) {
   float *numbers = b->mx;
   for (int i = 0; i < 11 * BATCH; i++) numbers[i] = 1.f;
@@ -125,7 +126,7 @@ typedef struct {
   int64_t tile_width, m, n, ends;  // tiles per row; lengths of conics, flatten_ids and isect_offsets
 } Lists;
 
-// Whether there is such a range of tiles, and their lists lie within flatten_ids.
+// True if the range of tiles exists and its lists lie within flatten_ids.
 static inline bool lists_are_sound(const Lists *l, int64_t first, int64_t last) {
   if (l->tile_width < 1 || first < 0 || last >= l->ends) return false;
   for (int64_t tile = first; tile < last; tile++) {
@@ -135,7 +136,7 @@ static inline bool lists_are_sound(const Lists *l, int64_t first, int64_t last) 
   return true;
 }
 
-// Rows become columns.
+// Transpose eight rows.
 static inline void transpose8(v8f r[8]) {
   v8f a[8], b[8];
   for (int k = 0; k < 8; k += 2) {
@@ -153,8 +154,8 @@ static inline void transpose8(v8f r[8]) {
   }
 }
 
-// Copy the conics of the intersections start to stop into the batch, and call for those of the next batch -> whether
-// there are such conics.
+// Copy the conics of the intersections start to stop into the batch, and prefetch those of the next batch. Return false
+// for an invalid index.
 static inline bool gather(Batch *b, const Tile *tile, const Lists *l, int64_t start, int64_t stop, int64_t end) {
   float left = (float)tile->left + 0.5f, top = (float)tile->top + 0.5f;
   const int32_t *ids = l->flatten_ids;
@@ -179,7 +180,7 @@ static inline bool gather(Batch *b, const Tile *tile, const Lists *l, int64_t st
   return true;
 }
 
-// Copy the colours of the intersections start to stop into the batch, and call for those of the next batch.
+// Copy the colours of the intersections start to stop into the batch, and prefetch those of the next batch.
 static inline void gather_colors(Batch *b, const float *colors, const int32_t *flatten_ids, int64_t start, int64_t stop,
                                  int64_t end) {
   for (int64_t i = start; i < stop; i++) {
@@ -192,7 +193,7 @@ static inline void gather_colors(Batch *b, const float *colors, const int32_t *f
     __builtin_prefetch(colors + SPLAT_COLORS * (int64_t)flatten_ids[i]);
 }
 
-// Reset the planes of a tile: all light passes, the others are zero; lanes outside the image have stopped.
+// Reset the planes of a tile: the transmittance is 1, other planes are zero, and lanes outside the image have stopped.
 static inline Tile open_tile(float *state, int planes, int64_t tile, int64_t tile_width, int64_t h, int64_t w) {
   int64_t left = tile % tile_width * TILE, top = tile / tile_width * TILE;
   int32_t num_x = (int32_t)mini(TILE, w - left), num_y = (int32_t)mini(TILE, h - top);
@@ -208,7 +209,7 @@ static inline bool row_is_live(const float *row) {
   return live;
 }
 
-// Narrow the rows of a tile to those where a pixel still goes on.
+// Narrow the rows of a tile to those with pixels that have not stopped.
 static inline void narrow_tile(Tile *tile, const float *state) {
   while (tile->y_low <= tile->y_high && !row_is_live(state + tile->y_low * TILE)) tile->y_low++;
   while (tile->y_high >= tile->y_low && !row_is_live(state + tile->y_high * TILE)) tile->y_high--;

@@ -1,4 +1,4 @@
-// Bayesian adaptive superpixels: parameters of regions and passes over their labels.
+// Bayesian adaptive superpixels: fit the parameters of regions, and pass over their labels.
 #include "exp_log.h"
 #include "labels.h"
 
@@ -8,8 +8,8 @@ static const int64_t ROW = 9;
 
 typedef double v4d __attribute__((vector_size(32), aligned(8)));
 
-// Pseudo-observations of the shape prior per pixel of a superpixel's expected area, and the weight
-// of its neighbours.
+// Pseudo-observations of the shape prior per pixel of a superpixel's expected area, and the weight of
+// the Potts term.
 static const double PRIOR_WEIGHT = 50;
 static const float POTTS = 0.5f;
 
@@ -22,7 +22,7 @@ API int32_t fit_regions(const int32_t *labels, const float *colours, const doubl
       const float *colour = colours + 3 * (y * width + x);
       double *sum = sums + ROW * labels[(y + 1) * padded_width + x + 1];
       double across = (double)x, down = (double)y;
-      // Four at a time on purpose: lines of eight, not aligned, take longer.
+      // Four at a time, since unaligned vectors of eight take longer.
       *(v4d *)sum += (v4d){colour[0], colour[1], colour[2], across};
       *(v4d *)(sum + 4) += (v4d){down, across * across, across * down, down * down};
       sum[8] += 1;
@@ -45,8 +45,8 @@ API int32_t fit_regions(const int32_t *labels, const float *colours, const doubl
   return 0;
 }
 
-// Twice the logarithm of the posterior of a label for a pixel, up to a constant. A pixel: three
-// colours, x, y.
+// Twice the logarithm of the posterior of a label for a pixel, up to a constant. A pixel has three
+// colours, x and y.
 static inline float log_posterior(const float *row, const float *pixel, float num_foreign,
                                   float precision) {
   float d0 = pixel[0] - row[0], d1 = pixel[1] - row[1], d2 = pixel[2] - row[2];
@@ -57,8 +57,8 @@ static inline float log_posterior(const float *row, const float *pixel, float nu
   return -((colour + shape) + rest);
 }
 
-// The label of highest posterior among those around a border pixel; its own where another one may
-// not take it.
+// The label with the highest posterior among those around a border pixel; its own label if the pixel
+// may not change.
 static inline int32_t best_label(const int32_t *place, int64_t columns, const float *rows,
                                  const float *pixel, const uint8_t *table, const float *foreign,
                                  float precision) {

@@ -1,18 +1,20 @@
 """Bayesian adaptive superpixel segmentation (Uziel et al. 2019), with a fixed number of superpixels or adaptively.
 
-Hard expectation maximisation of Gaussians in colour (fixed deviation) and position (normal-inverse-Wishart prior),
-with a Potts term on the borders. A pixel may change its label only where no label is taken apart; the pixels at the
-picture's edge take part, and no region can run empty. The adaptive form splits and merges between the rounds, by
-moves that are accepted by their Hastings ratio (Chang and Fisher 2013).
+The method is hard expectation maximisation of Gaussians in colour (fixed standard deviation) and position
+(normal-inverse-Wishart prior), with a Potts term on the borders. A pixel may change its label only if no region is
+disconnected by that. Pixels at the picture's edge may change, too, and no region can become empty. The adaptive form
+splits and merges superpixels between the rounds, by moves that are accepted by their Hastings ratio (Chang and Fisher
+2013).
 
-Splitting c into a and b has the ratio ``H = α Γ(n_a) f(a) Γ(n_b) f(b) / (Γ(n_c) f(c))``, merging them its inverse, with
-the concentration α of a Dirichlet process and the marginal likelihood ``f`` of a superpixel's n pixels. Moves with
-H > 1 are made. ``f`` is that of colours of unknown mean and variance (normal-inverse-gamma) times ``n^-n`` for
-positions anywhere in the superpixel's area: without it Γ would favour few large superpixels in every picture, as the
-density of positions grows as a superpixel shrinks.
+Splitting c into a and b has the ratio ``H = α Γ(n_a) f(a) Γ(n_b) f(b) / (Γ(n_c) f(c))``, and merging them its inverse.
+Here α is the concentration of a Dirichlet process, and ``f`` is the marginal likelihood of a superpixel's n pixels.
+Moves with H > 1 are made. ``f`` is the likelihood of colours with unknown mean and variance (normal-inverse-gamma)
+times ``n^-n`` for positions anywhere in the superpixel's area. Without that factor Γ would favour few large superpixels
+in every picture, since the density of positions grows as a superpixel shrinks.
 
-The authors' own code differs: it has neither α nor Γ nor positions in a split, overwrites a_0 by a_n (so that Γ(a_n)
-is lost), sets b_0 to a_0 times a deviation instead of a variance, and accepts log H > -2 in both directions.
+The authors' own code differs. It has neither α nor Γ nor positions in a split. It overwrites a_0 by a_n, so that Γ(a_n)
+is lost. It sets b_0 to a_0 times a standard deviation instead of a variance. And it accepts log H > -2 in both
+directions.
 """
 
 from __future__ import annotations
@@ -33,10 +35,11 @@ _sum_regions = declare(
 )  # fmt: skip
 COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
 NUM_PASSES = 4  # label passes per update of the parameters
-NUM_ROUNDS = 12  # of the adaptive form: splits and merges in turn
-# Prior of the moves. The concentration, at the lower end of the authors' 0.01 to 100. Pseudo-observations of a colour's
-# variance, so many that it is all but fixed, as in the label passes (with 1e4 a superpixel of much variance would
-# rather keep it than pay for it twice, at up to 0.2 dB). The deviation of mean colours in a picture, CIELAB / 100.
+NUM_ROUNDS = 12  # rounds of the adaptive form, which alternate between splits and merges
+# Prior of the moves: the concentration, at the lower end of the authors' 0.01 to 100; the number of pseudo-observations
+# of a colour's variance; and the standard deviation of mean colours in a picture, CIELAB / 100. The number is so large
+# that the variance is almost fixed, as in the label passes. With 1e4 superpixels of large variance would not be split,
+# which costs up to 0.2 dB
 ALPHA, PRIOR_SHAPE, MEAN_DEVIATION = 0.01, 1e6, 0.5
 ROW = 9  # columns of a region's parameters
 
@@ -74,8 +77,8 @@ _mark_halves = declare(
 def mark_halves(labels, count, across):
     """Mark the second half of every region, ``[h,w]`` bool; both halves are 4-connected.
 
-    A region has two ends: the middle of its top and bottom, or with ``across`` of its left and right. Each pixel
-    belongs to the end that is nearer in steps inside the region. A region of one pixel has no second half.
+    A region has two ends: the middle of its top and of its bottom, or with ``across`` of its left and of its right.
+    Each pixel belongs to the end that is nearer in steps inside the region. A region of one pixel has no second half.
     """
     height, width = labels.shape[0] - 2, labels.shape[1] - 2
     halves, queue = np.empty((height, width), np.uint8), np.empty((height * width, 2), np.int32)
@@ -84,18 +87,18 @@ def mark_halves(labels, count, across):
     return halves == 1
 
 
-# leaves ratios where there is nothing to split
+# ratios of regions that cannot be split do not change
 _weigh_splits = declare(
     "weigh_splits", whole=f8("count", SUMS), second=f8("count", SUMS), prior=f8(4), ratios=f8("count", out=True)
 )
 
 
 def weigh_splits(whole, second, prior):
-    """Compute log H ``[count]`` of splitting every region; -inf where it cannot be split.
+    """Compute log H ``[count]`` of splitting every region; -inf for regions that cannot be split.
 
     Args:
         whole: ``[count,7]`` sums of the regions.
-        second: The same of their second halves.
+        second: ``[count,7]`` sums of their second halves.
         prior: ``[4]`` float64, log α, a, b and v.
     """
     ratios = np.full(len(whole), -np.inf)
@@ -111,7 +114,7 @@ _choose_merges = declare(
 
 
 def choose_merges(pairs, sums, prior):
-    """Choose every region's best neighbour ``[count]`` (-1: none) and compute log H ``[count]`` of merging with it."""
+    """Choose every region's best neighbour ``[count]``, -1 without any; also return log H ``[count]`` of the merge."""
     count = len(sums)
     partners, ratios = np.full(count, -1, np.int32), np.full(count, -np.inf)
     _choose_merges(sums, pairs, prior, np.empty(count), partners, ratios)
@@ -119,15 +122,15 @@ def choose_merges(pairs, sums, prior):
 
 
 def split(labels, colours, areas, prior, across, most, least=0.0):
-    """Split the regions whose log H is above ``least``, at most ``most`` of them, the highest first.
+    """Split the regions with log H above ``least``, at most ``most`` of them, highest log H first.
 
     Args:
-        labels: Padded labels 0 to ``len(areas) - 1``, each region 4-connected and none empty; they stay so.
-        areas: ``[count]`` float64 expected area of every region, pixels; halves share it.
+        labels: Padded labels 0 to ``len(areas) - 1``, each region 4-connected and not empty, before and after.
+        areas: ``[count]`` float64 expected area of every region, pixels; each half gets a part of it.
         prior: ``[4]`` float64, log α, a, b and v.
-        across: Whether the halves are left and right, else top and bottom.
+        across: Split into left and right halves; otherwise into top and bottom.
         most: Largest number of splits.
-        least: log H.
+        least: Least log H of a split.
 
     Returns:
         (labels, areas) with the new regions at the end.
@@ -164,10 +167,10 @@ def merge(labels, colours, areas, prior, most, least=0.0):
 
 
 def simple_point_table():
-    """Make a table ``[256]`` uint8 of the rings of neighbours at which a pixel may change its label.
+    """Make a table ``[256]`` uint8 that is 1 for rings of neighbours with which a pixel may change its label.
 
-    An entry is 1 if the ring has one arc of pixels with the label and one arc without, each with an edge neighbour. Bit
-    i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the label.
+    Such a ring has one arc of pixels with the label and one arc without, each with an edge neighbour. Bit i of the
+    index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the label.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
     changes = (cells != np.roll(cells, 1, axis=1)).sum(1)
@@ -198,7 +201,7 @@ def fit_regions(labels, colours, areas):
     rows=f4("count", ROW), table=u1(256), foreign=f4(256), precision=f4(),
 )  # fmt: skip
 def label_pass(labels, colours, rows, table, foreign, precision):
-    """Pass over all border pixels once, in four grids of pixels that do not touch; return how many changed.
+    """Pass over all border pixels once, in four grids of pixels that do not touch; return how many pixels changed.
 
     No two pixels of a grid are neighbours, so their order does not matter.
     """
@@ -207,7 +210,7 @@ def label_pass(labels, colours, rows, table, foreign, precision):
 def infer_labels(labels, colours, count):
     """Improve padded labels in place, in as many rounds as a superpixel's side has pixels; return them.
 
-    Each of the ``count`` regions is 4-connected and not empty, and stays so. ``colours [h,w,3]`` are CIELAB / 100.
+    Each of the ``count`` regions is 4-connected and not empty, before and after. ``colours [h,w,3]`` are CIELAB / 100.
     """
     height, width, _ = colours.shape
     areas = np.full(count, height * width / count)
@@ -217,7 +220,7 @@ def infer_labels(labels, colours, count):
 
 
 def improve_labels(labels, colours, areas):
-    """Fit the regions' parameters and pass over the labels, in place; ``areas`` as in :func:`fit_regions`."""
+    """Fit the parameters of the regions and pass over the labels in place; ``areas`` are as in :func:`fit_regions`."""
     table = simple_point_table()
     foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
     precision = np.float32(1 / COLOUR_DEVIATION**2)
@@ -230,25 +233,25 @@ def improve_labels(labels, colours, areas):
 def move_prior():
     """Return the prior of splits and merges: ``[4]`` float64 log α, a, b and v.
 
-    The deviation of colours is that of the label passes.
+    The standard deviation of colours is that of the label passes.
     """
     variance = COLOUR_DEVIATION**2
     return np.array([math.log(ALPHA), PRIOR_SHAPE, PRIOR_SHAPE * variance, MEAN_DEVIATION**2 / variance])
 
 
 def adapt_labels(labels, colours, count, factor, share):
-    """Improve padded labels while superpixels split and merge by the Hastings ratio.
+    """Improve padded labels, and split and merge superpixels by the Hastings ratio.
 
     Args:
         labels: Padded labels 0 to ``count - 1``, each region 4-connected and none empty; overwritten.
         colours: ``[h,w,3]`` float32, CIELAB / 100.
-        count: Regions at the start.
-        factor: Most times that their number grows or falls, an integer; there is never more than one per pixel.
-        share: Of the number that they come to, the part that is left in the end; None: exactly ``count``. It is met by
-            the moves of the highest ratios.
+        count: Number of regions at the start.
+        factor: Largest factor, an integer, by which their number grows or falls; there is at most one per pixel.
+        share: Share of the resulting number of regions that remains in the end; None: exactly ``count`` remain. The
+            moves with the highest ratios are made to reach it.
 
     Returns:
-        (labels, count): padded labels, dense from 0, each region 4-connected and none empty, and how many there are.
+        (labels, count): padded labels, dense from 0, each region 4-connected and not empty, and the number of regions.
     """
     height, width, _ = colours.shape
     areas, prior = np.full(count, height * width / count), move_prior()

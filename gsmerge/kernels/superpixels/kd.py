@@ -1,6 +1,6 @@
-"""Over-split of a picture into rectangles, best cut first, with integral images.
+"""Split a picture into rectangles, as a start for merging: best cut first, with integral images.
 
-Label pictures are padded: ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel asks where the picture ends.
+Label pictures are padded: ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel has to check for the border.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8
 
-NUM_BUCKETS = 2048  # lists of cuts of about the same gain
+NUM_BUCKETS = 2048  # lists of cuts with about the same gain
 NODE = 8  # columns of a rectangle's row
 
 
@@ -24,18 +24,19 @@ def integral_image(pixels):
     return integral
 
 
-# Writes how much the best cut of a rectangle across one of its sides lowers the squared error, below 0 if there is
-# nothing to cut, and its place, 1 to side - 1. A rectangle of n pixels with colour sum t, whose side of length S is cut
-# at c into parts with sums s and t - s, loses |S s - c t|² / (n c (S - c)) of colour error and n c (S - c) / 4 of
-# position error, times the compactness. near and far are the places in the integral image of its first corner and of
-# the one at the other end of the side that is not cut; step is the distance of neighbours along the other side.
+# Writes the gain of the best cut of a rectangle across one of its sides, below 0 if there is nothing to cut, and its
+# place, 1 to side - 1. The gain is the reduction of the squared error. A rectangle of n pixels with colour sum t, whose
+# side of length S is cut at c into parts with sums s and t - s, loses |S s - c t|² / (n c (S - c)) of colour error and
+# n c (S - c) / 4 of position error, times the compactness. near and far are the places in the integral image of its
+# first corner and of the corner at the other end of the side that is not cut. step is the distance between neighbours
+# along the side that is cut.
 cut_gain = declare(
     "cut_gain", STATUS, integral=f8("places", 3), near=i8(least=0), far=i8(least=0), step=i8(least=1), side=i8(least=0),
     num_pixels=f8(), compactness=f8(), found=f8(2, out=True),
 )  # fmt: skip
 
 
-# returns how many labels there are
+# returns the number of labels
 _split_rectangles = declare(
     "split_rectangles", COUNT, integral=f8("places", 3), count=i8(least=0), block=i8(least=1), compactness=f8(),
     nodes=i4("capacity", NODE, out=True), heads=i8(NUM_BUCKETS, out=True),
@@ -44,15 +45,15 @@ _split_rectangles = declare(
 
 
 def split_rectangles(pixels, count, block, compactness):
-    """Cut the picture into ``count`` rectangles (at least one per block), the most rewarding cuts first.
+    """Cut the picture into ``count`` rectangles, at least one per block; cuts with the largest gain come first.
 
     Args:
-        count: Rectangles wanted, at most h·w.
+        count: Wanted number of rectangles, at most h·w.
         block: Side of the blocks that the picture is divided into at the start, pixels.
         compactness: Weight of squared pixels against squared colours.
 
     Returns:
-        (labels, count): padded labels and how many there are.
+        (labels, count): padded labels and the number of rectangles.
     """
     height, width, _ = pixels.shape
     capacity = max(count, max(1, height // block) * max(1, width // block))

@@ -1,10 +1,10 @@
-// What the kernels of segmentation share. Label pictures are padded: [h+2,w+2] with a frame of -1,
-// so that no loop asks where the picture ends.
+// Shared by the kernels of segmentation. Label pictures are padded: [h+2,w+2] with a frame of -1, so
+// that no loop has to check for the border.
 #pragma once
 #include "native.h"
 
-// Whether labels [rows,columns] are those of a picture of this size: -1 on the frame, below count
-// inside of it.
+// True if labels [rows,columns] are valid for a picture of this size: -1 on the frame, and below count
+// inside.
 static inline bool labels_fit(const int32_t *labels, int64_t rows, int64_t columns, int64_t height,
                               int64_t width, int64_t count) {
   if (rows != height + 2 || columns != width + 2 || count < 0) return false;
@@ -29,15 +29,15 @@ static inline uint32_t ring_of(const int32_t *place, int64_t columns, int32_t la
                     | (above[-1] == label) << 7);
 }
 
-// Whether all four neighbours of a place have its label.
+// True if all four neighbours of a place have its label.
 static inline bool is_inside(const int32_t *place, int64_t columns) {
   int32_t own = place[0];
   return (place[-columns] == own) & (place[1] == own) & (place[columns] == own)
       & (place[-1] == own);
 }
 
-// A small number in (0, 1e-7] that depends on the pair only. It spreads equal costs, so that flat
-// pictures do not merge one pair a round.
+// A small number in (0, 1e-7] that depends only on the pair. It makes equal costs differ, so that flat
+// pictures do not merge only one pair per round.
 static inline float pair_tie(int32_t u, int32_t v) {
   uint32_t mixed = (uint32_t)u * 2654435761u ^ (uint32_t)v * 40503u;
   mixed ^= mixed >> 15;

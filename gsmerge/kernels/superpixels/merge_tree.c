@@ -1,4 +1,4 @@
-// Merging of the regions of a view one pair after the other, cheapest first.
+// Merge the regions of a view, one pair after another, cheapest first.
 #include "labels.h"
 
 // Columns of a region's row after its mean (three colours, y, x); the nine from PLANE on are sums
@@ -6,7 +6,7 @@
 // whole pixels, the largest of each.
 enum { NUM_PIXELS = 5, PLANE, PLANE_ERROR = 15, BOX };
 static const int64_t ROW = 20;
-// Square pixels; holds the slopes of planes through fewer than three points.
+// Ridge of the fit of planes, square pixels; it determines the slopes of planes through fewer than three points.
 static const double SLOPE_RIDGE = 1e-3;
 static const int32_t NEVER = -1000000000;  // box of a region without pixels
 static const double OVERSIZE = 1e9;        // added to the cost of a merge beyond the largest extent
@@ -16,15 +16,15 @@ typedef struct {
   double error, place;
 } Growth;
 
-// What edges between regions wait in: a heap by their costs, and for each region a list of its
-// half-edges. Edge e has half-edges 2e and 2e + 1.
+// Edges between regions: a heap by their costs, and a list of half-edges for each region. Edge e has
+// the half-edges 2e and 2e + 1.
 typedef struct {
   double *costs;
   int32_t *heap;    // edges, the cheapest first
-  int32_t *places;  // of each edge in the heap, -1 when taken
+  int32_t *places;  // place of each edge in the heap, -1 after it was removed
   int32_t *heads;   // first half-edge of each region
-  int32_t *nexts;   // the one after a half-edge
-  int32_t *ends;    // where a half-edge leads
+  int32_t *nexts;   // next half-edge in the list of each half-edge
+  int32_t *ends;    // region to which each half-edge leads
   int64_t size;
 } Edges;
 
@@ -33,7 +33,7 @@ typedef struct {
   double depth_weight, compactness, max_extent;
 } Regions;
 
-// Least sum of (1 - z (a x + b y + c))² over n pixels, with a ridge on the slopes.
+// Minimum over a, b, c of the sum of (1 - z (a x + b y + c))² over n pixels, with a ridge on the slopes.
 static inline double plane_error(double n, const double *s) {
   double w = s[0], z = s[6];
   if (w <= 0) return 0;
@@ -44,8 +44,8 @@ static inline double plane_error(double n, const double *s) {
   return maxd(n - z * z / w - explained, 0);
 }
 
-// Add a pixel of a colour, a place and a depth to a region's row of sums, and its squared colour
-// where the error will be. Four at a time on purpose: lines of eight, not aligned, take longer.
+// Add a pixel with its colour, place and depth to a region's row of sums, and its squared colour to
+// the column of the error. Four at a time, since unaligned vectors of eight take longer.
 static inline void add_pixel(double *row, const float *pixel, double y, double x, double z) {
   v4d *sums = (v4d *)row;
   double r = pixel[0], g = pixel[1], b = pixel[2], zz = z * z;
@@ -89,8 +89,7 @@ API int32_t region_sums(const int32_t *labels, const float *pixels, const float 
   return 0;
 }
 
-// Growth of the error if two regions become one: of colour and depth, and of place times
-// compactness.
+// Growth of the error if two regions are merged: of colour and depth, and of place times compactness.
 static inline Growth growth_of(const double *a, const double *b, double depth_weight,
                                double compactness) {
   double n_a = a[NUM_PIXELS], n_b = b[NUM_PIXELS], sums[9];
@@ -130,7 +129,7 @@ static void join(double *rows, int64_t u, int64_t v, int64_t node) {
   for (int i = BOX; i < ROW; i++) row[i] = maxd(a[i], b[i]);
 }
 
-// Make the lists of half-edges, every pair once; returns the number of edges.
+// Make the lists of half-edges, with every pair once; return the number of edges.
 static int64_t link(const int32_t *pairs, int64_t num_pairs, Edges *edges) {
   int64_t num_edges = 0;
   for (int64_t i = 0; i < num_pairs; i++) {
@@ -158,7 +157,7 @@ static inline void put(Edges *edges, int64_t at, int32_t edge) {
   edges->places[edge] = (int32_t)at;
 }
 
-// Move an edge of the heap to where its cost belongs, up or down.
+// Move an edge up or down in the heap to the place of its cost.
 static void settle(Edges *edges, int32_t edge) {
   const int32_t *heap = edges->heap;
   const double *costs = edges->costs;
@@ -173,7 +172,7 @@ static void settle(Edges *edges, int32_t edge) {
   put(edges, at, edge);
 }
 
-// Take an edge out of the heap.
+// Remove an edge from the heap.
 static void take(Edges *edges, int32_t edge) {
   int32_t at = edges->places[edge], last = edges->heap[--edges->size];
   edges->places[edge] = -1;
@@ -182,8 +181,8 @@ static void take(Edges *edges, int32_t edge) {
   settle(edges, last);
 }
 
-// Lead the edges of a child of a new node to the node; both children's edges to one neighbour
-// become one.
+// Move the edges of a child of a new node to the node; edges of both children to the same neighbour
+// become one edge.
 static void move_edges(Edges *edges, const Regions *regions, int32_t *marks, int32_t child,
                        int32_t node) {
   for (int32_t half = edges->heads[child], following; half >= 0; half = following) {

@@ -1,8 +1,8 @@
-"""Merge the neighbouring regions of a view one pair after the other, cheapest first, down to a single one.
+"""Merge the neighbouring regions of a view, one pair after another, cheapest first, down to a single region.
 
-A region's row is float64: its mean colour and place, its number of pixels, ten sums of the plane fitted to its
-depths, that plane's error, and its box. The plane is a x + b y + c for 1 / z, fitted with weights z², so that the
-error is that of z relative to the plane: scale-free, additive over regions, and zero for any flat surface.
+A region's row is float64: its mean colour and place, its number of pixels, the sums of the plane fitted to its depths,
+the error of the plane, and its box. The plane is a x + b y + c for 1 / z, fitted with weights z². So the error is
+relative to the depth. It is scale-free, additive over regions, and zero for any flat surface.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import numpy as np
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, u1
 
 NUM_PIXELS, PLANE_ERROR, ROW = 5, 15, 20  # columns of a row after the mean, and its length
-SLOPE_RIDGE = 1e-3  # square pixels; holds the slopes of planes through fewer than three points
-OVERSIZE = 1e9  # added to the cost of a merge beyond the largest extent: these come last, in their own order
+SLOPE_RIDGE = 1e-3  # square pixels; it determines the slopes of planes through fewer than three points
+OVERSIZE = 1e9  # added to the cost of a merge beyond the largest extent, so that such merges come last
 
 
 _region_sums = declare(
@@ -26,7 +26,7 @@ _region_sums = declare(
 def region_sums(labels, pixels, depths, count, rows):
     """Fill the first ``count`` of ``rows [2·count,20]`` from padded labels; return their colour error.
 
-    Pixels with depth 0 do not count. Plane coordinates are relative to the middle of the view.
+    Pixels with a depth of 0 do not count. Plane coordinates are relative to the middle of the view.
     """
     squares = np.empty(1)
     _region_sums(labels, pixels, depths, rows, np.empty((count, 4), np.int32), squares)
@@ -51,7 +51,7 @@ _merge_order = declare(
 
 
 def merge_order(pairs, rows, depth_weight, compactness, max_extent):
-    """Merge the regions of one view into one, each time the cheapest pair of neighbours.
+    """Merge the regions of one view into a single one, each time the cheapest pair of neighbours.
 
     Args:
         pairs: ``[e,2]`` int32 neighbouring regions, repeats allowed; together they connect all regions.
@@ -61,8 +61,9 @@ def merge_order(pairs, rows, depth_weight, compactness, max_extent):
         max_extent: Regions whose sides reach this many pixels are merged last.
 
     Returns:
-        (parents, heights, growths): ``parents [2·leaves-1]`` int32, -1 at the root, children before parents; per
-        merge its cost or that of its dearest child, and how much the error of colour and depth grows by it.
+        (parents, heights, growths): ``parents [2·leaves-1]`` int32, -1 at the root, children before parents. The height
+        of a merge is its cost, or the largest height of its children if that is larger. The growth is the increase of
+        the error of colour and depth by the merge.
     """
     num_nodes, num_pairs = len(rows), len(pairs)
     num_leaves, last = num_nodes // 2, max(num_nodes - 1, 0)

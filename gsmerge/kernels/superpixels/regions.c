@@ -1,7 +1,7 @@
 // Rows of the regions of a label picture.
 #include "labels.h"
 
-// A region's row: mean (three colours, y and x times spread), pixels, two columns for others.
+// A region's row: mean (three colours, y and x times spread), number of pixels, and two columns for other algorithms.
 static const int64_t ROW = 8;
 
 API int32_t region_rows(const int32_t *labels, const float *pixels, float spread, double *sums,

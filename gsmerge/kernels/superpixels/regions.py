@@ -1,9 +1,10 @@
-"""Regions of a picture: padded labels, a row of numbers for each, and exact border moves between them.
+"""Describe regions of a picture by padded labels and a row of numbers each, and move pixels between them.
 
-Label pictures are padded: ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel asks where the picture ends.
-A region's row holds what a cost needs in half a cache line of float32: its mean feature (r, g, b, y·spread,
-x·spread; spread² is the weight of squared pixels against squared colours), its number of pixels, and two columns
-that belong to the algorithm at work. Means, not sums, keep float32 exact enough for pictures of any size.
+Label pictures are padded: ``[h+2,w+2]`` int32 with a frame of -1, so that no kernel has to check for the border. A
+region's row has all numbers of its cost in half a cache line of float32: its mean feature, its number of pixels, and
+two columns for the algorithm that uses it. The feature is r, g, b, y·spread and x·spread, where spread² is the weight
+of squared pixels against squared colours. With means in place of sums, float32 is exact enough for pictures of any
+size.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8, native, u1
 
 NUM_PIXELS, ROW = 5, 8  # column after the five of the mean, and the length of a row
-LEAVE, JOIN = 6, 7  # columns of a region's row: n / (n - 1) for a pixel that leaves, n / (n + 1) for one that joins
+LEAVE, JOIN = 6, 7  # columns of a region's row: n / (n - 1) for removing a pixel, n / (n + 1) for adding one
 
 
 def pad_labels(labels):
@@ -31,7 +32,7 @@ _region_rows = declare(
 def region_rows(labels, pixels, count, capacity, spread):
     """Fill the first ``count`` of ``[capacity,8]`` float32 rows with the regions of a picture, summed in float64.
 
-    Raises ValueError where padded labels are not from 0 to ``count - 1``.
+    Raises ValueError if padded labels are not from 0 to ``count - 1``.
     """
     rows = np.zeros((capacity, ROW), np.float32)
     _region_rows(labels, pixels, spread, np.zeros((count, 6)), rows)
@@ -39,11 +40,12 @@ def region_rows(labels, pixels, count, capacity, spread):
 
 
 def connectivity_table() -> np.ndarray:
-    """Make a table ``[256]`` uint8 of the rings at which a pixel may leave its region without splitting it.
+    """Make a table ``[256]`` uint8 that is 1 for rings with which a pixel may leave its region without splitting it.
 
     Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the pixel's label. An entry is 1 if the
-    cells with the label form one 4-connected part that touches the pixel by an edge. Parts are counted as edge cells
-    minus corner cells that join two edge cells (Yokoi's connectivity number); in a closed ring both numbers are equal.
+    neighbours with the label form one 4-connected part that touches the pixel by an edge. The number of parts is the
+    number of edge neighbours minus the number of corner neighbours that join two edge neighbours (Yokoi's connectivity
+    number). In a closed ring both numbers are equal.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
     edges, corners = cells[:, 0::2], cells[:, 1::2]
@@ -61,7 +63,7 @@ def ring_mask(labels, y, x, label):
     rows=f4("count", ROW, out=True), table=u1(256), spread=f4(), backward=i4(),
 )  # fmt: skip
 def sweep(labels, pixels, rows, table, spread, backward):
-    """Sweep once over the border pixels: each move lowers the total squared error, and the means are updated at once.
+    """Sweep once over the border pixels; each move lowers the total squared error, and updates the means at once.
 
     A pixel moves from region A to a 4-neighbour's region B if ``n_A/(n_A-1)·d_A² > n_B/(n_B+1)·d_B²`` and A stays
     connected without it. It needs a neighbour of its own label, so no region becomes empty.
@@ -71,10 +73,10 @@ def sweep(labels, pixels, rows, table, spread, backward):
         rows: ``[count,8]`` float32 rows of the regions with their last two columns, changed.
         table: From :func:`connectivity_table`.
         spread: Square root of the weight of squared pixels against squared colours.
-        backward: Whether the pass goes from the last pixel to the first.
+        backward: Sweep from the last pixel to the first.
 
     Returns:
-        How many pixels moved.
+        Number of pixels that moved.
     """
 
 
@@ -82,10 +84,10 @@ CONNECTIVITY = connectivity_table()
 
 
 def refine(labels, pixels, count, num_sweeps, spread):
-    """Sweep in place, back and forth, until nothing moves or ``num_sweeps`` are done; return the padded labels.
+    """Sweep in place, back and forth, until no pixel moves or ``num_sweeps`` are done; return the padded labels.
 
-    Each of the ``count`` regions is 4-connected and not empty, and stays so. ``spread``: square root of the weight of
-    squared pixels against squared colours, float32.
+    Each of the ``count`` regions is 4-connected and not empty, before and after. ``spread`` is the square root of the
+    weight of squared pixels against squared colours, float32.
     """
     rows = region_rows(labels, pixels, count, count, spread)
     num_pixels = rows[:, NUM_PIXELS]

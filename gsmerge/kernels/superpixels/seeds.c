@@ -1,11 +1,11 @@
-// Corners of a picture, seeds for superpixels, and the regions that grow from them.
+// Measure the corners of a picture, choose seeds for superpixels, and grow regions from them.
 #include "native.h"
 
-// The line or column that a picture of n of them has at i, mirrored about its first and last.
+// The line or column i of a picture with n of them, mirrored about the first and the last one.
 static inline int64_t mirror(int64_t i, int64_t n) {
   i = i < 0 ? -i : i;
   i = i < n ? i : 2 * (n - 1) - i;
-  return i < 0 ? 0 : i;  // of one line: itself
+  return i < 0 ? 0 : i;  // a single line is its own neighbour
 }
 
 // Fill the two columns beside a line of w values.
@@ -70,8 +70,8 @@ API int32_t corner_response(const float *pixels, float *planes, float *response,
   return 0;
 }
 
-// Errors are split by sums and products of their own: none may be contracted, which would take
-// sides.
+// Shares of the error are separate products and sums, since fusing them would treat the two sides
+// differently.
 API int32_t dither(const double *density, double jitter, double *errors, uint8_t *seeds,
                    int64_t height, int64_t width, int64_t columns) {
   if (columns != width + 2) return OUTSIDE;

@@ -1,4 +1,4 @@
-"""Corners of a picture, seeds for superpixels, and the regions that grow from them."""
+"""Measure the corners of a picture, choose seeds for superpixels, and grow regions from them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, u1
 
-DENSITY_FLOOR = 0.3  # share of the seeds that is spread evenly
-JITTER = 0.3  # width of the noise on the dithering threshold, against worm patterns
+DENSITY_FLOOR = 0.3  # share of the seeds that are spread evenly
+JITTER = 0.3  # width of the noise on the dithering threshold, which prevents worm patterns
 
 
 _corner_response = declare(
@@ -31,7 +31,7 @@ def corner_response(pixels):
 
 
 def hexagonal_seeds(height, width, count):
-    """Place ``count`` distinct pixels near a hexagonal grid with about equally many in each row: (y, x) int64."""
+    """Place ``count`` distinct pixels near a hexagonal grid, about equally many per row; return (y, x) int64."""
     row_distance = math.sqrt(height * width / count * math.sqrt(3) / 2)
     num_rows = min(max(round(height / row_distance), math.ceil(count / width)), height, count)
     first = np.arange(num_rows + 1) * count // num_rows
@@ -43,9 +43,9 @@ def hexagonal_seeds(height, width, count):
 
 
 def seed_density(saliency, count):
-    """Compute seeds per pixel from saliency, ``[h,w]`` float64: at most 1 each and ``count`` in all.
+    """Compute the number of seeds per pixel ``[h,w]`` float64 from saliency: at most 1 each, and ``count`` in all.
 
-    The density is uniform where nothing is salient.
+    The density is uniform if nothing is salient.
     """
     density = np.sqrt(saliency, dtype=np.float64)
     density = DENSITY_FLOOR + (1 - DENSITY_FLOOR) * density / max(density.mean(), 1e-12)
@@ -83,7 +83,7 @@ def _spread_picks(weights, count):
 
 
 def seeds_from_density(density, count):
-    """Choose ``count`` distinct pixels ``[count,2]`` int64 (y, x) that follow the density.
+    """Choose ``count`` distinct pixels ``[count,2]`` int64 (y, x) distributed by the density.
 
     Dithering loses a few seeds at the border of the picture; seeds are added or removed evenly to reach the exact
     number.
@@ -105,7 +105,7 @@ _voronoi = declare(
 def voronoi(seeds, height, width):
     """Label each pixel with its nearest seed in steps to 4-neighbours: ``[h,w]`` int32; every region is connected.
 
-    ``seeds [count,2]`` int64 are y and x of pixels; ValueError for a seed outside the picture.
+    ``seeds [count,2]`` int64 are y and x of pixels. Raises ValueError for a seed outside the picture.
     """
     labels = np.empty((height, width), np.int32)
     _voronoi(seeds, np.empty((height * width + len(seeds), 2), np.int32), labels)

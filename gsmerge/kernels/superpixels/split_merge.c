@@ -3,7 +3,7 @@
 #include "labels.h"
 
 enum { SUMS = 7 };  // columns of a region's sums: pixels, colours (3), squared colours (3)
-enum { LOG_ALPHA, SHAPE, SCALE, SPREAD };  // of a prior: log α, a and b of the inverse gamma, v
+enum { LOG_ALPHA, SHAPE, SCALE, SPREAD };  // numbers of a prior: log α, a and b of the inverse gamma, v
 
 API int32_t sum_regions(const int32_t *labels, const float *colours, const uint8_t *marks,
                         double *sums, int64_t padded_height, int64_t padded_width, int64_t height,
@@ -23,7 +23,7 @@ API int32_t sum_regions(const int32_t *labels, const float *colours, const uint8
   return 0;
 }
 
-// The part of the evidence that all regions share, once.
+// The part of the evidence that all regions share.
 typedef struct {
   double gamma, scale;  // log Γ(a) and log(2 π b)
 } Constants;
@@ -38,7 +38,7 @@ static double evidence(const double *sums, const double *prior, Constants consta
   value +=
       3 * (lgamma8(shape) - constants.gamma - 0.5 * log8(1 + n * v) - 0.5 * n * constants.scale);
   double share = v / (1 + n * v), half = 0.5 / b,
-         growth = 1;  // of b to b_n, the product of three channels
+         growth = 1;  // product of b_n / b over three channels
   for (int i = 0; i < 3; i++)
     growth *= 1 + half * maxd(sums[4 + i] - sums[1 + i] * sums[1 + i] * share, 0);
   return value - shape * log8(growth);
@@ -103,9 +103,9 @@ static void measure_boxes(const int32_t *labels, int64_t *boxes, double *sums, i
     }
 }
 
-// A first and a last pixel of every region, different ones where it has two: in its first and last
-// row, or where across column, next to the middle of its pixels. A region of one row or column is
-// taken along it.
+// The first and the last pixel of every region, which differ if it has two pixels. They lie in its
+// first and last row, or with `across` in its first and last column, nearest to the middle of its
+// pixels. A region of one row or column is split along it.
 static void find_ends(const int32_t *labels, bool across, const int64_t *boxes, const double *sums,
                       double *offsets, int64_t *ends, int64_t height, int64_t width,
                       int64_t count) {
@@ -129,7 +129,7 @@ static void find_ends(const int32_t *labels, bool across, const int64_t *boxes, 
     }
 }
 
-// Spread the marks of the places in the queue over their regions, one step at a time.
+// Spread the marks of the queued places over their regions, one step at a time.
 static void spread_halves(const int32_t *labels, uint8_t *halves, int32_t *queue, int64_t tail,
                           int64_t width) {
   static const int32_t steps[4][2] = {{-1, 0}, {1, 0}, {0, -1}, {0, 1}};

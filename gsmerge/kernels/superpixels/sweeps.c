@@ -1,4 +1,4 @@
-// Exact border moves between regions.
+// Move border pixels between regions, with exact costs.
 #include "labels.h"
 
 enum { NUM_PIXELS = 5, LEAVE, JOIN };  // columns of a region's row after its mean
@@ -17,7 +17,7 @@ static inline float distance(const float *row, const float *feature) {
   return d0 * d0 + d1 * d1 + d2 * d2 + d3 * d3 + d4 * d4;
 }
 
-// Add (sign 1) or take away (sign -1) one pixel.
+// Add (sign 1) or remove (sign -1) one pixel.
 static inline void shift(float *row, float sign, const float *feature) {
   float num_pixels = row[NUM_PIXELS] + sign, step = sign / num_pixels;
   row[NUM_PIXELS] = num_pixels;
@@ -26,7 +26,7 @@ static inline void shift(float *row, float sign, const float *feature) {
   for (int i = 0; i < 5; i++) row[i] += step * (feature[i] - row[i]);
 }
 
-// The neighbour's label under which a border pixel costs least, or its own.
+// The label, of a neighbour or its own, with the least cost of a border pixel.
 static inline int32_t best_label(const int32_t *place, int64_t columns, const float *rows,
                                  const float *feature) {
   const int32_t own = place[0], around[4] = {place[-columns], place[1], place[columns], place[-1]};

@@ -1,4 +1,4 @@
-// Ward merging of neighbouring regions.
+// Merge neighbouring regions by Ward's method.
 #include "labels.h"
 
 enum { NUM_PIXELS = 5, INVERSE, HEIGHT };  // columns of a region's row after its mean
@@ -6,9 +6,9 @@ static const int64_t ROW = 8;
 
 static const float LEAST_CEILING = 1e-7f;
 static const float CEILING_GROWTH = 1.5f;
-static const float RETURN_MARGIN = 1.5f;  // parked edges come back this far above the ceiling
+static const float RETURN_MARGIN = 1.5f;  // parked edges return if their cost is below so many times the ceiling
 
-// Edges between regions: at work those up to the ceiling, and parked the others.
+// Edges between regions: active ones with a cost up to the ceiling, or parked ones.
 typedef struct {
   int32_t *pairs;
   float *costs;
@@ -18,7 +18,7 @@ typedef struct {
 typedef struct {
   float *rows;
   int32_t *parents;
-  float *best_costs;  // of every region's edges at work, inf between the rounds
+  float *best_costs;  // least cost of every region's active edges, inf between the rounds
   int64_t num_nodes;
 } Tree;
 
@@ -30,7 +30,7 @@ API int64_t adjacent_pairs(const int32_t *labels, int32_t *pairs, int64_t rows, 
     const int32_t *line = labels + y * columns, *above = line - columns, *below = line + columns;
     for (int64_t x = 1; x < columns - 1; x++) {
       int32_t u = line[x], east = line[x + 1], south = below[x];
-      // Written in any case and kept by the count: a branch here would be mispredicted half of the
+      // Always written; the count decides if it stays. A branch here would be mispredicted half of the
       // time.
       pairs[2 * count] = u;
       pairs[2 * count + 1] = east;
@@ -43,7 +43,7 @@ API int64_t adjacent_pairs(const int32_t *labels, int32_t *pairs, int64_t rows, 
   return count;
 }
 
-// Growth of the squared error if two regions become one.
+// Growth of the squared error if two regions are merged.
 static inline float merge_cost(const float *u, const float *v) {
   float d0 = u[0] - v[0], d1 = u[1] - v[1], d2 = u[2] - v[2], d3 = u[3] - v[3], d4 = u[4] - v[4];
   return (d0 * d0 + d1 * d1 + d2 * d2 + d3 * d3 + d4 * d4) / (u[INVERSE] + v[INVERSE]);
@@ -62,9 +62,9 @@ static inline void set_edge(Edges *edges, int64_t e, int32_t u, int32_t v, float
   edges->costs[e] = cost;
 }
 
-// Cost of every edge and each region's lowest; drops inner edges and parks dear ones on the way.
-// Edges are written to both lists and kept by the counts: branches here would be mispredicted half
-// of the time.
+// Compute the cost of every edge and the least cost of each region; drop inner edges and park
+// expensive ones. Edges are written to both lists, and the counts decide if they stay. Branches here
+// would be mispredicted half of the time.
 static void weigh(Edges *edges, Edges *parked, const Tree *tree, float ceiling) {
   const int32_t *parents = tree->parents;
   float *best = tree->best_costs;
@@ -80,7 +80,7 @@ static void weigh(Edges *edges, Edges *parked, const Tree *tree, float ceiling) 
     set_edge(edges, kept, u, v, cost);
     kept += outer & cheap;
     bits4 bid = {.f = cost};
-    // Inf or NaN, which are below nothing; chosen among floats this would be a branch.
+    // Inf or NaN, which compare as not below; a choice between floats would be a branch.
     bid.u |= (outer & cheap) ? 0 : 0x7f800000;
     best[u] = minf(bid.f, best[u]);
     best[v] = minf(bid.f, best[v]);
@@ -114,7 +114,7 @@ static void join_mutual(const Edges *edges, Tree *tree) {
     tree->best_costs[edges->pairs[i]] = __builtin_inff();
 }
 
-// Bring back the parked edges that the new ceiling may admit.
+// Return parked edges to the active ones if their cost may be below the new ceiling.
 static void unpark(Edges *edges, Edges *parked, const int32_t *parents, float ceiling) {
   int64_t left = 0;
   for (int64_t e = 0; e < parked->count; e++) {
@@ -148,7 +148,7 @@ API int64_t merge_tree(int64_t num_leaves, int64_t num_merges, float ceiling, in
     weigh(&edges, &parked, &tree, ceiling);
     join_mutual(&edges, &tree);
     if (tree.num_nodes > before) continue;
-    bool rises = ceiling < __builtin_inff();  // edges that no ceiling admits have no cost: NaN
+    bool rises = ceiling < __builtin_inff();  // edges that remain above an infinite ceiling have a cost of NaN
     if (tree.num_nodes - num_leaves >= num_merges || parked.count == 0 || !rises)
       return tree.num_nodes;
     ceiling *= CEILING_GROWTH;

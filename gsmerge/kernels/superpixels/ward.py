@@ -1,8 +1,8 @@
-"""Ward merging of neighbouring regions down to an exact number.
+"""Merge neighbouring regions by Ward's method down to an exact number.
 
-Each round every region finds its cheapest neighbour, and mutual choices merge. Edges dearer than a ceiling are
-parked meanwhile, so that a round looks only at the few edges that matter; the ceiling rises when the cheap ones run
-dry. Rounds merge a few pairs out of order and too many, so the merges are recorded as a tree with heights, and the
+In each round every region finds its cheapest neighbour, and pairs that choose each other merge. Edges with costs above
+a ceiling are parked, so that a round reads only the few edges that matter. The ceiling rises when no cheap edges are
+left. Rounds merge some pairs out of order, and too many. So the merges are recorded as a tree with heights, and the
 tree is cut where exactly the wanted number of regions is left.
 """
 
@@ -13,12 +13,12 @@ import numpy as np
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, i4, i8, u1
 from gsmerge.kernels.superpixels.regions import NUM_PIXELS, ROW, region_rows
 
-INVERSE, HEIGHT = 6, 7  # columns of a region's row: 1 / n, and the cost at which it came to be
-SAMPLE_EDGES = 4096  # edges whose costs tell where to put the first ceiling
-TIE_BREAK = 1e-7  # squared colour; what the kernel adds to equal costs, so that flat pictures merge many pairs a round
+INVERSE, HEIGHT = 6, 7  # columns of a region's row: 1 / n, and the cost of the merge that made it
+SAMPLE_EDGES = 4096  # edges whose costs the first ceiling is estimated from
+TIE_BREAK = 1e-7  # squared colour that the kernel adds to equal costs, so that flat pictures merge many pairs per round
 
 
-# returns how many there are
+# returns the number of pairs
 _adjacent_pairs = declare("adjacent_pairs", COUNT, labels=i4("rows", "columns"), pairs=i4("capacity", 2, out=True))
 
 
@@ -41,8 +41,8 @@ merge_costs = declare(
 def _first_ceiling(pairs, rows, share):
     """Estimate a cost slightly above the most expensive merge that removes ``share`` of the regions.
 
-    Measured on photos that were over-segmented by 1.5 to 3: the share of edges that are cheaper than that merge at the
-    start is close to the share of regions that disappear.
+    On photos with 1.5 to 3 times too many regions, the share of edges that are cheaper than that merge at the start is
+    close to the share of regions that disappear.
     """
     step = max(1, len(pairs) // SAMPLE_EDGES)
     costs = np.empty(len(pairs) // step, np.float32)
@@ -66,8 +66,8 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
     Args:
         pairs: From :func:`adjacent_pairs`; overwritten.
         rows: ``[2·leaves,8]`` rows of the leaves; those of the merged regions are filled in.
-        num_leaves: Regions at the start.
-        num_merges: Merges wanted; the regions must be connected.
+        num_leaves: Number of regions at the start.
+        num_merges: Wanted number of merges; the regions must be connected.
         ceiling: First ceiling of the cost, squared colour times pixels.
 
     Returns:
@@ -82,7 +82,7 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
     return parents, num_nodes
 
 
-# names the leaves, dense from 0, when only the merges in keep are made
+# labels the leaves, dense from 0, if only the merges in ``keep`` are made
 _label_leaves = declare(
     "label_leaves", STATUS, parents=i4("num_nodes", below="num_nodes"), keep=u1("num_nodes"),
     names=i4("num_nodes", out=True), num_leaves=i8(),
@@ -94,14 +94,14 @@ def merge_regions(labels, pixels, num_regions, count, spread):
 
     Args:
         labels: Padded labels 0 to ``num_regions - 1``, each region 4-connected.
-        count: Regions wanted, 1 to ``num_regions``.
+        count: Wanted number of regions, 1 to ``num_regions``.
         spread: Square root of the weight of squared pixels against squared colours, float32.
 
     Returns:
         Padded labels 0 to ``count - 1``.
 
     Raises:
-        ValueError: If labels are outside of their range, or colours not finite.
+        ValueError: If labels are out of range, or colours are not finite.
     """
     num_merges = num_regions - count
     if num_merges == 0:
@@ -118,7 +118,7 @@ def merge_regions(labels, pixels, num_regions, count, spread):
     cut = np.partition(merges, num_merges - 1)[num_merges - 1]
     keep = heights < cut
     ties = np.flatnonzero(merges == cut) + num_regions
-    # Children come before their parents, so the first of the equal ones never lack a child.
+    # Children come before their parents, so of merges with equal heights the first ones have all their children.
     keep[ties[: num_merges - np.count_nonzero(merges < cut)]] = True
     names = np.empty(num_nodes, np.int32)
     _label_leaves(parents[:num_nodes], keep.view(np.uint8), names, num_regions)
