@@ -13,11 +13,10 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_budget, read_lines
 from gsmerge.io.formats import depth_maps
-from gsmerge.io.formats.table import may_hold_gaussians
+from gsmerge.io.formats.table import STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import natural_order
 from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
 from gsmerge.scene.no_gaussians import find_remedy
-from gsmerge.settings.extend import SUFFIX
 
 NamedScene = tuple[Path, Path | None]  # a scene, and the folder that the user named; None if that was the scene itself
 MAX_FOLDERS = 100_000  # folders without a scene after the last scene; a link into a system's folders leads to more
@@ -64,7 +63,7 @@ def find_named_scenes(arguments: Sequence[str], out: Path) -> Iterator[NamedScen
                     f"{out}: expected another folder for the results than for the scenes; name another --output"
                 )
             yield from _require_some(search.walk(path), argument, "in the folder")
-        elif path.suffix in (*SCENE_SUFFIXES, SUFFIX) and path.is_file():
+        elif path.suffix in (*SCENE_SUFFIXES, STATE_ENDING) and path.is_file():
             yield path, None
         elif glob.has_magic(argument) and not path.exists():
             yield from _require_some(_matches(argument, search), argument, "that match")

@@ -138,10 +138,9 @@ def _is_scene(word: str) -> bool:
         return False
     if os.path.lexists(word) or os.path.dirname(word):
         return True
-    from gsmerge.io.formats.table import SCENE_SUFFIXES
-    from gsmerge.settings.extend import SUFFIX
+    from gsmerge.io.formats.table import SCENE_SUFFIXES, STATE_ENDING
 
-    return word.lower().endswith((*SCENE_SUFFIXES, SUFFIX))
+    return word.lower().endswith((*SCENE_SUFFIXES, STATE_ENDING))
 
 
 def __getattr__(name: str) -> Any:

@@ -32,7 +32,6 @@ from gsmerge.cli.paths import (
 )
 from gsmerge.errors import TargetError, UsageError
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
-from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.reading import NONE
 from gsmerge.settings.stages import Engine
 
@@ -201,7 +200,9 @@ def _decode(args: opt.Args, path: Path, start: float) -> None:
 
 def _features_in(scenes: Sequence[Path]) -> Path | None:
     """Return the first path that is a ``.gsm`` of Feature Gaussians; None if there is none."""
-    states = [path for path in scenes if path.suffix.lower() == SUFFIX and path.is_file()]
+    from gsmerge.io.formats.table import STATE_ENDING
+
+    states = [path for path in scenes if path.suffix.lower() == STATE_ENDING and path.is_file()]
     if not states:
         return None
     from gsmerge.states.state_file import holds_features

@@ -9,7 +9,6 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs, files_beside, output_file
 from gsmerge.errors import UsageError
-from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import CleanOptions
@@ -71,9 +70,11 @@ def convert(args: opt.Args) -> None:
 
 def _convert_features(args: opt.Args, inputs: list[Path], output: Path) -> None:
     """Write the Feature Gaussians of a ``.gsm`` as arrays."""
+    from gsmerge.io.formats.table import STATE_ENDING
+
     path = inputs[0]
-    if len(inputs) > 1 or path.suffix.lower() != SUFFIX:
-        raise UsageError(f"{output}: expected one {SUFFIX} of Feature Gaussians to write as arrays, got {path}")
+    if len(inputs) > 1 or path.suffix.lower() != STATE_ENDING:
+        raise UsageError(f"{output}: expected one {STATE_ENDING} of Feature Gaussians to write as arrays, got {path}")
     args.require_scene(("paths", "overwrite", "json", "quiet"), path)
     from gsmerge.states.files import arrays_line, convert_features
 

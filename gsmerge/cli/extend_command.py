@@ -12,7 +12,7 @@ from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import input_files
 from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.extend import SUFFIX, ExtendOptions
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.reading import NONE
 
 
@@ -32,9 +32,11 @@ from gsmerge.settings.reading import NONE
 )
 def extend(args: opt.Args) -> None:
     """Compact new views and add them to a state, from which gsmerge compact makes a result at any time."""
+    from gsmerge.io.formats.table import STATE_ENDING
+
     start = perf_counter()
-    if args.state.suffix.lower() != SUFFIX:
-        raise UsageError(f"{args.state}: expected a state whose name ends in {SUFFIX}")
+    if args.state.suffix.lower() != STATE_ENDING:
+        raise UsageError(f"{args.state}: expected a state whose name ends in {STATE_ENDING}")
     hints, scenes = args.hints(), args.scenes or []
     if (args.remove is None) == (not scenes):
         raise UsageError("extend: expected either scenes to add or --remove NUMBER")

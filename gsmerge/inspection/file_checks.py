@@ -15,13 +15,12 @@ from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, read_all_cameras
 from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.read import degree_notes
-from gsmerge.io.formats.table import META, SCENE_SUFFIXES, SEVERAL_USES, find_format, may_hold_gaussians
+from gsmerge.io.formats.table import META, SCENE_SUFFIXES, SEVERAL_USES, STATE_ENDING, find_format, may_hold_gaussians
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.scene.exporters import AUTO
 from gsmerge.scene.files import find_scene_files, list_plys
 from gsmerge.scene.read import load_files
-from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.reading import OpacityChoice, ReadHints
 from gsmerge.states.state_file import holds_features, load_state
 
@@ -75,7 +74,7 @@ def holds_scene(path: Path) -> bool:
     suffix = path.suffix.lower()
     if suffix in SEVERAL_USES:
         return os.path.exists(path) and may_hold_gaussians(path)
-    if suffix == SUFFIX:
+    if suffix == STATE_ENDING:
         return os.path.isfile(path) and not holds_features(path)
     if path.name == META:
         return find_format(path).holds(path)
@@ -95,7 +94,7 @@ def list_damage(path: Path) -> list[str]:
 def _read(path: Path) -> FileCheck:
     """Read a file that is not a scene; SceneError if it cannot be read."""
     suffix = path.suffix.lower()
-    if suffix == SUFFIX:
+    if suffix == STATE_ENDING:
         return FileCheck(str(path), "Feature Gaussians", len(load_state(path)))
     if path.name == streamed.INDEX:
         return _read_levels(path)
@@ -106,7 +105,7 @@ def _read(path: Path) -> FileCheck:
     check_file(path)
     if suffix in SCENE_SUFFIXES:
         find_scene_files(path)  # which says what a file without Gaussians holds
-    endings = ", ".join(dict.fromkeys((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX)))
+    endings = ", ".join(dict.fromkeys((*SCENE_SUFFIXES, *CAMERAS, STATE_ENDING, NETWORKS, streamed.INDEX)))
     raise SceneError(path, f"expected one of {endings}, found another kind of file")
 
 

@@ -38,7 +38,6 @@ from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.read import Loaded, align_scene, read_gaussian_file
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import PicturedScene, Scene, StrPath
@@ -107,7 +106,7 @@ def inspect(
         report_progress("inspect: reading", 0, 3)
         ply = read_gaussian_file(files, opacity=opacity, hints=read_hints)
         report_progress("inspect: Gaussians", 1, 3)
-        described = _describe_file(ply) | {"batches": list_batches(files.ply) if files.ply.suffix == SUFFIX else []}
+        described = _describe_file(ply) | {"batches": list_batches(files.ply) if files.is_state else []}
         report_progress("inspect: views", 2, 3)
         document: dict[str, Any] = finite(described | _describe_views(ply, files, read_hints))
         document["notes"] = [*document["notes"], *degree_notes(ply.info)]

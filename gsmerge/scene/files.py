@@ -32,13 +32,13 @@ from gsmerge.io.formats.table import (
     POSES,
     SCENE_SUFFIXES,
     SEVERAL_USES,
+    STATE_ENDING,
     find_format,
     is_frame,
     may_hold_gaussians,
 )
 from gsmerge.io.image_names import check_photo_folder, list_images, natural_order
 from gsmerge.runtime.plugins import LazyFunction
-from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.reading import NONE
 from gsmerge.types import StrPath
 
@@ -125,7 +125,7 @@ class SceneFiles:
     @property
     def is_state(self) -> bool:
         """Whether it is a state, whose Gaussians have no pixels."""
-        return self.ply.suffix.lower() == SUFFIX
+        return self.ply.suffix.lower() == STATE_ENDING
 
     @property
     def base(self) -> Path:
@@ -183,7 +183,7 @@ def find_scene_files(
     camera_path, image_path, mask_path = map(named_path, given.values())
     protect = named_path(protect)
     _check_folders(masks=mask_path, protect=protect)
-    if path.suffix.lower() == SUFFIX and not os.path.isdir(path):
+    if path.suffix.lower() == STATE_ENDING and not os.path.isdir(path):
         check_file(path)
         own = path if cameras is None and _HOLDS_VIEWS(path) else None
         photos = image_path or (own if images is None else None)
@@ -206,7 +206,7 @@ def find_scene_files(
     if images is None and is_frame(ply):
         image_path = ply
     elif images is None and camera_path is not None:
-        has_images = camera_path.suffix in (CHUNK, SUFFIX) or (
+        has_images = camera_path.suffix in (CHUNK, STATE_ENDING) or (
             camera_path.suffix == ".npz" and holds_images(camera_path)
         )
         image_path = camera_path if has_images else None

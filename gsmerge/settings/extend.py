@@ -9,8 +9,6 @@ from typing import Any
 from gsmerge.settings.compact import CompactOptions, changed_settings
 from gsmerge.settings.setting import Settings, setting
 
-SUFFIX = ".gsm"  # ending of state files
-
 
 @dataclass(frozen=True)
 class ExtendOptions(Settings):

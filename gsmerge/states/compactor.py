@@ -10,9 +10,10 @@ from gsmerge.arguments import check_arguments
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import UsageError
+from gsmerge.io.formats.table import STATE_ENDING
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.read import as_scene
-from gsmerge.settings.extend import SUFFIX, batch_settings
+from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.extend import BatchReport, extend
 from gsmerge.states.features import decode_features, extend_features
@@ -169,6 +170,6 @@ class Compactor:
             ValueError: If there was no batch yet, or the name does not end in ``.gsm``.
             SceneError: If the file exists or cannot be written.
         """
-        if Path(path).suffix.lower() != SUFFIX:
-            raise ValueError(f"{path}: expected a name ending in {SUFFIX}")
+        if Path(path).suffix.lower() != STATE_ENDING:
+            raise ValueError(f"{path}: expected a name ending in {STATE_ENDING}")
         save_state(path, self.state, overwrite=overwrite)

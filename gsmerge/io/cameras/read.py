@@ -26,9 +26,8 @@ from gsmerge.io.cameras.json_files import (
 from gsmerge.io.cameras.transforms import read_transforms
 from gsmerge.io.cameras.viewer_cameras import ENDING
 from gsmerge.io.first_bytes import read_start
-from gsmerge.io.formats.table import MODEL_NAMES
+from gsmerge.io.formats.table import MODEL_NAMES, STATE_ENDING
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
-from gsmerge.settings.extend import SUFFIX
 from gsmerge.types import StrPath
 
 _lazy = lazy_functions(__package__)
@@ -216,7 +215,7 @@ CAMERA_FORMATS = (
                  ".npz", _READ_DA3, W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
     _RE10K,
     _SHARP,
-    CameraFormat("state", "inside a `.gsm` of gsmerge extend", SUFFIX, _READ_VIEWS, W2C_OPENCV, "pixels"),
+    CameraFormat("state", "inside a `.gsm` of gsmerge extend", STATE_ENDING, _READ_VIEWS, W2C_OPENCV, "pixels"),
 )  # fmt: skip
 CAMERA_ENDINGS = (*dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")), _LOG)
 _UNKNOWN = {  # what was expected of a file of an ending, and a remedy

@@ -17,10 +17,10 @@ from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import FLAT_COMMENT, MIP_COMMENT, StoredRows
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.plugins import lazy_functions
-from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.setting import join_words
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath
 
+STATE_ENDING = ".gsm"  # of states, as gsmerge extend writes them
 INDEX = "lod-meta.json"  # the name by which loaders recognise levels of detail in chunks
 MODEL_NAMES = POINTS, CAMERAS, IMAGES = "points3D.bin", "cameras.bin", "images.bin"
 FRAMES, POSES = "results_output", "camera_poses.txt"  # DA3-Streaming's folder of frames, and the poses beside it
@@ -163,7 +163,7 @@ DEPTHS = Format(
     holds=_lazy("depth_maps.holds_depth_maps"), each=(6.0,),
 )  # fmt: skip
 STATE = Format(
-    SUFFIX, "batches of views: Gaussians, cameras and pictures", _lazy("gsm.read_rows"), None, -1, each=(56.0,)
+    STATE_ENDING, "batches of views: Gaussians, cameras and pictures", _lazy("gsm.read_rows"), None, -1, each=(56.0,)
 )
 META = "meta.json"  # of a .sog that is a folder
 BY_PROGRAM = (  # which splat-transform reads in our place
