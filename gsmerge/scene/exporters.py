@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from gsmerge.alignment import ESTIMATED, MAY_BE_UNALIGNED, Layout
 from gsmerge.geometry import Similarity
-from gsmerge.io.cameras.json_files import FFGS
+from gsmerge.io.cameras.table import FFGS
 from gsmerge.settings.reading import OF_SCENE, QuatChoice, ReadHints
 from gsmerge.settings.setting import join_words, perhaps
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 import tempfile
 import warnings
@@ -19,17 +20,9 @@ import numpy as np
 from former_formats import compressed_bytes, spz4_bytes
 from made_gaussians import random_gaussians
 from model_files import long_lrm
-from program_cameras import write_globalsplat, write_metashape, write_opensfm, write_polycam
+from program_cameras import FORMATS
 from splat_transform_programs import write_set
-from tiny_scene import (
-    make_tiny,
-    save_json,
-    write_colmap_binary,
-    write_colmap_text,
-    write_inria,
-    write_npz,
-    write_transforms,
-)
+from tiny_scene import make_tiny, save_json, write_colmap_binary, write_colmap_text, write_npz
 
 import gsmerge
 from gsmerge.cli.parameters import parse_pairs
@@ -216,23 +209,19 @@ def levels(folder: Path) -> Iterable[bytes]:
 
 
 def json_cameras(folder: Path) -> Iterable[bytes]:
-    """Make cameras of every kind of JSON file."""
-    tiny = make_tiny(4, 4)
-    write_transforms(folder / "a.json", tiny)
-    write_inria(folder / "b.json", tiny)
-    Ks = np.tile(tiny.K, (3, 1, 1)).tolist()
-    views = [{"camera_id": str(i), "matrix": m.tolist()} for i, m in enumerate(tiny.c2w)]
-    lenses = [{"camera_id": str(i), "matrix": m} for i, m in enumerate(Ks)]
-    save_json(folder / "c.json", {"num_cameras": 3, "extrinsics": views, "intrinsics": lenses})
+    """Make cameras of every kind of JSON file, and nerfstudio's with lenses and with a field of view."""
+    for name in FORMATS:
+        path = FORMATS[name].write(folder)
+        if path.suffix == ".json":
+            yield path.read_bytes()
+    frames = json.loads(FORMATS["transforms.json"].write(folder).read_text())["frames"]
     lens = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 8, "w": 24, "h": 16, "k1": 0.1, "camera_model": "OPENCV"}
-    frames = [{"file_path": f"{i}.png", "transform_matrix": m.tolist(), **lens} for i, m in enumerate(tiny.c2w)]
-    save_json(folder / "d.json", {"frames": frames, "applied_transform": np.eye(4)[:3].tolist()})
-    save_json(folder / "e.json", frames)
-    save_json(folder / "f.json", {"camera_angle_x": 0.8, "frames": [{k: f[k] for k in list(f)[:2]} for f in frames]})
-    for name in "abcdef":
-        yield (folder / f"{name}.json").read_bytes()
-    for write in (write_globalsplat, write_opensfm):
-        yield write(folder).read_bytes()
+    lenses = [frame | lens for frame in frames]
+    for data in (
+        {"frames": lenses, "applied_transform": np.eye(4)[:3].tolist()},
+        {"camera_angle_x": 0.8, "frames": frames},
+    ):
+        yield json.dumps(data).encode()
 
 
 def colmap(write: Callable[..., None]) -> Seeds:
@@ -270,12 +259,12 @@ def pose_folder(folder: Path) -> Iterable[bytes]:
 
 def polycam(folder: Path) -> Iterable[bytes]:
     """Make the keyframes of Polycam, a file for each camera."""
-    yield pack(write_polycam(folder))
+    yield pack(FORMATS["Polycam"].write(folder))
 
 
 def metashape(folder: Path) -> Iterable[bytes]:
     """Make a file of Metashape, with and without its world."""
-    path = write_metashape(folder, "<k1>0.1</k1>")
+    path = FORMATS["Metashape"].write(folder, "<f>42", "<k1>0.1</k1><f>42")
     yield path.read_bytes()
     move = (
         b"<transform><rotation>1 0 0 0 1 0 0 0 1</rotation><translation>2 4 6</translation><scale>2</scale></transform>"
