@@ -192,7 +192,7 @@ def _exporters_page(page: str) -> str:
 
 def _formats_page(page: str) -> str:
     """Renew the tables of formats, of Gaussians and of cameras."""
-    from gsmerge.io.cameras.read import CAMERA_FORMATS
+    from gsmerge.io.cameras.table import CAMERA_FORMATS
     from gsmerge.io.formats.table import FORMATS as ROWS
 
     rows = [

@@ -14,7 +14,7 @@ from gsmerge.alignment.layouts import TRIMS, da3_box
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import PATCH, CameraFile, Convention, sizes_of, to_cameras
-from gsmerge.io.cameras.json_files import FFGS
+from gsmerge.io.cameras.table import FFGS
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
 from gsmerge.types import Cameras

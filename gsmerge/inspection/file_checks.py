@@ -12,7 +12,8 @@ from gsmerge.io import file_notes
 from gsmerge.io.archives import damaged_member
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.npz_files import read_depths
-from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, read_all_cameras
+from gsmerge.io.cameras.read import read_all_cameras
+from gsmerge.io.cameras.table import CAMERA_ENDINGS, CHUNK
 from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.read import degree_notes
 from gsmerge.io.formats.table import META, SCENE_SUFFIXES, SEVERAL_USES, STATE_ENDING, find_format, may_hold_gaussians

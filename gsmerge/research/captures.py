@@ -15,7 +15,8 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
-from gsmerge.io.cameras.read import CHUNK, read_cameras
+from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.cameras.table import CHUNK
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
 from gsmerge.scene.photos import stored_photos

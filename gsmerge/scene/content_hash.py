@@ -13,7 +13,7 @@ from gsmerge.io import SCENE_SUFFIXES, CameraFile, read_cameras
 from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.dataparser import DATAPARSER
 from gsmerge.io.cameras.foreign import INTRINSICS
-from gsmerge.io.cameras.json_files import FRAMES_FILE, POSE_FILE, SCALE_FILE
+from gsmerge.io.cameras.long_lrm import FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
 from gsmerge.scene.photos import images_beside
 

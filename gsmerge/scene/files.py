@@ -14,14 +14,8 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.foreign import check_program, find_unread
-from gsmerge.io.cameras.read import (
-    CHUNK,
-    find_cameras,
-    find_other_cameras,
-    holds_images,
-    read_cameras,
-    read_sharp_camera,
-)
+from gsmerge.io.cameras.read import find_cameras, find_other_cameras, holds_images, read_cameras, read_sharp_camera
+from gsmerge.io.cameras.table import CHUNK
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.ply import header_content, header_counts
 from gsmerge.io.formats.table import (

@@ -26,7 +26,8 @@ from gsmerge.evidence.scores import stands_out
 from gsmerge.frame import canonicalise
 from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.embedded import SHARP
-from gsmerge.io.cameras.read import CHUNK, read_cameras
+from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.cameras.table import CHUNK
 from gsmerge.io.first_bytes import CONVERT
 from gsmerge.io.formats.table import is_frame
 from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_key, propose_images

@@ -1,87 +1,158 @@
-"""Cameras of a few views as capture and survey programs write them: GlobalSplat, OpenSfM, Polycam, Metashape."""
+"""A camera file of each format with a declared layout: three views with the same poses and intrinsics."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scenes
-from tiny_scene import FLIP, save_json
+from hostile.case import HEIGHT, VIEWS, WIDTH
+from tiny_scene import FLIP
 
 from gsmerge.geometry import motion_vectors
 from gsmerge.kernels.matrices import invert, matmul
 
-VIEWS, WIDTH, HEIGHT = 3, 24, 16
-C2W = invert(scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64))
-MOTIONS = motion_vectors(np.tile(np.eye(4), (VIEWS, 1, 1)), invert(C2W))
-K = np.array([[40.0, 0, WIDTH / 2 + 1], [0, 42, HEIGHT / 2 - 2], [0, 0, 1]])
-SIDE = max(WIDTH, HEIGHT)
+W2C = scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64)
+C2W = invert(W2C)
+C2W_OPENGL = matmul(C2W, FLIP)
+FX, FY, CX, CY = 40.0, 42.0, WIDTH / 2 + 1, HEIGHT / 2 - 2
+K = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+K_DIVIDED = K / [[WIDTH], [HEIGHT], [1]]  # by the size
+NAMES = ("0.png", "1.png", "2.png")
+POINT = {"fx": FX, "fy": FY, "cx": CX, "cy": CY}
 SIZE = {"width": WIDTH, "height": HEIGHT}
+NERFSTUDIO = {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": WIDTH, "h": HEIGHT}
 
 
-def write_globalsplat(folder: Path, scale: tuple[float, float] = (1, 1)) -> Path:
-    intrinsic = (K / [[scale[0]], [scale[1]], [1]]).tolist()
-    views = [{"image": f"{i}.png", "intrinsic": intrinsic, "c2w": pose.tolist()} for i, pose in enumerate(C2W)]
-    return save_json(folder / "cameras.json", {"image_shape": [HEIGHT, WIDTH], "views": views})
+class CameraText(NamedTuple):
+    """The files of a format.
+
+    Args:
+        place: What is read.
+        files: Text by path.
+        names: Of the views.
+        size: (width, height) of the views.
+    """
+
+    place: str
+    files: dict[str, str]
+    names: tuple[str, ...] = NAMES
+    size: tuple[int, int] = (WIDTH, HEIGHT)
+
+    def write(self, folder: Path, old: str = "", new: str = "") -> Path:
+        """Write the files into a folder, with a text replaced in the first; return what is read."""
+        for i, (name, text) in enumerate(self.files.items()):
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            assert old in text
+            path.write_text(text.replace(old, new) if old and i == 0 else text)
+        return folder / self.place
 
 
-def write_globalsplat_divided(folder: Path) -> Path:
-    return write_globalsplat(folder, (WIDTH, HEIGHT))
+def in_json(place: str, data: Any, **expected: Any) -> CameraText:
+    """Make a format of one JSON file."""
+    return CameraText(place, {place: json.dumps(data)}, **expected)
 
 
-def write_opensfm(folder: Path, **lens: object) -> Path:
-    camera = {
-        "projection_type": "brown", **SIZE, "focal_x": K[0, 0] / SIDE, "focal_y": K[1, 1] / SIDE,
-        "c_x": (K[0, 2] - WIDTH / 2) / SIDE, "c_y": (K[1, 2] - HEIGHT / 2) / SIDE, **lens,
-    }  # fmt: skip
+def each(of: Callable[[str, np.ndarray], Any], poses: np.ndarray = C2W) -> list[Any]:
+    """List what a function returns for the name and pose of each view."""
+    return [of(name, pose) for name, pose in zip(NAMES, poses, strict=True)]
+
+
+def opensfm() -> list[dict[str, Any]]:
+    side = max(WIDTH, HEIGHT)
+    camera = {"projection_type": "brown", **SIZE, "focal_x": FX / side, "focal_y": FY / side,
+              "c_x": (CX - WIDTH / 2) / side, "c_y": (CY - HEIGHT / 2) / side}  # fmt: skip
+    motions = motion_vectors(np.tile(np.eye(4), (VIEWS, 1, 1)), W2C)
     shots = {
-        f"{i}.png": {"rotation": motion[:3].tolist(), "translation": pose[:3, 3].tolist(), "camera": "v2"}
-        for i, (pose, motion) in enumerate(zip(invert(C2W), MOTIONS, strict=True))
+        name: {"rotation": motion[:3].tolist(), "translation": motion[3:].tolist(), "camera": "v2"}
+        for name, motion in zip(NAMES, motions, strict=True)
     }
-    parts = [{"cameras": {}, "shots": {}}, {"cameras": {"v2": camera}, "shots": shots}]
-    return save_json(folder / "reconstruction.json", parts)
+    return [{"cameras": {}, "shots": {}}, {"cameras": {"v2": camera}, "shots": shots}]
 
 
-def write_polycam(folder: Path) -> Path:
-    place = folder / "keyframes" / "corrected_cameras"
-    place.mkdir(parents=True)
-    for i, pose in enumerate(matmul(C2W, FLIP)):
-        values = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
-        values |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], **SIZE}
-        save_json(place / f"{8 + i}.json", values)
-    return place
+def polycam(pose: np.ndarray) -> str:
+    entries = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+    return json.dumps({**entries, **POINT, **SIZE})
 
 
-def write_metashape(folder: Path, lens: str = "", kind: str = "frame") -> Path:
+def metashape() -> str:
     size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
-    poses = [" ".join(map(repr, pose.ravel().tolist())) for pose in C2W]
     cameras = [
-        f'<camera id="{i}" sensor_id="0" label="{i}"><transform>{pose}</transform></camera>'
-        for i, pose in enumerate(poses)
+        f'<camera id="{i}" sensor_id="0" label="{name}"><transform>{" ".join(map(repr, pose))}</transform></camera>'
+        for i, (name, pose) in enumerate(zip(NAMES, C2W.reshape(VIEWS, 16).tolist(), strict=True))
     ]
-    path = folder / "cameras.xml"
-    path.write_text(
-        f'<?xml version="1.0" encoding="UTF-8"?><document><chunk><sensors><sensor id="0" type="{kind}">{size}'
-        f'<calibration class="adjusted">{size}<f>42</f><b1>-2</b1><cx>1</cx><cy>-2</cy>{lens}</calibration>'
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?><document><chunk><sensors><sensor id="0" type="frame">{size}'
+        f'<calibration class="adjusted">{size}<f>42</f><b1>-2</b1><cx>1</cx><cy>-2</cy></calibration>'
         f'<calibration class="initial">{size}<f>1</f></calibration></sensor></sensors>'
         f'<cameras>{"".join(cameras)}<camera id="99" sensor_id="1" label="not placed"/></cameras></chunk></document>'
     )
-    return path
 
 
-def world_mirror(c2w: np.ndarray, K: np.ndarray) -> dict[str, Any]:
-    """The document of WorldMirror's ``camera_params.json``."""
-    poses = [{"camera_id": name, "matrix": pose.tolist()} for name, pose in zip(view_names(c2w), c2w, strict=True)]
-    return {"extrinsics": poses, "intrinsics": [{**pose, "matrix": K.tolist()} for pose in poses]}
-
-
-def long_lrm(c2w: np.ndarray, K: np.ndarray, size: tuple[int, int] = (WIDTH, HEIGHT)) -> dict[str, Any]:
-    """The document of Long-LRM's cameras."""
-    common = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": size[0], "h": size[1]}
-    poses = zip(view_names(c2w), invert(c2w), strict=True)
-    return {"frames": [{"file_path": name, "w2c": pose.tolist(), **common} for name, pose in poses]}
-
-
-def view_names(c2w: np.ndarray) -> list[str]:
-    return [f"view_{view:03d}" for view in range(len(c2w))]
+FORMATS = {
+    "transforms.json": in_json(
+        "transforms.json",
+        {
+            **NERFSTUDIO,
+            "frames": each(lambda name, pose: {"file_path": name, "transform_matrix": pose.tolist()}, C2W_OPENGL),
+        },
+    ),
+    "frame list": in_json(
+        "transforms.json",
+        each(lambda name, pose: {"image_path": name, "transform_matrix": pose.tolist(), **NERFSTUDIO}),
+    ),
+    "Long-LRM": in_json(
+        "scene.json",
+        {
+            "frames": each(
+                lambda name, pose: {"file_path": name, "w2c": pose.tolist(), **POINT, "w": WIDTH, "h": HEIGHT}, W2C
+            )
+        },
+    ),
+    "INRIA cameras.json": in_json(
+        "cameras.json",
+        each(
+            lambda name, pose: {
+                "img_name": name,
+                "rotation": pose[:3, :3].tolist(),
+                "position": pose[:3, 3].tolist(),
+                **POINT,
+                **SIZE,
+            }
+        ),
+    ),
+    "GlobalSplat cameras.json": in_json(
+        "cameras.json",
+        {
+            "image_shape": [HEIGHT, WIDTH],
+            "views": each(lambda name, pose: {"image": name, "intrinsic": K.tolist(), "c2w": pose.tolist()}),
+        },
+    ),
+    "ffgs cameras.json": in_json(
+        "cameras.json",
+        {
+            "frame": "model",
+            "image_shape": [HEIGHT, WIDTH],
+            "views": each(lambda name, pose: {"file": name, "c2w": pose.tolist(), "k_normalized": K_DIVIDED.tolist()}),
+        },
+    ),
+    "camera_params.json": in_json(
+        "camera_params.json",
+        {
+            "extrinsics": each(lambda name, pose: {"camera_id": name, "matrix": pose.tolist()}),
+            "intrinsics": each(lambda name, _: {"camera_id": name, "matrix": K.tolist()}),
+        },
+        size=(2 * int(CX), 2 * int(CY)),  # of which the principal point is the middle
+    ),
+    "OpenSfM": in_json("reconstruction.json", opensfm()),
+    "Polycam": CameraText(
+        "keyframes/corrected_cameras",
+        {f"keyframes/corrected_cameras/{8 + i}.json": polycam(pose) for i, pose in enumerate(C2W_OPENGL)},
+        names=("8", "9", "10"),
+    ),
+    "Metashape": CameraText("cameras.xml", {"cameras.xml": metashape()}),
+}

@@ -15,7 +15,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rotation_entries
 from gsmerge.io.bounds import MAX_MODEL_BYTES, read_lines
 from gsmerge.io.cameras.camera_file import StoredView, check_count, make_lens, make_pinhole
-from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 
 # number of parameters of each model, in the order of their ids; the first are focal lengths and principal point
 _NUM_PARAMS = {

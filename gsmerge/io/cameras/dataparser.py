@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.geometry import Similarity
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import MAX_NUMBER, make_similarity
-from gsmerge.io.cameras.camera_format import number_errors, to_array, to_number
+from gsmerge.io.cameras.camera_source import number_errors, to_array, to_number
 from gsmerge.kernels.matrices import invert, matmul
 
 DATAPARSER = "dataparser_transforms.json"
@@ -28,7 +28,7 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
     if path is None:
-        from gsmerge.io.cameras.programs import read_metashape_world  # few files need it
+        from gsmerge.io.cameras.metashape import read_metashape_world  # few files need it
 
         world = read_metashape_world(cameras) if cameras is not None and cameras.suffix == ".xml" else None
         return [] if world is None else [world, replace(world, scale=1.0, shift=world.shift / world.scale)]

@@ -7,7 +7,7 @@ from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import StoredView, make_pinhole
-from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.formats.table import PLY, find_format
 
 SHARP = "SHARP"  # source of such cameras

@@ -24,7 +24,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import check_file, check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, StoredView, check_count
-from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.colmap import read_colmap
 from gsmerge.io.photo_files import PhotoArrays
 

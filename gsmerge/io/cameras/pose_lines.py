@@ -18,7 +18,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.io.bounds import MAX_TEXT_BYTES, check_file, read_lines
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, StoredView, check_count, make_pinhole
-from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.foreign import INTRINSICS, POSE_FOLDERS
 from gsmerge.io.cameras.npz_files import array_shape
 from gsmerge.io.formats.table import FRAMES, POSES

@@ -1,138 +1,77 @@
-"""Cameras as capture and survey programs write them: OpenSfM and WebODM, Polycam, Metashape.
-
-Each reader makes the frames of a ``transforms.json`` from its file, which are then read as those.
-"""
+"""List the views of programs that store them in several lists or files: OpenSfM, Polycam, WorldMirror."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
-from gsmerge.geometry import Similarity, motion_matrices
+from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_json
-from gsmerge.io.cameras.camera_file import check_count, make_similarity
-from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras, number_errors
-from gsmerge.io.cameras.transforms import transforms_views
+from gsmerge.io.cameras.camera_file import CENTRED_PX, MAX_NORMALISED_FOCAL, MAX_NUMBER, StoredView, check_count
+from gsmerge.io.cameras.camera_source import CameraSource, number_errors
+from gsmerge.io.cameras.view_layout import Entry
 from gsmerge.io.image_names import natural_key
-from gsmerge.io.xml_files import read_xml
-
-_MODELS = {  # of OpenSfM, by names of lenses that mean the same
-    "perspective": "OPENCV", "brown": "OPENCV", "simple_radial": "OPENCV", "radial": "OPENCV",
-    "fisheye": "OPENCV_FISHEYE", "fisheye_opencv": "OPENCV_FISHEYE",
-}  # fmt: skip
-_SENSORS = {"frame": "OPENCV", "fisheye": "OPENCV_FISHEYE"}  # of Metashape
-_MATRIX = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]  # keys of Polycam
-_ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component_id", "label"}  # of Metashape
 
 
-def read_opensfm(source: CameraSource) -> StoredCameras:
-    """Read the cameras of the reconstruction with the most images; SceneError if a value is missing or no number."""
-    path = source.path
-    with number_errors(path, "expected reconstructions of 'cameras' and 'shots'"):
+def list_shots(source: CameraSource) -> list[Entry]:
+    """List the shots of OpenSfM's reconstruction that has most of them, each with its camera."""
+    with number_errors(source.path, "expected reconstructions of 'cameras' and 'shots'"):
         largest = max(source.json, key=lambda entry: len(entry["shots"]))
-        shots = dict(largest["shots"])
-        check_count(path, len(shots))
-        cameras = {name: _opensfm_camera(camera) for name, camera in largest["cameras"].items()}
-        motions = np.array([[*shot["rotation"], *shot["translation"]] for shot in shots.values()], np.float64)
-        poses = motion_matrices(motions.reshape(-1, 6))
-        frames = [
-            {"file_path": name, "transform_matrix": pose, **cameras[shot["camera"]]}
-            for (name, shot), pose in zip(shots.items(), poses, strict=True)
-        ]
-    return StoredCameras(transforms_views(path, frames))
+        shots, cameras = dict(largest["shots"]), largest["cameras"]
+        check_count(source.path, len(shots))
+        entries = [Entry(shot, cameras[shot["camera"]], name) for name, shot in shots.items()]
+        if not all(isinstance(entry.shared, dict) for entry in entries):
+            raise TypeError("found a camera that is no object")
+        return entries
 
 
-def _opensfm_camera(camera: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the intrinsics of a camera, which are divided by the larger side and count from the middle."""
-    width, height = float(camera["width"]), float(camera["height"])
-    side = max(width, height)
-    fx = side * float(camera["focal_x"] if "focal_x" in camera else camera["focal"])
-    fy = side * float(camera["focal_y"]) if "focal_y" in camera else fx
-    cx, cy = width / 2 + side * float(camera.get("c_x", 0)), height / 2 + side * float(camera.get("c_y", 0))
-    lens = {key: camera.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
-    model = _MODELS.get(camera["projection_type"], camera["projection_type"])
-    return {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "camera_model": model, **lens}
-
-
-def read_polycam(source: CameraSource) -> StoredCameras:
-    """Read the cameras of a folder, a file each; SceneError if a value is missing or no number."""
-    frames, paths = [], sorted(source.path.glob("*.json"), key=lambda path: natural_key(path.name))
+def list_keyframes(source: CameraSource) -> list[Entry]:
+    """List the views of a folder of Polycam, which has a file for each."""
+    paths = sorted(source.path.glob("*.json"), key=lambda path: natural_key(path.name))
     check_count(source.path, len(paths))
-    for path in paths:
-        values = read_json(path)
-        with number_errors(path, "expected t_00 to t_23, fx, fy, cx, cy, width, height as numbers"):
-            frame = {"fl_x": values["fx"], "fl_y": values["fy"], "w": values["width"], "h": values["height"]}
-            pose = [[values[key] for key in row] for row in _MATRIX]
-            frames.append(
-                {"file_path": path.stem, "transform_matrix": pose, "cx": values["cx"], "cy": values["cy"]} | frame
-            )
-    return StoredCameras(transforms_views(source.path, frames))
+    return [Entry(_read_object(path), name=path.stem, path=path) for path in paths]
 
 
-def read_metashape(source: CameraSource) -> StoredCameras:
-    """Read the cameras of Metashape's largest component; SceneError if a value is missing or no number."""
-    path = source.path
-    root, cameras = _metashape_cameras(path)
-    with number_errors(path, "expected sensors with 'calibration', and cameras with 'transform'"):
-        sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
-        intrinsics = {
-            name: _metashape_sensor(sensors[name]) for name in {camera.get("sensor_id") for camera in cameras}
-        }
-        frames = [
-            {
-                "file_path": camera.get("label"),
-                "transform_matrix": np.array(camera.findtext("transform", "").split(), np.float64).reshape(4, 4),
-                **intrinsics[camera.get("sensor_id")],
-            }
-            for camera in cameras
-        ]
-    return StoredCameras(transforms_views(path, frames))
+def _read_object(path: Path) -> dict[str, Any]:
+    values = read_json(path)
+    if not isinstance(values, dict):
+        raise SceneError(path, "expected an object with the values of a view, found something else")
+    return values
 
 
-def read_metashape_world(path: Path) -> Similarity | None:
-    """Read how Metashape places the cameras in its world, in which it may have exported them otherwise; None if not."""
-    root, cameras = _metashape_cameras(path)
-    component = cameras[0].get("component_id") if cameras else None
-    own = [each for each in root.iter("component") if each.get("id") == component]
-    move = next((found for each in (*own, *root.iter("chunk")) if (found := each.find("transform")) is not None), None)
-    if move is None:
-        return None
-    text = "expected rotation, translation and scale of 'transform' as numbers"
-    with number_errors(path, text), np.errstate(all="ignore"):
-        R, shift, scale = (
-            np.array(move.findtext(tag, default).split(), np.float64)
-            for tag, default in (("rotation", "1 0 0 0 1 0 0 0 1"), ("translation", "0 0 0"), ("scale", "1"))
-        )
-        return make_similarity(path, np.column_stack([R.reshape(3, 3), shift.reshape(3) / scale]), scale.item())
+def join_matrices(source: CameraSource) -> list[Entry]:
+    """List WorldMirror's views: each has the same ``camera_id`` in the lists "extrinsics" and "intrinsics".
+
+    ``camera_id`` is the stem of the image's name, or its number. Views are in the order of the numbers, otherwise in
+    the file's. SceneError if one of the lists lacks a view.
+    """
+    poses, Ks = (_matrices_by_id(source, key) for key in ("extrinsics", "intrinsics"))
+    if poses.keys() != Ks.keys():
+        single = sorted(poses.keys() ^ Ks.keys())[0]
+        problem = f"expected extrinsics and intrinsics of the same cameras, found only one for {single}"
+        raise SceneError(source.path, problem)
+    names = sorted(poses, key=natural_key) if all(name.isdecimal() for name in poses) else list(poses)
+    return [Entry({"extrinsics": poses[name], "intrinsics": Ks[name]}, name=name) for name in names]
 
 
-def _metashape_cameras(path: Path) -> tuple[ElementTree.Element, list[ElementTree.Element]]:
-    """Parse a file, and list the cameras with a pose, of the component that has most of them."""
-    root = read_xml(path, _ATTRIBUTES)
-    cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
-    check_count(path, len(cameras))
-    largest = dict(Counter(camera.get("component_id") for camera in cameras).most_common(1))
-    return root, [camera for camera in cameras if camera.get("component_id") in largest]
+def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
+    entries: Sequence[Mapping[str, Any]] = source.object[key]
+    if not isinstance(entries, list):
+        raise SceneError(source.path, f"expected {key!r} to be a list, found something else")
+    check_count(source.path, len(entries))
+    with number_errors(source.path, f"{key}: expected entries of 'camera_id' and 'matrix'"):
+        return {str(entry["camera_id"]): entry["matrix"] for entry in entries}
 
 
-def _metashape_sensor(sensor: ElementTree.Element) -> dict[str, Any]:
-    """Return the intrinsics of a sensor, whose principal point counts from the middle."""
-    calibration = max(sensor.findall("calibration"), key=lambda entry: entry.get("class") == "adjusted")
-    size = [*calibration.findall("resolution"), *sensor.findall("resolution")][0].attrib
-    width, height = float(size["width"]), float(size["height"])
-    numbers = {child.tag: float(child.text or "") for child in calibration if child.tag != "resolution"}
-    focal = {"fl_x": numbers["f"] + numbers.get("b1", 0), "fl_y": numbers["f"]}
-    centre = {"cx": numbers.get("cx", 0) + width / 2, "cy": numbers.get("cy", 0) + height / 2}
-    # p1 and p2 are the other way round than OpenCV's
-    lens = {
-        "p1": numbers.get("p2"),
-        "p2": numbers.get("p1"),
-        **{key: numbers.get(key) for key in ("k1", "k2", "k3", "k4")},
-    }
-    model = _SENSORS.get(sensor.get("type", "frame"), sensor.get("type"))
-    return {"w": width, "h": height, "camera_model": model, **focal, **centre, **lens}
+def set_centred_size(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
+    """Set the size of which all principal points are the middle; leave it unknown if there is none."""
+    sides = 2 * np.array([view.K for view in views])[:, :2, 2].reshape(-1, 2) if views else np.zeros((0, 2))
+    whole = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
+    centred = len(sides) > 0 and bool((np.abs(sides - whole) <= CENTRED_PX).all())
+    if not centred or not (whole > MAX_NORMALISED_FOCAL).all():
+        return views
+    size = int(whole[0, 0]), int(whole[0, 1])
+    return [view._replace(size=size) for view in views]

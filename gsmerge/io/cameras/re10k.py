@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.errors import SceneError, refuse_without_torch
 from gsmerge.io.bounds import MAX_VIEWS, read_budget
 from gsmerge.io.cameras.camera_file import StoredView, make_pinhole
-from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.photo_files import PhotoArrays, decode_embedded, photo_size
 
 with refuse_without_torch():

@@ -18,7 +18,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import project_points, rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, StoredView, make_camera_file
-from gsmerge.io.cameras.camera_format import CameraSource
+from gsmerge.io.cameras.camera_source import CameraSource
 from gsmerge.io.cameras.npz_files import (
     array_names,
     array_shape,

@@ -13,7 +13,8 @@ from typing import Any, Literal
 from gsmerge.batch.find import find_scenes, main_file, scene_plys
 from gsmerge.batch.jobs import Job
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.cameras.read import find_cameras, is_colmap
+from gsmerge.io.cameras.read import find_cameras
+from gsmerge.io.cameras.table import is_colmap
 from gsmerge.io.formats.table import estimate_counts
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.lines import ONE_SIZE, SIZES

@@ -45,6 +45,8 @@ RE10K = lines(lambda i: f"{100 * i} {text([40 / WIDTH, 42 / HEIGHT, 25 / WIDTH, 
 SRN = f"{text([40, 25, 16, 0])}\n0. 0. 0.\n1.\n{HEIGHT} {WIDTH}\n"
 LAYOUTS: dict[str, tuple[str, dict[str, str]]] = {  # place of the poses, and all files
     "KITTI": ("poses.txt", {"poses.txt": lines(lambda i: text(C2W[i, :3])), "intrinsics.txt": FOCAL}),
+    "DA3-Streaming": ("camera_poses.txt", {"camera_poses.txt": lines(lambda i: text(C2W[i])), "intrinsic.txt": FOCAL}),
+    "a byte order mark": ("poses.txt", {"poses.txt": "\ufeff" + lines(lambda i: text(C2W[i])), "intrinsic.txt": FOCAL}),
     "TUM": ("KeyFrameTrajectory.txt", {"KeyFrameTrajectory.txt": f"# time tx ty tz\n{TUM}", "intrinsic.txt": FOCAL}),
     "MonST3R": ("pred_traj.txt", {"pred_traj.txt": TUM, "pred_intrinsics.txt": lines(lambda i: text(K))}),
     "RealEstate10K": ("0a1b.txt", {"0a1b.txt": f"https://www.youtube.com/watch?v=a\n{RE10K}"}),
@@ -61,7 +63,7 @@ def write(folder: Path, name: str) -> Path:
     for file, content in files.items():
         path = folder / file
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content)
+        path.write_text(content, encoding="utf-8")
     return folder / place
 
 
@@ -94,7 +96,8 @@ def test_a_view_without_a_pose_is_left_out(tmp_path: Path) -> None:
         ("MonST3R", "pred_intrinsics.txt", f"{text(K)}\n{text(K)}\n", ("pred_intrinsics.txt", "3 views, found 2")),
         ("SRN", "intrinsics.txt", "1 2\n", ("intrinsics.txt", "fx, fy, cx, cy")),
         ("SRN", "pose/1.txt", "a b c d\n", ("pose: line 2", "found 4")),
-        ("KITTI", "intrinsics.txt", "", ("intrinsics.txt", "found 0")),
+        ("KITTI", "intrinsics.txt", "", ("intrinsics.txt", "3 views, found 0")),
+        ("KITTI", "intrinsics.txt", "a b c d", ("intrinsics.txt: line 1", "'a'")),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_named(tmp_path: Path, name: str, file: str, content: str, named: tuple[str, ...]) -> None:

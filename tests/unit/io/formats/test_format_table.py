@@ -7,13 +7,20 @@ from functools import partial
 import pytest
 
 from gsmerge.io.cameras import read as camera_reader
-from gsmerge.io.cameras.read import CAMERA_FORMATS
+from gsmerge.io.cameras import table as camera_table
+from gsmerge.io.cameras.table import CAMERA_FORMATS
+from gsmerge.io.cameras.view_layout import ViewLayout
 from gsmerge.io.formats import glb, sog, splat, spz, streamed, usd
 from gsmerge.io.formats.table import FORMATS, LEVELS
 from gsmerge.runtime.plugins import LazyFunction
 
-ENTRIES = [entry for row in (*FORMATS, *CAMERA_FORMATS) for entry in vars(row).values()]
-FUNCTIONS = [entry.func if isinstance(entry, partial) else entry for entry in (*ENTRIES, *vars(camera_reader).values())]
+LAYOUTS = [row.read for row in CAMERA_FORMATS if isinstance(row.read, ViewLayout)]
+ENTRIES = [
+    entry
+    for table in (*FORMATS, *CAMERA_FORMATS, *LAYOUTS, camera_reader, camera_table)
+    for entry in vars(table).values()
+]
+FUNCTIONS = [entry.func if isinstance(entry, partial) else entry for entry in ENTRIES]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Camera formats as records: how the files of one are recognised and read, and how they store poses."""
+"""What readers of camera files take and return: a file whose content is read once, and cameras before conversion."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from plyfile import PlyData
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_json
-from gsmerge.io.cameras.camera_file import CameraFile, Convention, StoredView, make_camera_file
+from gsmerge.io.cameras.camera_file import Convention, StoredView
 from gsmerge.io.formats.ply import open_ply
 from gsmerge.io.photo_files import PhotoArrays
 
 
 @dataclass(frozen=True)
 class CameraSource:
-    """A camera file or COLMAP folder, whose content is read once, at the first use."""
+    """A camera file or folder, whose content is read once, at the first use."""
 
     path: Path
-    scene: str | None = None  # which one, where a file holds several
-    folder: Path | None = None  # of the Gaussians, where a backbone writes how it moved the cameras
+    scene: str | None = None  # the scene's name, for files that hold several scenes
+    folder: Path | None = None  # of the Gaussians, beside which some models write how they moved the cameras
 
     @cached_property
     def json(self) -> Any:
@@ -55,34 +55,12 @@ class StoredCameras(NamedTuple):
     views: list[StoredView]
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
     order: str = "auto"  # of the Gaussians' rows
-    convention: Convention | None = None  # where the numbers show another one than the format's
-
-
-@dataclass(frozen=True)
-class CameraFormat:
-    """A format of camera files: how to recognise and read it, and its conventions."""
-
-    name: str  # the ``source`` of its cameras
-    files: str  # for people
-    ending: str  # of files' names, in lower case; "" for a folder
-    read: Callable[[CameraSource], StoredCameras]  # SceneError where it is damaged
-    convention: Convention
-    intrinsics: str  # how they are stored, for people
-    recognise: Callable[[CameraSource], bool] = lambda _: True  # of a file with the ending
-
-    def cameras(self, source: CameraSource) -> CameraFile:
-        """Read the cameras of a file; SceneError if it is damaged or incomplete."""
-        return self.convert(source.path, self.read(source))
-
-    def convert(self, path: Path, stored: StoredCameras) -> CameraFile:
-        """Convert the cameras that a file stores; SceneError if one of them is invalid."""
-        convention = stored.convention or self.convention
-        return make_camera_file(path, self.name, convention, stored.views, stored.images, stored.order)
+    convention: Convention | None = None  # that the numbers show; None: that of the format
 
 
 @contextmanager
 def number_errors(path: Path, expected: str) -> Iterator[None]:
-    """Turn errors of missing entries, and of values that are no numbers or objects, in the block into a SceneError."""
+    """Raise SceneError with the file and what was expected if the block meets a missing key or a wrong value."""
     try:
         yield
     except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError) as error:
@@ -102,3 +80,11 @@ def to_array(values: Any) -> np.ndarray:
     if bool in set(map(type, np.array(values, object).flat)):
         raise TypeError("found true or false")
     return array
+
+
+def convert(function: Callable[[Any], Any], key: str, value: Any) -> Any:
+    """Convert the value of a key; ValueError that begins with the key if the value is wrong."""
+    try:
+        return function(value)
+    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise ValueError(f"{key!r}: {error}") from error

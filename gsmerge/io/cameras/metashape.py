@@ -1,0 +1,74 @@
+"""Metashape's ``.xml``: its cameras, and where its world is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from gsmerge.geometry import Similarity
+from gsmerge.io.cameras.camera_file import check_count, make_similarity
+from gsmerge.io.cameras.camera_source import CameraSource, number_errors
+from gsmerge.io.cameras.view_layout import Entry
+from gsmerge.io.xml_files import read_xml
+
+_ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component_id", "label"}
+
+
+def list_cameras(source: CameraSource) -> list[Entry]:
+    """List the cameras of the largest component, each with its sensor."""
+    root, cameras = _largest_component(source.path)
+    with number_errors(source.path, "expected sensors with 'calibration', and cameras with 'transform'"):
+        sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
+        used = {camera.get("sensor_id") for camera in cameras}
+        values = {sensor_id: _sensor_values(sensors[sensor_id]) for sensor_id in used}
+        return [
+            Entry(
+                {"transform": np.array(camera.findtext("transform", "").split(), np.float64).reshape(4, 4)},
+                values[camera.get("sensor_id")],
+                camera.get("label") or "",
+            )
+            for camera in cameras
+        ]
+
+
+def _sensor_values(sensor: Element) -> dict[str, Any]:
+    """Return size, intrinsics and lens of a sensor: its adjusted calibration, if there is one."""
+    calibration = max(sensor.findall("calibration"), key=lambda entry: entry.get("class") == "adjusted")
+    size = [*calibration.findall("resolution"), *sensor.findall("resolution")][0].attrib
+    numbers = {child.tag: float(child.text or "") for child in calibration if child.tag != "resolution"}
+    values: dict[str, Any] = {key: numbers[key] for key in ("cx", "cy", "k1", "k2", "k3", "k4") if key in numbers}
+    # p1 and p2 are OpenCV's p2 and p1
+    values |= {opencv: numbers[key] for key, opencv in (("p1", "p2"), ("p2", "p1")) if key in numbers}
+    fx, fy = numbers["f"] + numbers.get("b1", 0), numbers["f"]
+    values |= {"width": float(size["width"]), "height": float(size["height"]), "fx": fx, "fy": fy}
+    return values | {"type": sensor.get("type", "frame")}
+
+
+def read_metashape_world(path: Path) -> Similarity | None:
+    """Read the map from the cameras' world to Metashape's, in which its other exports may be; None without one."""
+    root, cameras = _largest_component(path)
+    component = cameras[0].get("component_id") if cameras else None
+    places = [*(each for each in root.iter("component") if each.get("id") == component), *root.iter("chunk")]
+    move = next((found for place in places if (found := place.find("transform")) is not None), None)
+    if move is None:
+        return None
+    text = "expected rotation, translation and scale of 'transform' as numbers"
+    with number_errors(path, text), np.errstate(all="ignore"):
+        R, shift, scale = (
+            np.array(move.findtext(tag, default).split(), np.float64)
+            for tag, default in (("rotation", "1 0 0 0 1 0 0 0 1"), ("translation", "0 0 0"), ("scale", "1"))
+        )
+        return make_similarity(path, np.column_stack([R.reshape(3, 3), shift.reshape(3) / scale]), scale.item())
+
+
+def _largest_component(path: Path) -> tuple[Element, list[Element]]:
+    """Parse a file, and list the cameras that have a pose, of the component that has most of them."""
+    root = read_xml(path, _ATTRIBUTES)
+    cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
+    check_count(path, len(cameras))
+    largest = dict(Counter(camera.get("component_id") for camera in cameras).most_common(1))
+    return root, [camera for camera in cameras if camera.get("component_id") in largest]

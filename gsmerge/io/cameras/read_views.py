@@ -1,0 +1,191 @@
+"""Read the views of any file whose layout is declared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import Lens, StoredView, check_count, make_lens, make_pinhole
+from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras, convert, number_errors, to_number
+from gsmerge.io.cameras.view_layout import Entry, Key, Matrix, ViewLayout
+from gsmerge.io.image_names import find_image
+from gsmerge.io.photo_files import Size, image_size
+from gsmerge.kernels.elementary import cos, sin
+
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's "distortion_params"
+_COEFFICIENTS = (*_DISTORTION, "k5", "k6")
+_DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
+_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
+_FOCAL = ("fx", "fy", "angle_x", "angle_y")  # values from which a focal length follows
+_MAX_MODEL = 40  # letters of a camera model's name
+
+
+def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
+    """Read the cameras of a file by its layout; SceneError with file, view and key if a value is missing or wrong."""
+    entries = layout.views(source) if callable(layout.views) else _list_entries(source, layout.views)
+    shared: dict[int, dict[str, Any]] = {}  # by id; converted once, because it may be large and views many
+    cameras: list[tuple[Path, str, np.ndarray, dict[str, Any]]] = []
+    for i, entry in enumerate(entries):
+        path, name = entry.path or source.path, entry.name or _find_name(entry.values, layout.name) or f"view {i}"
+        _check_keys(path, name, layout, entry)
+        if id(entry.shared) not in shared:
+            with number_errors(path, "expected numbers"):
+                shared[id(entry.shared)] = _camera_values(layout, entry.shared)
+        with number_errors(path, f"view {name}: expected numbers"):
+            values = shared[id(entry.shared)] | _camera_values(layout, entry.values)
+            cameras.append((path, name, layout.pose.read(entry.values), values))
+    has_intrinsics = any(key in values for *_, values in cameras for key in ("K", *_FOCAL))
+    size_of = cache(image_size)  # of photos that many views may name
+    views = []
+    for path, name, pose, values in cameras:
+        with number_errors(path, f"view {name}: expected numbers"):
+            lens = _lens(path, name, values) if layout.lens else None
+            if has_intrinsics and "K" not in values:
+                values = _with_size(path, name, layout, values, size_of)
+            size = round(values.get("w", 0)), round(values.get("h", 0))
+            K = _intrinsics(path, name, layout, values) if has_intrinsics else None
+            views.append(StoredView(name, pose, K, size, lens))
+    return StoredCameras(views if layout.finish is None else layout.finish(source, views))
+
+
+def _list_entries(source: CameraSource, key: str) -> list[Entry]:
+    """List the views under a key of a file's object, or those of a file that is a list."""
+    views = source.object.get(key) if key else source.json
+    if not isinstance(views, list) or not all(isinstance(view, dict) for view in views):
+        place = repr(key) if key else "the file"
+        raise SceneError(source.path, f"expected {place} to be a list of objects, found something else")
+    check_count(source.path, len(views))
+    return [Entry(view, source.object) for view in views]
+
+
+def _alternatives(key: Key) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else key
+
+
+def _find_value(values: Mapping[str, Any], key: Key) -> Any:
+    """Return the value of the first of a key's alternatives that has one; None if none has."""
+    return next((values[one] for one in _alternatives(key) if values.get(one) is not None), None)
+
+
+def _find_name(values: Mapping[str, Any], key: Key) -> str:
+    """Return the name of a view's image, "" if it has none."""
+    return str(next((values[one] for one in _alternatives(key) if values.get(one) not in (None, "")), ""))
+
+
+def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None:
+    """Raise SceneError with the keys that a view lacks."""
+    missing: list[Key] = [key for key in layout.pose.keys if entry.values.get(key) is None]
+    for key in layout.required_keys:
+        if _find_value(entry.values, key) is None and _find_value(entry.shared, key) is None:
+            missing.append(key)
+    if missing:
+        words = ", ".join(" or ".join(map(repr, _alternatives(key))) for key in missing)
+        raise SceneError(path, f"view {name}: expected {words}, found none")
+
+
+def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert what a view, or the object that views share, has of intrinsics, size and lens.
+
+    The result has no more keys than the file: those of ``number_keys``, "K" for a matrix, and of a lens "model",
+    "is_fisheye", "distortion_params" and the coefficients. Errors as in :func:`convert`.
+    """
+    keys = layout.number_keys | ({name: name for name in _COEFFICIENTS} if layout.lens else {})
+    camera: dict[str, Any] = {}
+    for name, key in keys.items():
+        value = _find_value(values, key)
+        if value is not None:
+            camera[name] = convert(to_number, " or ".join(_alternatives(key)), value)
+    if isinstance(layout.size, str) and values.get(layout.size) is not None:
+        camera["h"], camera["w"] = convert(_two_numbers, layout.size, values[layout.size])
+    if isinstance(layout.K, Matrix) and values.get(layout.K.key) is not None:
+        camera["K"] = layout.K.read(values)
+    if not layout.lens:
+        return camera
+    if values.get(layout.lens) is not None:
+        model = values[layout.lens]
+        camera["model"] = str(layout.models.get(model, model)).upper()[:_MAX_MODEL]
+    if values.get("is_fisheye") is not None:
+        camera["is_fisheye"] = values["is_fisheye"]
+    if values.get("distortion_params") is not None:
+        numbers = values["distortion_params"][: len(_DISTORTION)]
+        camera["distortion_params"] = [convert(to_number, "distortion_params", number) for number in numbers]
+    return camera
+
+
+def _two_numbers(values: Any) -> tuple[float, float]:
+    if len(values) != 2:
+        raise ValueError(f"expected two numbers, found {len(values)}")
+    return to_number(values[0]), to_number(values[1])
+
+
+def _with_size(
+    path: Path, name: str, layout: ViewLayout, values: dict[str, Any], size_of: Callable[[Path], Size]
+) -> dict[str, Any]:
+    """Return the values of a view with the size of its image, if intrinsics need a size that the file may lack."""
+    keys = layout.number_keys
+    if not any(key in values for key in _FOCAL):
+        missing = ", ".join(str(keys[field]) for field in ("fx", "w", "h") if field not in values)
+        every = ", ".join(str(keys[field]) for field in ("fx", "fy", "cx", "cy", "w", "h"))
+        problem = f"view {name}: expected intrinsics ({every}), found none of {missing}"
+        raise SceneError(path, problem, "add them in pixels, for all views or for each")
+    has_size = values.get("w") and values.get("h")
+    if has_size or {"fx", "cx", "cy"} <= values.keys() or keys.get("w") not in layout.optional:
+        return values
+    w, h = repr(keys["w"]), repr(keys["h"])
+    image = find_image(path.parent, name, f"add {w} and {h} to the camera file")
+    if image is None:
+        raise SceneError(path, f"view {name}: expected {w} and {h}, found neither them nor the image itself")
+    return values | dict(zip(("w", "h"), size_of(image), strict=True))
+
+
+def _intrinsics(path: Path, name: str, layout: ViewLayout, values: Mapping[str, Any]) -> np.ndarray:
+    """Return the intrinsics ``[3,3]`` of a view, in pixels unless the file has shares of the size as "pixels"."""
+    width, height = values.get("w", 0.0), values.get("h", 0.0)
+    if isinstance(layout.K, Matrix):
+        K = values["K"]
+        if K.shape != (3, 3):
+            problem = f"expected 3x3 numbers in {layout.K.key!r}, found shape {K.shape}"
+            raise SceneError(path, f"view {name}: {problem}")
+        return K * np.array([[round(width)], [round(height)], [1]]) if layout.unit == "size" else K
+    unit = max(width, height) if layout.unit == "larger side" else 1.0
+    fx, fy = _focal(values, "x", width), _focal(values, "y", height)
+    fx = fx or fy if layout.K.fx in layout.optional else fx
+    fy = fy or fx if layout.K.fy in layout.optional else fy
+    if layout.origin == "middle":
+        cx, cy = (side / 2 + unit * values.get(key, 0.0) for key, side in (("cx", width), ("cy", height)))
+    else:
+        cx, cy = values.get("cx", width / 2), values.get("cy", height / 2)
+    return make_pinhole(unit * fx, unit * fy, cx, cy)
+
+
+def _focal(values: Mapping[str, float], axis: str, side: float) -> float:
+    """Return the focal length along an axis, from the angle of view if need be; 0 where the file has none."""
+    if f"f{axis}" in values:
+        return values[f"f{axis}"]
+    if f"angle_{axis}" in values:
+        half = 0.5 * values[f"angle_{axis}"]
+        return float(0.5 * side * cos(half) / sin(half))
+    return 0.0
+
+
+def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
+    """Return the lens of a view, None for a pinhole."""
+    model = values.get("model", "PINHOLE")
+    params = {key: values.get(key, 0.0) for key in _COEFFICIENTS}
+    if not any(params.values()):
+        params |= dict(zip(_DISTORTION, values.get("distortion_params", ()), strict=False))
+    if model == "OPENCV_FISHEYE" or values.get("is_fisheye"):
+        return make_lens("OPENCV_FISHEYE", "fisheye", [params[key] for key in ("k1", "k2", "k3", "k4")])
+    ambiguous = next((key for key in ("k4", "k5", "k6") if params[key]), None)
+    if model not in _PERSPECTIVE or ambiguous is not None:
+        reason = f"lens distortion {ambiguous}, which formats understand differently"
+        found = f"camera model {model}" if ambiguous is None else reason
+        problem = f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {found}"
+        raise SceneError(path, problem, "undistort the images first")
+    coefficients = [params[key] for key in ("k1", "k2", "p1", "p2", "k3")]
+    return make_lens(model if model in _DISTORTED else "OPENCV", "perspective", coefficients)

@@ -1,0 +1,206 @@
+"""Every format of cameras: how a file is recognised, how its views are stored, and in which convention.
+
+A format whose files have a key for each value is a :class:`ViewLayout`; formats of other kinds have a function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile, Convention, make_camera_file
+from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
+from gsmerge.io.cameras.embedded import SHARP, read_sharp
+from gsmerge.io.cameras.long_lrm import is_long_lrm, move_to_gaussians
+from gsmerge.io.cameras.programs import join_matrices, list_keyframes, list_shots, set_centred_size
+from gsmerge.io.cameras.read_views import read_views
+from gsmerge.io.cameras.view_layout import (
+    Matrix,
+    MatrixEntries,
+    Pinhole,
+    RotationAndShift,
+    ViewLayout,
+    rotation_of_vector,
+)
+from gsmerge.io.first_bytes import read_start
+from gsmerge.runtime.plugins import LazyFunction, lazy_functions
+from gsmerge.settings.extend import SUFFIX
+
+_lazy = lazy_functions(__package__)
+CHUNK = ".torch"  # ending of re10k's chunks
+LOG = ".log"  # ending of Open3D's lists of poses, which are read as ``.txt``
+FFGS = "ffgs cameras.json"  # format of cameras whose photos were resized to cover the model's input, and cropped
+KEYFRAME = "t_00"  # key in files of Polycam, within their first bytes
+
+
+@dataclass(frozen=True)
+class CameraFormat:
+    """A format of camera files."""
+
+    name: str  # the ``source`` of its cameras
+    files: str  # description for people
+    ending: str  # of files' names, in lower case; "" for a folder
+    read: ViewLayout | Callable[[CameraSource], StoredCameras]  # the function raises SceneError for damaged files
+    convention: Convention  # of its poses
+    intrinsics: str  # description of how they are stored, for people
+    recognise: Callable[[CameraSource], bool] = lambda _: True  # called for files with the ending
+
+    def cameras(self, source: CameraSource) -> CameraFile:
+        """Read the cameras of a file; SceneError if it is damaged or incomplete."""
+        stored = read_views(source, self.read) if isinstance(self.read, ViewLayout) else self.read(source)
+        return self.convert(source.path, stored)
+
+    def convert(self, path: Path, stored: StoredCameras) -> CameraFile:
+        """Convert the cameras that a file stores; SceneError if one of them is invalid."""
+        convention = stored.convention or self.convention
+        return make_camera_file(path, self.name, convention, stored.views, stored.images, stored.order)
+
+
+def is_colmap(folder: Path) -> bool:
+    """Return whether a folder holds a COLMAP model."""
+    return _holds_model(folder, ".bin") or _holds_model(folder, ".txt")
+
+
+def _holds_model(folder: Path, suffix: str) -> bool:
+    """Return whether a folder holds the files of a COLMAP model with an ending, ``.bin`` or ``.txt``."""
+    return (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file()
+
+
+def is_keyframes(folder: Path) -> bool:
+    """Return whether a folder holds the cameras of Polycam's keyframes, a ``.json`` each."""
+    first = min(folder.glob("[!.]*.json"), default=folder)
+    return first.is_file() and f'"{KEYFRAME}"'.encode() in read_start(first)
+
+
+def _has_views_with(source: CameraSource, key: str) -> bool:
+    """Return whether a JSON file has ``views``, of which one has a key."""
+    views = source.object.get("views")
+    return isinstance(views, list) and all(isinstance(v, dict) for v in views) and any(key in v for v in views)
+
+
+_ARRAY_NAMES, _IS_DA3 = _lazy("npz_files.array_names"), _lazy("npz_files.is_da3")
+_READ_COLMAP, _READ_DA3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3")
+LISTS_POSES, _READ_POSES = _lazy("pose_lines.lists_poses"), _lazy("pose_lines.read_poses")
+_READ_STATE = LazyFunction("gsmerge.io.formats.gsm", "read_views")
+
+_TRANSFORMS = ViewLayout(
+    views="frames",
+    name=("file_path", "image_path", "name"),
+    pose=Matrix("transform_matrix"),  # applied_transform is not applied: poses are in the Gaussians' world
+    K=Pinhole("fl_x", "fl_y", "cx", "cy", angle_x="camera_angle_x", angle_y="camera_angle_y"),
+    size=("w", "h"),
+    lens="camera_model",
+    optional=("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model"),
+)
+_LONG_LRM = ViewLayout(
+    views="frames",
+    name=("file_path", "image_path"),
+    pose=Matrix("w2c", (4, 4)),
+    K=Pinhole("fx", "fy", "cx", "cy"),
+    size=("w", "h"),
+    finish=move_to_gaussians,
+)
+_INRIA = ViewLayout(
+    name="img_name",
+    pose=RotationAndShift("rotation", "position"),
+    K=Pinhole("fx", "fy", "cx", "cy"),
+    size=("width", "height"),
+    optional=("cx", "cy"),
+    finish=_lazy("instantsplat.take_optimised_poses"),
+)
+_GLOBALSPLAT = ViewLayout(
+    views="views", name=("file", "image"), pose=Matrix("c2w", (4, 4)), K=Matrix("intrinsic", (3, 3)), size="image_shape"
+)
+_FFGS = replace(_GLOBALSPLAT, K=Matrix("k_normalized", (3, 3)), unit="size")
+_WORLD_MIRROR = ViewLayout(
+    views=join_matrices, pose=Matrix("extrinsics"), K=Matrix("intrinsics"), finish=set_centred_size
+)
+_OPENSFM = ViewLayout(
+    views=list_shots,
+    pose=RotationAndShift("rotation", "translation", rotation_of_vector),
+    K=Pinhole(("focal_x", "focal"), "focal_y", "c_x", "c_y"),
+    size=("width", "height"),
+    unit="larger side",
+    origin="middle",
+    lens="projection_type",
+    models={
+        "perspective": "OPENCV",
+        "brown": "OPENCV",
+        "simple_radial": "OPENCV",
+        "radial": "OPENCV",
+        "fisheye": "OPENCV_FISHEYE",
+        "fisheye_opencv": "OPENCV_FISHEYE",
+    },
+    optional=("focal_y", "c_x", "c_y"),
+)
+_POLYCAM = ViewLayout(
+    views=list_keyframes,
+    pose=MatrixEntries([[f"t_{row}{column}" for column in range(4)] for row in range(3)]),
+    K=Pinhole("fx", "fy", "cx", "cy"),
+    size=("width", "height"),
+)
+_METASHAPE = ViewLayout(
+    views=_lazy("metashape.list_cameras"),
+    pose=Matrix("transform"),
+    K=Pinhole("fx", "fy", "cx", "cy"),
+    size=("width", "height"),
+    origin="middle",
+    lens="type",
+    models={"frame": "OPENCV", "fisheye": "OPENCV_FISHEYE"},
+    optional=("cx", "cy"),
+)
+
+SHARP_PLY = CameraFormat(
+    SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
+    "pixels of the photo", lambda file: read_sharp(file) is not None,
+)  # fmt: skip
+RE10K = CameraFormat(
+    "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`; needs torch", CHUNK,
+    _lazy("re10k.read_re10k"), W2C_OPENCV, "divided by the size",
+)  # fmt: skip
+# In the order of trial: the first row with the ending of a file that recognises it reads it
+CAMERA_FORMATS = (
+    CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(_READ_COLMAP, suffix=".bin"),
+                 W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".bin")),
+    CameraFormat("Polycam", "`keyframes/corrected_cameras` of Polycam", "", _POLYCAM,
+                 C2W_OPENGL, "pixels", lambda file: is_keyframes(file.path)),
+    CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(_READ_COLMAP, suffix=".txt"),
+                 W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".txt")),
+    CameraFormat("pose folder", "`pose/*.txt` of ScanNet, NSVF", "", _READ_POSES,
+                 C2W_OPENCV, "pixels, in `intrinsic.txt`; may be missing", lambda file: LISTS_POSES(file.path)),
+    CameraFormat("pose list", "poses of KITTI, TUM, RealEstate10K; `.log` of Open3D", ".txt", _READ_POSES, C2W_OPENCV,
+                 "as these"),
+    CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", _LONG_LRM, W2C_OPENCV, "pixels", is_long_lrm),
+    CameraFormat("transforms.json", "`transforms.json` of nerfstudio, instant-ngp; `transforms_train.json` of Blender",
+                 ".json", _TRANSFORMS, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
+                 lambda file: "frames" in file.object),
+    CameraFormat("frame list", "list of frames with `transform_matrix`", ".json", replace(_TRANSFORMS, views=""),
+                 C2W_OPENCV, "pixels or field of view; may be missing; lenses",
+                 lambda file: "transform_matrix" in file.first),
+    CameraFormat("INRIA cameras.json", "`cameras.json` of INRIA; InstantSplat's `pose/ours_N/pose_optimized.npy`",
+                 ".json", _INRIA, C2W_OPENCV, "pixels; principal point in the middle, or `cx`, `cy`",
+                 lambda file: "position" in file.first or "rotation" in file.first),
+    CameraFormat("GlobalSplat cameras.json", "`cameras.json` of GlobalSplat", ".json", _GLOBALSPLAT, C2W_OPENCV,
+                 "pixels, or divided by the size", lambda file: _has_views_with(file, "intrinsic")),
+    CameraFormat(FFGS, "`cameras.json` of ffgs", ".json", _FFGS, C2W_OPENCV,
+                 "divided by the size of the model's input", lambda file: _has_views_with(file, "c2w")),
+    CameraFormat("OpenSfM", "`reconstruction.json` of OpenSfM and WebODM", ".json", _OPENSFM,
+                 W2C_OPENCV, "divided by the larger side; lenses", lambda file: "shots" in file.first),
+    CameraFormat("Metashape", "`.xml` of Metashape", ".xml", _METASHAPE, C2W_OPENCV, "pixels from the middle; lenses"),
+    CameraFormat("camera_params.json", "`camera_params.json` of WorldMirror", ".json", _WORLD_MIRROR,
+                 C2W_OPENCV, "pixels", lambda file: {"extrinsics", "intrinsics"} <= file.object.keys()),
+    CameraFormat("dump of a model", "`views.npz` ([below](#models-that-save-no-cameras))", ".npz",
+                 _lazy("npz_files.read_dump"), C2W_OPENCV, "pixels, or divided by the size; may be missing",
+                 lambda file: "c2w" in _ARRAY_NAMES(file.path)),
+    CameraFormat("DA3 npz", "`results.npz` of Depth Anything 3", ".npz", _READ_DA3,
+                 W2C_OPENCV, "pixels, or divided by the size; may be missing",
+                 lambda file: _IS_DA3(file.path)),
+    CameraFormat("npz of poses", "`.npz` of what VGGT, or MapAnything or AnySplat (camera-to-world), returns",
+                 ".npz", _READ_DA3, W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
+    RE10K,
+    SHARP_PLY,
+    CameraFormat("state", "inside a `.gsm` of gsmerge extend", SUFFIX, _READ_STATE, W2C_OPENCV, "pixels"),
+)  # fmt: skip
+CAMERA_ENDINGS = (*dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")), LOG)

@@ -1,0 +1,185 @@
+"""Declare how a file stores its views: under which keys the pose, intrinsics, size and lens of each are.
+
+The rows of ``table.py`` hold such declarations, and ``read_views.py`` reads files by them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from gsmerge.geometry import motion_matrices
+from gsmerge.io.cameras.camera_file import StoredView
+from gsmerge.io.cameras.camera_source import CameraSource, convert, to_array, to_number
+
+Key = str | tuple[str, ...]  # a key, or several, of which the first that has a value counts
+
+
+class Entry(NamedTuple):
+    """One view as a file stores it, before conversion."""
+
+    values: Mapping[str, Any]  # its own
+    shared: Mapping[str, Any] = {}  # those of several views, for example of one camera; they fill in what a view lacks
+    name: str = ""  # of its image, where the name is no value
+    path: Path | None = None  # the view's own file, where each view has one
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """A matrix under one key.
+
+    Args:
+        key: The key.
+        shape: The matrix's shape, where a file may also list its numbers without rows; None: the file has rows.
+    """
+
+    key: str
+    shape: tuple[int, int] | None = None
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys that a view must have."""
+        return (self.key,)
+
+    def read(self, values: Mapping[str, Any]) -> np.ndarray:
+        """Read the matrix; errors as in :func:`convert`."""
+        return np.asarray(convert(self._to_matrix, self.key, values[self.key]))
+
+    def _to_matrix(self, value: Any) -> np.ndarray:
+        array = to_array(value)
+        return array if self.shape is None else array.reshape(self.shape)
+
+
+@dataclass(frozen=True)
+class MatrixEntries:
+    """A matrix with a key for each of its numbers.
+
+    Args:
+        rows: The keys, row by row.
+    """
+
+    rows: Sequence[Sequence[str]]
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys that a view must have."""
+        return tuple(key for row in self.rows for key in row)
+
+    def read(self, values: Mapping[str, Any]) -> np.ndarray:
+        """Read the matrix; errors as in :func:`convert`."""
+        return np.array([[convert(to_number, key, values[key]) for key in row] for row in self.rows])
+
+
+def rotation_of_matrix(numbers: np.ndarray) -> np.ndarray:
+    """Return the rotation ``[3,3]`` whose nine numbers a file lists row by row."""
+    return numbers.reshape(3, 3)
+
+
+def rotation_of_vector(numbers: np.ndarray) -> np.ndarray:
+    """Return the rotation ``[3,3]`` about an axis: the vector ``[3]`` along it has the angle in radians as length."""
+    motion = np.concatenate([numbers.reshape(1, 3), np.zeros((1, 3))], 1)
+    return motion_matrices(motion)[0, :3, :3]
+
+
+@dataclass(frozen=True)
+class RotationAndShift:
+    """A pose ``[3,4]`` under two keys: its rotation, and its last column.
+
+    Args:
+        rotation: Key of the rotation.
+        shift: Key of the last column, which is the camera's centre if poses are camera-to-world.
+        to_matrix: Makes the rotation ``[3,3]`` from the numbers under its key: :func:`rotation_of_matrix`,
+            :func:`rotation_of_vector`, or :func:`gsmerge.geometry.quat_to_rotmat` for quaternions wxyz.
+    """
+
+    rotation: str
+    shift: str
+    to_matrix: Callable[[np.ndarray], np.ndarray] = rotation_of_matrix
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys that a view must have."""
+        return self.rotation, self.shift
+
+    def read(self, values: Mapping[str, Any]) -> np.ndarray:
+        """Read the pose; errors as in :func:`convert`."""
+        rotation = convert(lambda value: self.to_matrix(to_array(value)), self.rotation, values[self.rotation])
+        shift = convert(lambda value: to_array(value).reshape(3, 1), self.shift, values[self.shift])
+        return np.concatenate([rotation, shift], 1)
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Intrinsics with a key for each number. What happens without one counts where the layout makes it optional.
+
+    Args:
+        fx: Key of the horizontal focal length. A view without it has square pixels.
+        fy: Key of the vertical focal length. A view without it has square pixels.
+        cx: Key of the principal point's x. A view without it has the principal point in the middle of the image.
+        cy: Key of the principal point's y, likewise.
+        angle_x: Key of the horizontal field of view in radians, for views without ``fx``; "" if there is none.
+        angle_y: Key of the vertical field of view.
+    """
+
+    fx: Key
+    fy: Key
+    cx: Key
+    cy: Key
+    angle_x: Key = ""
+    angle_y: Key = ""
+
+
+@dataclass(frozen=True)
+class ViewLayout:
+    """Where a file lists its views, and under which keys a view has its values.
+
+    A value of null counts as missing. A view takes what it lacks from the object that has the list of views, except for
+    its name and pose.
+
+    Args:
+        pose: The pose, in the convention of the format.
+        K: The intrinsics: a key for each number, or a matrix ``[3,3]``.
+        views: Key of the list of views; "" if the file itself is the list; or a function that lists them.
+        name: Key of the image's name. Views without one are called "view 0", "view 1" and so on.
+        size: Keys of width and height in pixels, or the key of a list [height, width]; "" if the file has no size.
+        unit: What intrinsics are measured in: pixels, the image's width and height, or its larger side. Intrinsics that
+            are "pixels" but small enough to be shares of width and height are taken as these, see
+            :func:`make_camera_file`.
+        origin: The point of the image from which the principal point is measured: the upper left corner or the middle.
+        lens: Key of the camera model, beside which the file has the coefficients k1, k2 and so on; "" for pinholes.
+        models: COLMAP's names of the program's camera models, where they differ.
+        optional: Keys that a view may lack. Without a size, that of the image counts. If no view of the file has a
+            focal length, it is estimated later.
+        finish: A function that changes the views where the values do not say all.
+    """
+
+    pose: Matrix | MatrixEntries | RotationAndShift
+    K: Pinhole | Matrix
+    views: str | Callable[[CameraSource], Sequence[Entry]] = ""
+    name: Key = ()
+    size: tuple[str, str] | str = ""
+    unit: Literal["pixels", "size", "larger side"] = "pixels"
+    origin: Literal["corner", "middle"] = "corner"
+    lens: str = ""
+    models: Mapping[str, str] = field(default_factory=dict)
+    optional: Sequence[Key] = ()
+    finish: Callable[[CameraSource, list[StoredView]], list[StoredView]] | None = None
+
+    @property
+    def number_keys(self) -> dict[str, Key]:
+        """Keys of single numbers: of the fields of :class:`Pinhole`, and of the width "w" and height "h"."""
+        keys: dict[str, Key] = dict(vars(self.K)) if isinstance(self.K, Pinhole) else {}
+        keys |= dict(zip(("w", "h"), self.size, strict=True)) if isinstance(self.size, tuple) else {}
+        return {name: key for name, key in keys.items() if key}
+
+    @property
+    def required_keys(self) -> list[Key]:
+        """Keys of intrinsics, size and lens that each view, or what views share, must have."""
+        keys = [key for name, key in self.number_keys.items() if not name.startswith("angle")]
+        keys += [self.K.key] if isinstance(self.K, Matrix) else []
+        keys += [key for key in (self.size, self.lens) if isinstance(key, str) and key]
+        return [key for key in keys if key not in self.optional]

@@ -1,0 +1,152 @@
+"""How a program moved its cameras into the Gaussians' world: nerfstudio's file beside the scene, and Metashape's."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exports import smooth_scene
+from messages import refuses
+from program_cameras import FORMATS, W2C
+from sweeps import sweep
+from tiny_scene import FLIP, Tiny, frames_of, rotation, write_colmap_text, write_transforms
+
+from gsmerge.errors import SceneError
+from gsmerge.io import read_cameras
+from gsmerge.io.cameras.dataparser import read_dataparser
+from gsmerge.scene.held_out import read_into_frame
+from gsmerge.scene.read import load_scene
+
+SMOOTH = smooth_scene(24, 18)
+TURN, SHIFT, SCALE = rotation(0.4, -1.2, 0.7), np.array([1.5, -2.0, 0.5]), 0.3
+NOTE = "the cameras are moved into the Gaussians' frame by dataparser_transforms.json"
+
+
+def trained(folder: Path, *, move: bool = True) -> Tiny:
+    """Some of the Gaussians in no order, where nerfstudio puts them: X' = s (T [X; 1]); photos beside them."""
+    some = np.random.default_rng(0).permutation(1296)[:864]
+    gaussians = SMOOTH.gaussians[some]
+    if move:
+        means = SCALE * (gaussians.means.astype(np.float64) @ TURN.T + SHIFT)
+        gaussians = replace(gaussians, means=means.astype(np.float32), scales=SCALE * gaussians.scales)
+    there = replace(SMOOTH, gaussians=gaussians)
+    there.save(folder, cameras=False)
+    write_dataparser(folder)
+    return there
+
+
+def write_dataparser(folder: Path, **changes: object) -> None:
+    matrix = np.concatenate([TURN, SHIFT[:, None]], 1).tolist()
+    (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": matrix, "scale": SCALE} | changes))
+
+
+def assert_moved(folder: Path) -> None:
+    loaded = load_scene(folder)
+    assert NOTE in loaded.notes
+    centres = SCALE * (SMOOTH.c2w[:, :3, 3] @ TURN.T + SHIFT)
+    assert np.allclose(loaded.scene.cameras.centres, centres)
+    assert np.allclose(loaded.scene.cameras.viewmats[:, :3, :3], SMOOTH.w2c[:, :3, :3] @ TURN.T)
+    assert np.array_equal(loaded.cameras.viewmats, loaded.scene.cameras.viewmats)
+
+
+def test_cameras_of_the_capture_are_moved(tmp_path: Path) -> None:
+    trained(tmp_path)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    assert_moved(tmp_path)
+
+
+def test_other_cameras_of_the_capture_are_moved_with_them(tmp_path: Path) -> None:
+    """Held-out views, or those of a path, are in the capture's world and share no view with the scene."""
+    trained(tmp_path)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    write_transforms(tmp_path / "path.json", replace(SMOOTH, names=("x.png", "y.png", "z.png")))
+    placed, shared = read_into_frame(load_scene(tmp_path), tmp_path / "path.json")
+    assert shared == {}
+    expected = SMOOTH.w2c
+    expected[:, :3, :3] = expected[:, :3, :3] @ TURN.T
+    centres = SCALE * (SMOOTH.c2w[:, :3, 3] @ TURN.T + SHIFT)
+    expected[:, :3, 3] = -(expected[:, :3, :3] * centres[:, None]).sum(-1)
+    np.testing.assert_allclose(placed.viewmats, expected, atol=1e-6)
+
+
+def test_poses_that_are_moved_already(tmp_path: Path) -> None:
+    """``transform`` starts from the world before ``applied_transform``, in which the poses no longer are."""
+    trained(tmp_path)
+    applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.25], [0, 0, 0, 1]])
+    data = frames_of(SMOOTH)
+    poses = applied @ SMOOTH.c2w @ FLIP
+    poses[:, :3, 3] *= 2
+    for frame, pose in zip(data["frames"], poses, strict=True):
+        frame["transform_matrix"] = pose.tolist()
+    data |= {"applied_transform": applied[:3].tolist(), "applied_scale": 2.0}
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    own = np.eye(4)  # from the saved poses to where nerfstudio puts them, but for its scale of SCALE / 2
+    own[:3, :3] = TURN @ applied[:3, :3].T
+    own[:3, 3] = 2 * (SHIFT - own[:3, :3] @ applied[:3, 3])
+    write_dataparser(tmp_path, transform=(own @ applied)[:3].tolist(), scale=SCALE / 2 * 2)
+    assert_moved(tmp_path)
+
+
+def test_it_is_left_alone_where_it_does_not_help(tmp_path: Path) -> None:
+    trained(tmp_path, move=False)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    loaded = load_scene(tmp_path)
+    assert NOTE not in loaded.notes
+    assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
+
+
+def test_without_it_the_cameras_do_not_see_the_gaussians(tmp_path: Path) -> None:
+    trained(tmp_path)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    (tmp_path / "dataparser_transforms.json").unlink()
+    with refuses(SceneError, "scene.ply", 1296, 864):
+        load_scene(tmp_path, cameras=tmp_path / "sparse")
+
+
+@sweep(
+    ("text", "found"),
+    [
+        ("{}", "'scale'"),
+        ("no", "JSON"),
+        (json.dumps({"transform": [[1, 2], [3, 4]], "scale": 1}), [2, 2]),
+        (json.dumps({"transform": np.eye(4).tolist(), "scale": -1}), "another map"),
+        (json.dumps({"transform": (2 * np.eye(4)).tolist(), "scale": 1}), "another map"),
+    ],
+    often=1,
+)
+def test_a_damaged_file(tmp_path: Path, text: str, found: object) -> None:
+    trained(tmp_path)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    (tmp_path / "dataparser_transforms.json").write_text(text)
+    with refuses(SceneError, "dataparser_transforms.json", found):
+        load_scene(tmp_path, cameras=tmp_path / "sparse")
+
+
+MOVE = "<transform><rotation>0 -1 0 1 0 0 0 0 1</rotation><translation>2 4 6</translation><scale>2</scale></transform>"
+
+
+@pytest.mark.parametrize("place", ["<chunk>", '<components><component id="1"/><component id="0">'])
+def test_metashape_s_world_is_a_frame_of_its_largest_component(tmp_path: Path, place: str) -> None:
+    """In it Metashape's other exports are, and at the scale of the cameras those of nerfstudio."""
+    path = FORMATS["Metashape"].write(tmp_path)
+    end = "</component></components>" if "id" in place else ""
+    text = path.read_text().replace("<chunk>", f"<chunk>{place.replace('<chunk>', '')}{MOVE}{end}")
+    path.write_text(text.replace("<camera id", '<camera component_id="0" id').replace('"0" id="0"', '"1" id="0"'))
+    cameras, frames = read_cameras(path), read_dataparser(tmp_path / "a.ply", path)
+    assert cameras.names == ("1.png", "2.png")
+    np.testing.assert_allclose(cameras.viewmats, W2C[1:], atol=1e-9)
+    assert [frame.scale for frame in frames] == [2, 1]
+    np.testing.assert_allclose([frame.shift for frame in frames], [(2, 4, 6), (1, 2, 3)])
+    np.testing.assert_allclose(frames[0].rotation @ (1, 0, 0), (0, 1, 0), atol=1e-9)
+    assert read_dataparser(tmp_path / "a.ply", FORMATS["Metashape"].write(tmp_path)) == []
+
+
+@pytest.mark.parametrize("value", ["1 0 0", "0 0 0 0 0 0 0 0 0", "nan nan nan nan nan nan nan nan nan", "a"])
+def test_metashape_s_world_is_checked(tmp_path: Path, value: str) -> None:
+    path = FORMATS["Metashape"].write(tmp_path)
+    path.write_text(path.read_text().replace("<chunk>", f"<chunk>{MOVE}").replace("0 -1 0 1 0 0 0 0 1", value))
+    with refuses(SceneError, "cameras.xml", "expected"):
+        read_dataparser(tmp_path / "a.ply", path)
