@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .case import Change, Damage, either, read, refused
-from .changes import beside, edit, place, put, text
+from .changes import beside, edit, place, put, text, without
 from .sounds import NAMES
 
 MOST = 10_000  # cameras of a file
@@ -108,6 +108,7 @@ MANY = repeated(2 * MOST // 3 + 1)
 DAMAGES = {
     "transforms": of_transforms(),
     "Blender": {
+        "no size": refused(without("w"), "'w'", "'h'", place="transforms.json: view 0.png"),
         "an angle of 0": refused(place("camera_angle_x", value=0), "finite", place="transforms.json: view 0.png"),
     },
     "INRIA": {"a huge width": either(place(0, "width", value=10**400)), "20,001 cameras": refused(MANY, slow=True)},
