@@ -17,9 +17,10 @@ import pytest
 from damage import SOUNDS, places
 from damage.random_changes import mutate
 from forked_commands import CommandServer, Limits, refused_by_inspect
-from gsmerge.file_checks import check_content
 from messages import says
 from tiny_scene import make_tiny
+
+from gsmerge.inspection.file_checks import check_content
 
 COUNT, MANY = 2, 20  # mutations of a kind
 FEWER = 10  # of kinds that take one or two seconds for each mutation: their rows have to be placed
@@ -49,7 +50,7 @@ def with_one_photo(folder: Path) -> None:
 STATE = ("compact", "--fit", "none", "-o", "made.ply", "--overwrite", "a.gsm")
 KINDS = {
     "rows": Kind("scene.ply", many=FEWER),
-    "parts": Kind("view_*.ply", change=places.in_parts(lambda path: None), many=FEWER),
+    "parts": Kind("view_*.ply", change=places.split_in_parts(lambda path: None), many=FEWER),
     "transforms": Kind("transforms.json", named=("--cameras", "transforms.json")),
     "photos": Kind("images/*.png", change=with_one_photo, named=("--images", "images")),
     "views.npz": Kind("views.npz", "views.npz", named=("--cameras", "views.npz")),
