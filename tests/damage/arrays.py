@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from .case import Change, Damage, either, read, refused
-from .changes import beside, bomb, cut, members, of_bytes, of_member, packed, put
+from .case import Change, Damage, accept, allow, refuse
+from .changes import add_bomb, change_beside, cut, edit_bytes, edit_member, pack_members, read_members, write_file
 from .sounds import TINY
 
 MARKER = "executed"
@@ -43,47 +43,47 @@ def npy(value: Any, dtype: str | None = None, shape: tuple[int, ...] | None = No
     return stream.getvalue() + array.tobytes()
 
 
-def stored(data: bytes) -> np.ndarray:
+def load_array(data: bytes) -> np.ndarray:
     array: np.ndarray = np.load(io.BytesIO(data))
     return array
 
 
-def array(name: str, value: Any) -> Change:
+def put_array(name: str, value: Any) -> Change:
     """Put another array, or bytes, into the file; leave it out for None."""
     data = value if isinstance(value, bytes) else npy(value)
 
     def change(contents: bytes) -> bytes:
-        others = {key: part for key, part in members(contents).items() if key != f"{name}.npy"}
-        return packed(others if value is None else others | {f"{name}.npy": data}, zipfile.ZIP_DEFLATED)
+        others = {key: part for key, part in read_members(contents).items() if key != f"{name}.npy"}
+        return pack_members(others if value is None else others | {f"{name}.npy": data}, zipfile.ZIP_DEFLATED)
 
-    return of_bytes(change)
+    return edit_bytes(change)
 
 
-def of_array(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
+def edit_array(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
     """Change the values of an array."""
-    return of_member(f"{name}.npy", lambda data: npy(change(stored(data))))
+    return edit_member(f"{name}.npy", lambda data: npy(change(load_array(data))))
 
 
-def pickled(name: str) -> Change:
+def put_objects(name: str) -> Change:
     """Put objects into the file, which make a folder when they are read."""
 
     def change(path: Path) -> None:
         stream = io.BytesIO()
         np.save(stream, np.array([Payload(path.parent / MARKER)], dtype=object), allow_pickle=True)
-        array(name, stream.getvalue())(path)
+        put_array(name, stream.getvalue())(path)
 
     return change
 
 
-def raw_pickle(path: Path) -> None:
+def write_pickle(path: Path) -> None:
     path.write_bytes(pickle.dumps(Payload(path.parent / MARKER)))
 
 
-def pickles(path: Path) -> None:
+def write_pickles(path: Path) -> None:
     """An archive of pickles by the arrays' names."""
     data = pickle.dumps(Payload(path.parent / MARKER))
-    names = {name.removesuffix(end) for name in members(path.read_bytes()) for end in ("", ".npy")}
-    put(path, packed(dict.fromkeys(names | {f"{name}.npy" for name in names}, data)))
+    names = {name.removesuffix(end) for name in read_members(path.read_bytes()) for end in ("", ".npy")}
+    write_file(path, pack_members(dict.fromkeys(names | {f"{name}.npy" for name in names}, data)))
 
 
 def bomb_of(size: int, shape: tuple[int, ...]) -> bytes:
@@ -98,33 +98,33 @@ def brackets(depth: int) -> bytes:
 def of_cameras(poses: str, Ks: str, images: str) -> dict[str, Damage]:
     """Damages of a file of these arrays, which has the cameras of a scene."""
     damages = {
-        "the same arrays": read(of_bytes(lambda data: packed(members(data)))),
-        "poses as objects": refused(pickled(poses)),
-        "a pickle": refused(raw_pickle),
-        "pickles in an archive": refused(pickles),
-        "poses of nested brackets": refused(array(poses, brackets(9000))),
-        "20,000 poses": refused(array(poses, np.tile(np.eye(4), (20_000, 1, 1))), slow=True),
-        "a bomb of poses": refused(array(poses, bomb_of(2**27, (2**27,))), slow=True),
-        "a bomb of images": refused(array(images, bomb_of(2**27, (VIEWS, 3800, 3800, 3))), slow=True),
-        "a bomb of floats": refused(array(images, np.zeros((VIEWS, 1400, 1400, 3), "<f4")), slow=True),
-        "a header of 60 MB": refused(array(images, b"\x93NUMPY\2\0" + struct.pack("<I", 60 << 20) + bytes(60 << 20)),
+        "the same arrays": accept(edit_bytes(lambda data: pack_members(read_members(data)))),
+        "poses as objects": refuse(put_objects(poses)),
+        "a pickle": refuse(write_pickle),
+        "pickles in an archive": refuse(write_pickles),
+        "poses of nested brackets": refuse(put_array(poses, brackets(9000))),
+        "20,000 poses": refuse(put_array(poses, np.tile(np.eye(4), (20_000, 1, 1))), slow=True),
+        "a bomb of poses": refuse(put_array(poses, bomb_of(2**27, (2**27,))), slow=True),
+        "a bomb of images": refuse(put_array(images, bomb_of(2**27, (VIEWS, 3800, 3800, 3))), slow=True),
+        "a bomb of floats": refuse(put_array(images, np.zeros((VIEWS, 1400, 1400, 3), "<f4")), slow=True),
+        "a header of 60 MB": refuse(put_array(images, b"\x93NUMPY\2\0" + struct.pack("<I", 60 << 20) + bytes(60 << 20)),
                                      slow=True),
-        "poses that promise less": either(bomb(f"{poses}.npy", zipfile.ZIP_DEFLATED, npy(np.zeros((VIEWS, 4, 4)))),
+        "poses that promise less": allow(add_bomb(f"{poses}.npy", zipfile.ZIP_DEFLATED, npy(np.zeros((VIEWS, 4, 4)))),
                                           slow=True),
     }  # fmt: skip
     start = npy(np.zeros((VIEWS, 4, 4)))
     for name, method, number in ((poses, "BZIP2", 12), (poses, "LZMA", 14), ("more", "BZIP2", 12)):
-        change = bomb(f"{name}.npy", getattr(zipfile, f"ZIP_{method}"), start)
-        damages[f"{name} of {method}"] = refused(change, f"{name}.npy", f"method {number}", slow=True)
+        change = add_bomb(f"{name}.npy", getattr(zipfile, f"ZIP_{method}"), start)
+        damages[f"{name} of {method}"] = refuse(change, f"{name}.npy", f"method {number}", slow=True)
     for shape in ((2**40, 2**40), (VIEWS, 2**31, 2**31), (2**62,), (-1, 3)):
-        damages[f"poses said to be {shape}"] = refused(of_member(f"{poses}.npy", relabel(shape=shape)))
+        damages[f"poses said to be {shape}"] = refuse(edit_member(f"{poses}.npy", relabel(shape=shape)))
     for dtype in ("|O", "<U1000000000", "|V1000000000"):
-        damages[f"poses said to be of {dtype}"] = either(of_member(f"{poses}.npy", relabel(dtype=dtype)))
+        damages[f"poses said to be of {dtype}"] = allow(edit_member(f"{poses}.npy", relabel(dtype=dtype)))
     return damages
 
 
 def relabel(**said: Any) -> Callable[[bytes], bytes]:
-    return lambda data: npy(stored(data), **said)
+    return lambda data: npy(load_array(data), **said)
 
 
 def of_depth_maps() -> dict[str, Damage]:
@@ -133,41 +133,41 @@ def of_depth_maps() -> dict[str, Damage]:
     wide = {"extrinsics": np.eye(4)[None], "intrinsics": np.eye(3)[None], "depth": np.ones((1, 2000, 3000), "i1")}
 
     def no_pixels(path: Path) -> None:
-        array("image", None)(path)
-        array("depth", np.empty((VIEWS, 0, 0), np.float32))(path)
+        put_array("image", None)(path)
+        put_array("depth", np.empty((VIEWS, 0, 0), np.float32))(path)
 
     def large(path: Path) -> None:
         np.savez_compressed(path, **wide)
 
     return {
-        "depths of another size": refused(array("depth", depths[:, 1:]), "images", "size"),
-        "depths of fewer views": refused(array("depth", depths[:2]), "[3,h,w]"),
-        "depths without pixels": refused(no_pixels, "0 x 0"),
-        "intrinsics of zeros": refused(of_array("intrinsics", np.zeros_like), "focal"),
-        "intrinsics of ones": refused(of_array("intrinsics", np.ones_like), "0 0 1"),
-        "poses of zeros": refused(of_array("extrinsics", np.zeros_like), "orthonormal"),
-        "six million pixels": refused(large, "memory"),
+        "depths of another size": refuse(put_array("depth", depths[:, 1:]), "images", "size"),
+        "depths of fewer views": refuse(put_array("depth", depths[:2]), "[3,h,w]"),
+        "depths without pixels": refuse(no_pixels, "0 x 0"),
+        "intrinsics of zeros": refuse(edit_array("intrinsics", np.zeros_like), "focal"),
+        "intrinsics of ones": refuse(edit_array("intrinsics", np.ones_like), "0 0 1"),
+        "poses of zeros": refuse(edit_array("extrinsics", np.zeros_like), "orthonormal"),
+        "six million pixels": refuse(large, "memory"),
     }
 
 
 def of_frames() -> dict[str, Damage]:
     return {
-        "depths of another size": refused(array("depth", np.ones((5, 5), np.float32)), "size"),
-        "depths of two channels": refused(array("depth", np.ones((5, 5, 2), np.float32)), "[h,w]"),
-        "intrinsics of two rows": refused(array("intrinsics", np.ones((2, 3))), "intrinsics"),
-        "intrinsics of zeros": refused(array("intrinsics", np.zeros((3, 3))), "focal"),
-        "an image of text": refused(array("image", np.array(["text"])), "images"),
-        "a pose of three numbers": refused(
-            beside("../camera_poses.txt", lambda path: put(path, "1 2 3\n")), "12 or 16",
+        "depths of another size": refuse(put_array("depth", np.ones((5, 5), np.float32)), "size"),
+        "depths of two channels": refuse(put_array("depth", np.ones((5, 5, 2), np.float32)), "[h,w]"),
+        "intrinsics of two rows": refuse(put_array("intrinsics", np.ones((2, 3))), "intrinsics"),
+        "intrinsics of zeros": refuse(put_array("intrinsics", np.zeros((3, 3))), "focal"),
+        "an image of text": refuse(put_array("image", np.array(["text"])), "images"),
+        "a pose of three numbers": refuse(
+            change_beside("../camera_poses.txt", lambda path: write_file(path, "1 2 3\n")), "12 or 16",
             place="camera_poses.txt: line 1",
         ),
-        "the first 200 bytes": refused(of_bytes(lambda data: data[:200]), "readable"),
-        "another frame that is cut": read(beside("frame_1.npz", cut(0.5))),
+        "the first 200 bytes": refuse(edit_bytes(lambda data: data[:200]), "readable"),
+        "another frame that is cut": accept(change_beside("frame_1.npz", cut(0.5))),
     }  # fmt: skip
 
 
 DAMAGES = {
-    "views.npz": of_cameras("c2w", "K", "images") | {"an order of objects": refused(pickled("order"))},
+    "views.npz": of_cameras("c2w", "K", "images") | {"an order of objects": refuse(put_objects("order"))},
     "results.npz": of_cameras("extrinsics", "intrinsics", "image"),
     "depth maps": of_depth_maps(),
     "depth frames": of_frames(),

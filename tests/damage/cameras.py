@@ -6,32 +6,35 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from .case import Change, Damage, either, refused
-from .changes import at, beside, content, of_bytes, put, swap, zeros
+from .case import Change, Damage, allow, refuse
+from .changes import change_beside, edit_bytes, fill_with_zeros, pack_at, swap, write, write_file
 
 MILLION = "MILLION"  # stands for as many attributes, which take a second to name
 NAME_IN_IMAGES = 72  # place of the first name in images.bin
 POINTS_IN_IMAGES = NAME_IN_IMAGES + len("view_000.png\0")
 
 
-def lines(change: Callable[[list[str]], list[str]]) -> Change:
+def edit_lines(change: Callable[[list[str]], list[str]]) -> Change:
     """Change the lines of a text."""
-    return of_bytes(lambda data: "\n".join(change(data.decode().splitlines())).encode())
+    return edit_bytes(lambda data: "\n".join(change(data.decode().splitlines())).encode())
 
 
 def of_binary() -> dict[str, Damage]:
     many = (2**63, 2**64 - 1)
-    huge = zeros(2**33)
+    huge = fill_with_zeros(2**33)
     return {
-        **{f"cameras.bin, count {n}": either(beside("cameras.bin", at(0, "<Q", n))) for n in many},
-        **{f"cameras.bin, width {n}": either(beside("cameras.bin", at(16, "<Q", n))) for n in (60_000, 2**63)},
-        **{f"count {n}": either(at(0, "<Q", n)) for n in many},
-        **{f"{n} points": either(at(POINTS_IN_IMAGES, "<Q", n)) for n in (2**40, 2**61, 2**64 - 1)},
-        "a million images": either(of_bytes(lambda d: struct.pack("<Q", 10**6) + d[8:] * 330_000), slow=True),
-        "a name of 1 MB": either(of_bytes(lambda d: d[:NAME_IN_IMAGES] + b"x" * 2**20 + d[NAME_IN_IMAGES:])),
-        "a name that is not UTF-8": either(at(NAME_IN_IMAGES, "<2B", 255, 254)),
-        "a name with line breaks": either(at(NAME_IN_IMAGES, "<3B", 10, 13, 27)),
-        "cameras.bin of 8 GB of zeros": refused(beside("cameras.bin", huge)),
+        **{f"cameras.bin, count {n}": allow(change_beside("cameras.bin", pack_at(0, "<Q", n))) for n in many},
+        **{
+            f"cameras.bin, width {n}": allow(change_beside("cameras.bin", pack_at(16, "<Q", n)))
+            for n in (60_000, 2**63)
+        },
+        **{f"count {n}": allow(pack_at(0, "<Q", n)) for n in many},
+        **{f"{n} points": allow(pack_at(POINTS_IN_IMAGES, "<Q", n)) for n in (2**40, 2**61, 2**64 - 1)},
+        "a million images": allow(edit_bytes(lambda d: struct.pack("<Q", 10**6) + d[8:] * 330_000), slow=True),
+        "a name of 1 MB": allow(edit_bytes(lambda d: d[:NAME_IN_IMAGES] + b"x" * 2**20 + d[NAME_IN_IMAGES:])),
+        "a name that is not UTF-8": allow(pack_at(NAME_IN_IMAGES, "<2B", 255, 254)),
+        "a name with line breaks": allow(pack_at(NAME_IN_IMAGES, "<3B", 10, 13, 27)),
+        "cameras.bin of 8 GB of zeros": refuse(change_beside("cameras.bin", huge)),
     }
 
 
@@ -43,10 +46,11 @@ def of_text() -> dict[str, Damage]:
     }  # fmt: skip
     return {
         **{
-            f"cameras.txt with {word}": refused(beside("cameras.txt", content(data))) for word, data in contents.items()
+            f"cameras.txt with {word}": refuse(change_beside("cameras.txt", write(data)))
+            for word, data in contents.items()
         },
-        "a million images": refused(content(b"0 1 0 0 0 0 0 0 1 a\n" * 1_000_000), slow=True),
-        "cameras.txt of 8 GB of zeros": refused(beside("cameras.txt", zeros(2**33))),
+        "a million images": refuse(write(b"0 1 0 0 0 0 0 0 1 a\n" * 1_000_000), slow=True),
+        "cameras.txt of 8 GB of zeros": refuse(change_beside("cameras.txt", fill_with_zeros(2**33))),
     }
 
 
@@ -58,15 +62,15 @@ def of_pose_list() -> dict[str, Damage]:
         "15,000,000 blank lines": lambda x: [*x, " \n" * 15_000_000],
         "15,000,000 comments": lambda x: [*x, "#\n" * 15_000_000],
     }  # fmt: skip
-    return {word: either(lines(change), slow=word[0].isdigit()) for word, change in changes.items()}
+    return {word: allow(edit_lines(change), slow=word[0].isdigit()) for word, change in changes.items()}
 
 
-def element(tag: str) -> Change:
+def add_element(tag: str) -> Change:
     """Put an element into a file of Metashape, behind its cameras."""
     return swap("</chunk>", f"{tag}</chunk>")
 
 
-def nested_sensors(path: Path) -> None:
+def nest_sensors(path: Path) -> None:
     """Each of 400 sensors holds the next one; the innermost has 100,000 elements."""
     data, count = path.read_text(), 400
     start, end = data.index("<sensor "), data.index("</sensors>")
@@ -75,11 +79,11 @@ def nested_sensors(path: Path) -> None:
     sensors = "".join(sensor.replace('id="0"', f'id="{i}"', 1) for i in range(count))
     cameras = "".join(camera.replace('sensor_id="0"', f'sensor_id="{i}"', 1) for i in range(count))
     head, tail = data[:start], data[data.index("</cameras>") :]
-    put(path, f"{head}{sensors}{'<a/>' * 100_000}{'</sensor>' * count}</sensors><cameras>{cameras}{tail}")
+    write_file(path, f"{head}{sensors}{'<a/>' * 100_000}{'</sensor>' * count}</sensors><cameras>{cameras}{tail}")
 
 
-def million_attributes(path: Path) -> None:
-    element(f"<x {' '.join(f'a{i}=' + chr(39) * 2 for i in range(1_000_000))}/>")(path)
+def add_attributes(path: Path) -> None:
+    add_element(f"<x {' '.join(f'a{i}=' + chr(39) * 2 for i in range(1_000_000))}/>")(path)
 
 
 def of_metashape() -> dict[str, Damage]:
@@ -87,13 +91,13 @@ def of_metashape() -> dict[str, Damage]:
     address = "u" * 1_000_000
     names = "".join(f"<a:b{i}/>" for i in range(3000))
     return {
-        "nested sensors": either(nested_sensors, slow=True),
-        "a million attributes": either(million_attributes, slow=True),
-        "a namespace of 1 MB": either(element(f"<x xmlns:a='{address}'>{'<a:b/>' * 100_000}</x>"), slow=True),
-        "names in a namespace of 1 MB": either(element(f"<x xmlns:a='{address}'>{names}</x>"), slow=True),
-        "depth": either(element("<a>" * 400_000 + "</a>" * 400_000), slow=True),
-        "a component named by a quote": either(swap('<camera id="0"', '<camera component_id="a\'b" id="0"')),
-        "an entity": either(swap("<document>", "<!DOCTYPE x [<!ENTITY a 'aaaa'>]><document>")),
+        "nested sensors": allow(nest_sensors, slow=True),
+        "a million attributes": allow(add_attributes, slow=True),
+        "a namespace of 1 MB": allow(add_element(f"<x xmlns:a='{address}'>{'<a:b/>' * 100_000}</x>"), slow=True),
+        "names in a namespace of 1 MB": allow(add_element(f"<x xmlns:a='{address}'>{names}</x>"), slow=True),
+        "depth": allow(add_element("<a>" * 400_000 + "</a>" * 400_000), slow=True),
+        "a component named by a quote": allow(swap('<camera id="0"', '<camera component_id="a\'b" id="0"')),
+        "an entity": allow(swap("<document>", "<!DOCTYPE x [<!ENTITY a 'aaaa'>]><document>")),
     }
 
 

@@ -39,21 +39,21 @@ class Damage:
     other_kind: bool = False
 
 
-def refused(change: Change, *says: object, place: str = "", **settings: Any) -> Damage:
+def refuse(change: Change, *says: object, place: str = "", **settings: Any) -> Damage:
     """Make a damage that is refused in a line that begins with the place and has these values."""
     return Damage(change, says=says, place=place, **settings)
 
 
-def read(change: Change, **settings: Any) -> Damage:
+def accept(change: Change, **settings: Any) -> Damage:
     """Make a change that the file is read with as before."""
     return Damage(change, (READ,), **settings)
 
 
-def either(change: Change, **settings: Any) -> Damage:
+def allow(change: Change, **settings: Any) -> Damage:
     """Make a damage that is read or refused, as it comes."""
     return Damage(change, (READ, REFUSED), **settings)
 
 
-def slow(damages: dict[str, Damage]) -> dict[str, Damage]:
+def leave_to_sweep(damages: dict[str, Damage]) -> dict[str, Damage]:
     """Return the same damages for the sweep alone."""
     return {name: replace(damage, slow=True) for name, damage in damages.items()}

@@ -12,35 +12,35 @@ from typing import Any
 
 from .case import Change
 
-BOMB = 10 * (1 << 24)  # bytes that the member of :func:`bomb` unpacks to
+BOMB = 10 * (1 << 24)  # bytes that the member of :func:`add_bomb` unpacks to
 
 
-def of_bytes(change: Callable[[bytes], bytes]) -> Change:
+def edit_bytes(change: Callable[[bytes], bytes]) -> Change:
     """Change the bytes of a file."""
-    return lambda path: put(path, change(path.read_bytes()))
+    return lambda path: write_file(path, change(path.read_bytes()))
 
 
-def put(path: Path, content: bytes | str) -> None:
+def write_file(path: Path, content: bytes | str) -> None:
     """Write bytes or text."""
     path.write_bytes(content.encode("utf-8", "surrogatepass") if isinstance(content, str) else content)
 
 
-def content(data: bytes | str) -> Change:
+def write(data: bytes | str) -> Change:
     """Put other content in the place of a file."""
-    return lambda path: put(path, data)
+    return lambda path: write_file(path, data)
 
 
 def cut(share: float) -> Change:
     """Keep that share of a file."""
-    return of_bytes(lambda data: data[: int(share * len(data))])
+    return edit_bytes(lambda data: data[: int(share * len(data))])
 
 
-def at(position: int, form: str, *values: Any) -> Change:
+def pack_at(position: int, form: str, *values: Any) -> Change:
     """Put numbers at a position, as ``struct`` packs them."""
-    return of_bytes(with_numbers(position, form, *values))
+    return edit_bytes(put_numbers(position, form, *values))
 
 
-def with_numbers(position: int, form: str, *values: Any) -> Callable[[bytes], bytes]:
+def put_numbers(position: int, form: str, *values: Any) -> Callable[[bytes], bytes]:
     """Return a function that puts numbers at a position of bytes."""
     packed = struct.pack(form, *values)
     return lambda data: data[:position] + packed + data[position + len(packed) :]
@@ -54,10 +54,10 @@ def swap(old: bytes | str, new: bytes | str) -> Change:
         assert before in data, before
         return data.replace(before, after, 1)
 
-    return of_bytes(change)
+    return edit_bytes(change)
 
 
-def zeros(size: int, start: bytes | None = b"") -> Change:
+def fill_with_zeros(size: int, start: bytes | None = b"") -> Change:
     """Make a file of that many bytes, of which only the start takes room on the disk: what it has if None."""
 
     def change(path: Path) -> None:
@@ -69,7 +69,7 @@ def zeros(size: int, start: bytes | None = b"") -> Change:
     return change
 
 
-def beside(name: str, change: Change) -> Change:
+def change_beside(name: str, change: Change) -> Change:
     """Change a file beside the sound one, at a path relative to it; it need not exist."""
     return lambda path: change(path.parent / name)
 
@@ -77,7 +77,7 @@ def beside(name: str, change: Change) -> Change:
 # JSON
 
 
-def edit(change: Callable[[Any], Any]) -> Change:
+def edit_json(change: Callable[[Any], Any]) -> Change:
     """Change the document of a file: of JSON, of a ``.glb``, or ``meta.json`` of an archive.
 
     What the change returns replaces the document, unless that is None.
@@ -87,7 +87,7 @@ def edit(change: Callable[[Any], Any]) -> Change:
         text, pack = document(path.read_bytes())
         parsed = json.loads(text)
         other = change(parsed)
-        put(path, pack(json.dumps(parsed if other is None else other).encode()))
+        write_file(path, pack(json.dumps(parsed if other is None else other).encode()))
 
     return both
 
@@ -95,7 +95,7 @@ def edit(change: Callable[[Any], Any]) -> Change:
 def document(data: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
     """Return the JSON of a file, and a function that returns the file with other JSON."""
     if data[:4] == b"PK\3\4":
-        return member(data, "meta.json"), lambda text: with_member(data, "meta.json", text)
+        return read_member(data, "meta.json"), lambda text: put_member(data, "meta.json", text)
     if data[:4] == b"glTF":
         end = 20 + int.from_bytes(data[12:16], "little")
         return data[20:end], lambda text: glb_bytes(text, data[end:])
@@ -108,12 +108,12 @@ def glb_bytes(text: bytes, rest: bytes) -> bytes:
     return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
 
 
-def text(data: bytes) -> Change:
+def write_json(data: bytes) -> Change:
     """Put other text in the place of the document of a file."""
-    return of_bytes(lambda before: document(before)[1](data))
+    return edit_bytes(lambda before: document(before)[1](data))
 
 
-def place(*keys: str | int, value: Any) -> Change:
+def set_json(*keys: str | int, value: Any) -> Change:
     """Put a value at a place of the document; its last key may be new."""
 
     def change(parsed: Any) -> None:
@@ -121,10 +121,10 @@ def place(*keys: str | int, value: Any) -> Change:
             parsed = parsed[key]
         parsed[keys[-1]] = value
 
-    return edit(change)
+    return edit_json(change)
 
 
-def without(*keys: str | int) -> Change:
+def drop_json(*keys: str | int) -> Change:
     """Leave out a place of the document."""
 
     def change(parsed: Any) -> None:
@@ -132,24 +132,24 @@ def without(*keys: str | int) -> Change:
             parsed = parsed[key]
         del parsed[keys[-1]]
 
-    return edit(change)
+    return edit_json(change)
 
 
 # Archives
 
 
-def members(data: bytes) -> dict[str, bytes]:
+def read_members(data: bytes) -> dict[str, bytes]:
     """The content of an archive by name."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def member(data: bytes, name: str) -> bytes:
+def read_member(data: bytes, name: str) -> bytes:
     """One member."""
-    return members(data)[name]
+    return read_members(data)[name]
 
 
-def packed(contents: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
+def pack_members(contents: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
     """An archive of that content."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", method) as archive:
@@ -158,27 +158,29 @@ def packed(contents: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> byte
     return stream.getvalue()
 
 
-def with_member(data: bytes, name: str, content: bytes) -> bytes:
+def put_member(data: bytes, name: str, content: bytes) -> bytes:
     """The archive, stored, with other content of a member, which may be new."""
-    return packed(members(data) | {name: content})
+    return pack_members(read_members(data) | {name: content})
 
 
-def of_member(name: str, change: Callable[[bytes], bytes]) -> Change:
+def edit_member(name: str, change: Callable[[bytes], bytes]) -> Change:
     """Change the bytes of a member."""
-    return of_bytes(lambda data: with_member(data, name, change(member(data, name))))
+    return edit_bytes(lambda data: put_member(data, name, change(read_member(data, name))))
 
 
-def without_member(name: str) -> Change:
+def drop_member(name: str) -> Change:
     """Leave out a member."""
-    return of_bytes(lambda data: packed({key: value for key, value in members(data).items() if key != name}))
+    return edit_bytes(
+        lambda data: pack_members({key: value for key, value in read_members(data).items() if key != name})
+    )
 
 
-def bomb(name: str, method: int, start: bytes = b"") -> Change:
+def add_bomb(name: str, method: int, start: bytes = b"") -> Change:
     """Put a member into an archive that unpacks to 168 MB, of which the directory promises 512 bytes."""
 
     def change(path: Path) -> None:
-        rest = {key: value for key, value in members(path.read_bytes()).items() if key != name}
-        put(path, packed(rest))
+        rest = {key: value for key, value in read_members(path.read_bytes()).items() if key != name}
+        write_file(path, pack_members(rest))
         with zipfile.ZipFile(path, "a", method) as archive:
             with archive.open(name, "w") as file:
                 file.write(start)
@@ -189,7 +191,7 @@ def bomb(name: str, method: int, start: bytes = b"") -> Change:
     return change
 
 
-def of_entries(in_member: int, in_directory: int, change: Callable[[int], int]) -> Change:
+def edit_entries(in_member: int, in_directory: int, change: Callable[[int], int]) -> Change:
     """Change a number of 16 bits at these places of every member's head, and of its line in the directory."""
 
     def both(data: bytes) -> bytes:
@@ -201,4 +203,4 @@ def of_entries(in_member: int, in_directory: int, change: Callable[[int], int]) 
                 start = data.find(mark, start + 4)
         return bytes(out)
 
-    return of_bytes(both)
+    return edit_bytes(both)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from .case import Change, Damage, either, read, refused
-from .changes import at, content, document, edit, glb_bytes, of_bytes, place, put
+from .case import Change, Damage, accept, allow, refuse
+from .changes import document, edit_bytes, edit_json, glb_bytes, pack_at, set_json, write, write_file
 from .sounds import SOME, SPLATTING, SPZ_IN_GLB
 
 SPZ_HEADER = struct.Struct("<3I4B")
@@ -27,19 +27,19 @@ DEEP = 100_000  # brackets, or nodes in one another
 # .spz
 
 
-def unpacked(change: Callable[[bytes], bytes]) -> Change:
+def edit_stream(change: Callable[[bytes], bytes]) -> Change:
     """Change what is in the gzip stream."""
-    return of_bytes(lambda data: gzip.compress(change(gzip.decompress(data)), 1))
+    return edit_bytes(lambda data: gzip.compress(change(gzip.decompress(data)), 1))
 
 
-def header(**changes: int) -> Change:
+def edit_header(**changes: int) -> Change:
     names = ("magic", "version", "count", "degree", "fraction", "flags", "zero")
 
     def change(data: bytes) -> bytes:
         numbers = dict(zip(names, SPZ_HEADER.unpack_from(data), strict=True)) | changes
         return SPZ_HEADER.pack(*numbers.values()) + data[SPZ_HEADER.size :]
 
-    return unpacked(change)
+    return edit_stream(change)
 
 
 def equal_bytes(count: int, degree: int = 0) -> bytes:
@@ -73,38 +73,38 @@ def add_record(data: bytes, more: bytes) -> bytes:
     return bytes(flagged[:16] + struct.pack("<I", 32 + len(more)) + flagged[20:32] + more + flagged[32:])
 
 
-def with_record(more: bytes) -> Change:
-    return of_bytes(lambda data: add_record(data, more))
+def put_record(more: bytes) -> Change:
+    return edit_bytes(lambda data: add_record(data, more))
 
 
 RECORDS = {
-    "unknown axes": refused(with_record(axes_record(17)), "SPZ_ADOBE_coordinate_system", 17),
-    "axes of two bytes": refused(with_record(axes_record(4, 2)), "SPZ_ADOBE_coordinate_system", "damaged"),
-    "axes that are cut": refused(with_record(axes_record(4, cut=1)), "SPZ_ADOBE_coordinate_system", "damaged"),
+    "unknown axes": refuse(put_record(axes_record(17)), "SPZ_ADOBE_coordinate_system", 17),
+    "axes of two bytes": refuse(put_record(axes_record(4, 2)), "SPZ_ADOBE_coordinate_system", "damaged"),
+    "axes that are cut": refuse(put_record(axes_record(4, cut=1)), "SPZ_ADOBE_coordinate_system", "damaged"),
 }
 
 
 def of_spz() -> dict[str, Damage]:
     return RECORDS | {
-        "40 bytes": refused(of_bytes(lambda data: data[:40]), 174, 9),
-        "a stream of a byte less": refused(unpacked(lambda data: data[:-1]), 174, 173),
-        "another magic": refused(header(magic=1), "another file"),
-        "the start of version 4": refused(content(b"NGSP\4\0\0\0"), "end of file"),
-        "version 9": refused(header(version=9), "version 9"),
-        "version 1 of version 3": either(header(version=1)),
-        "another degree": refused(header(degree=4), 552, 174),
-        "a fraction of 200 bits": refused(header(fraction=200), "version 1 to 4"),
-        "none": refused(header(count=0), "none promised"),
-        "2^32 - 1": refused(header(count=2**32 - 1), "64 MB"),
-        "one more": refused(header(count=len(SOME) + 1), 203, 174),
-        "1,000,001 equal ones": refused(content(equal_bytes(1_000_001)), "1,000,001"),
-        "1,000,001 equal ones in version 4": refused(content(equal_4(1_000_001)), "1,000,001"),
-        "half a million of degree 4": refused(content(equal_bytes(500_000, 4)), "500,000"),
-        "the first bytes of a stream": refused(content(gzip.compress(bytes(9), 1))),
+        "40 bytes": refuse(edit_bytes(lambda data: data[:40]), 174, 9),
+        "a stream of a byte less": refuse(edit_stream(lambda data: data[:-1]), 174, 173),
+        "another magic": refuse(edit_header(magic=1), "another file"),
+        "the start of version 4": refuse(write(b"NGSP\4\0\0\0"), "end of file"),
+        "version 9": refuse(edit_header(version=9), "version 9"),
+        "version 1 of version 3": allow(edit_header(version=1)),
+        "another degree": refuse(edit_header(degree=4), 552, 174),
+        "a fraction of 200 bits": refuse(edit_header(fraction=200), "version 1 to 4"),
+        "none": refuse(edit_header(count=0), "none promised"),
+        "2^32 - 1": refuse(edit_header(count=2**32 - 1), "64 MB"),
+        "one more": refuse(edit_header(count=len(SOME) + 1), 203, 174),
+        "1,000,001 equal ones": refuse(write(equal_bytes(1_000_001)), "1,000,001"),
+        "1,000,001 equal ones in version 4": refuse(write(equal_4(1_000_001)), "1,000,001"),
+        "half a million of degree 4": refuse(write(equal_bytes(500_000, 4)), "500,000"),
+        "the first bytes of a stream": refuse(write(gzip.compress(bytes(9), 1))),
     }
 
 
-def stream(data: bytes) -> bytes:
+def lengthen_stream(data: bytes) -> bytes:
     """A first stream that unpacks to a megabyte."""
     import zstandard
 
@@ -119,75 +119,75 @@ def stream(data: bytes) -> bytes:
 def of_spz4() -> dict[str, Damage]:
     frame = b"\x28\xb5\x2f\xfd\xe0" + b"\xff" * 7 + b"\0"
     return RECORDS | {
-        "15 bytes": refused(of_bytes(lambda data: data[:15]), "end of file"),
-        "60 bytes": refused(of_bytes(lambda data: data[:60]), "end of file"),
-        "three bytes less": refused(of_bytes(lambda data: data[:-3]), "truncated"),
-        "none": refused(at(PLACE_OF_COUNT, "<I", 0), "none promised"),
-        "2^32 - 1": refused(at(PLACE_OF_COUNT, "<I", 2**32 - 1), "64 MB"),
-        "degree 5": refused(at(12, "B", 5), "degree 5"),
-        "three streams": refused(at(15, "B", 3), "columns"),
-        "a table far away": refused(at(16, "<I", 2**31 - 1), "end of file"),
-        "a stream of 2^63": refused(at(SIZES.start, "<Q", 2**63), "truncated"),
-        "a stream that unpacks to 2^40": refused(at(SIZES.start + 8, "<Q", 2**40), "columns"),
-        "no stream": refused(at(SIZES.stop, "4s", b"none"), "Zstandard"),
-        "a frame of another size": refused(at(SIZES.stop, f"{len(frame)}s", frame), "Zstandard"),
-        "a longer stream": refused(of_bytes(stream), "another size"),
+        "15 bytes": refuse(edit_bytes(lambda data: data[:15]), "end of file"),
+        "60 bytes": refuse(edit_bytes(lambda data: data[:60]), "end of file"),
+        "three bytes less": refuse(edit_bytes(lambda data: data[:-3]), "truncated"),
+        "none": refuse(pack_at(PLACE_OF_COUNT, "<I", 0), "none promised"),
+        "2^32 - 1": refuse(pack_at(PLACE_OF_COUNT, "<I", 2**32 - 1), "64 MB"),
+        "degree 5": refuse(pack_at(12, "B", 5), "degree 5"),
+        "three streams": refuse(pack_at(15, "B", 3), "columns"),
+        "a table far away": refuse(pack_at(16, "<I", 2**31 - 1), "end of file"),
+        "a stream of 2^63": refuse(pack_at(SIZES.start, "<Q", 2**63), "truncated"),
+        "a stream that unpacks to 2^40": refuse(pack_at(SIZES.start + 8, "<Q", 2**40), "columns"),
+        "no stream": refuse(pack_at(SIZES.stop, "4s", b"none"), "Zstandard"),
+        "a frame of another size": refuse(pack_at(SIZES.stop, f"{len(frame)}s", frame), "Zstandard"),
+        "a longer stream": refuse(edit_bytes(lengthen_stream), "another size"),
     }
 
 
 def of_splat() -> dict[str, Damage]:
     return {
-        "33 bytes": refused(content(bytes(33)), "33 bytes"),
-        "NaN": refused(content(np.full(8, np.nan, "<f4").tobytes()), "NaN"),
+        "33 bytes": refuse(write(bytes(33)), "33 bytes"),
+        "NaN": refuse(write(np.full(8, np.nan, "<f4").tobytes()), "NaN"),
     }
 
 
 # .glb
 
 
-def primitive(change: Callable[[dict[str, Any]], object]) -> Change:
+def edit_primitive(change: Callable[[dict[str, Any]], object]) -> Change:
     """Change the only primitive."""
 
     def both(parsed: dict[str, Any]) -> None:
         change(parsed["meshes"][0]["primitives"][0])
 
-    return edit(both)
+    return edit_json(both)
 
 
-def splats(**values: Any) -> Change:
-    return primitive(lambda p: p["extensions"][SPLATTING].update(values))
+def edit_splats(**values: Any) -> Change:
+    return edit_primitive(lambda p: p["extensions"][SPLATTING].update(values))
 
 
-def lacks(name: str) -> Damage:
-    return refused(primitive(lambda p: p["attributes"].pop(f"{SPLATTING}:{name}")), f"{SPLATTING}:{name}")
+def lack_attribute(name: str) -> Damage:
+    return refuse(edit_primitive(lambda p: p["attributes"].pop(f"{SPLATTING}:{name}")), f"{SPLATTING}:{name}")
 
 
-def chain(parsed: dict[str, Any]) -> None:
+def chain_nodes(parsed: dict[str, Any]) -> None:
     """Nodes in one another, of which the last has the Gaussians."""
     parsed["nodes"] = [{"children": [i + 1], "scale": [2, 2, 2]} for i in range(DEEP)] + parsed["nodes"]
 
 
-def copies(parsed: dict[str, Any]) -> None:
+def copy_nodes(parsed: dict[str, Any]) -> None:
     """As many nodes that show the same Gaussians."""
     parsed["nodes"] = [{"children": list(range(1, DEEP))}, *([{"mesh": 0}] * DEEP)]
 
 
-def empty(parsed: dict[str, Any]) -> None:
+def add_empty_nodes(parsed: dict[str, Any]) -> None:
     """Nodes of a few bytes, each of which takes longer to place than they allow."""
     parsed["nodes"] = [{"children": list(range(1, 200_000))}, *([{}] * 200_000)]
 
 
-def shared(parsed: dict[str, Any]) -> None:
+def share_positions(parsed: dict[str, Any]) -> None:
     """All harmonics are the positions."""
     names = [f"{SPLATTING}:SH_DEGREE_{d}_COEF_{i}" for d in (1, 2, 3) for i in range(2 * d + 1)]
     parsed["meshes"][0]["primitives"][0]["attributes"] |= dict.fromkeys(names, 0)
 
 
-def twice(parsed: dict[str, Any]) -> None:
+def show_twice(parsed: dict[str, Any]) -> None:
     parsed["nodes"] = [{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0}]
 
 
-def many_spz(path: Path) -> None:
+def write_many_spz(path: Path) -> None:
     """Many small ``.spz``, each of which unpacks to 12 MB."""
     parsed, packed = json.loads(document(path.read_bytes())[0]), equal_bytes(PART_GAUSSIANS)
     size = len(packed) + -len(packed) % 4
@@ -198,53 +198,53 @@ def many_spz(path: Path) -> None:
         primitive["extensions"][SPLATTING]["extensions"][SPZ_IN_GLB]["bufferView"] = part
     parsed |= {"meshes": [{"primitives": primitives}], "bufferViews": views, "buffers": [{"byteLength": PARTS * size}]}
     rest = struct.pack("<I4s", PARTS * size, b"BIN\0") + packed.ljust(size, b"\0") * PARTS
-    put(path, glb_bytes(json.dumps(parsed).encode(), rest))
+    write_file(path, glb_bytes(json.dumps(parsed).encode(), rest))
 
 
 def of_glb() -> dict[str, Damage]:
-    damages = {f"JSON of {value} bytes": refused(at(12, "<I", value)) for value in (0, 2**31, 2**32 - 1)}
+    damages = {f"JSON of {value} bytes": refuse(pack_at(12, "<I", value)) for value in (0, 2**31, 2**32 - 1)}
     for value in (float("nan"), 1e300):
         for part in ("translation", "scale"):
-            damages[f"{part} of {value}"] = either(place("nodes", 0, part, value=[value] * 3))
+            damages[f"{part} of {value}"] = allow(set_json("nodes", 0, part, value=[value] * 3))
     accessor, view = ("accessors", 2), ("bufferViews", 0)
     return damages | {
-        "another length in the header": refused(at(8, "<I", 2**32 - 1), "cut"),
-        "the same document": read(of_bytes(lambda data: document(data)[1](document(data)[0]))),
-        "no splats": refused(primitive(lambda p: p["extensions"].clear()), SPLATTING, "mesh"),
-        "linear colours": refused(splats(colorSpace="lin_rec709_display"), "lin_rec709_display"),
-        "another kernel": refused(splats(kernel="customShape"), "customShape"),
-        "an unknown compression": refused(splats(extensions={f"{SPLATTING}_spz_2": {}}), f"{SPLATTING}_spz_2"),
-        **{f"no {name}": lacks(name) for name in ("SCALE", "SH_DEGREE_1_COEF_2", "SH_DEGREE_0_COEF_0")},
-        "an extension of others": refused(
-            place("extensionsRequired", value=["EXT_meshopt_compression"]), "EXT_meshopt_compression"
+        "another length in the header": refuse(pack_at(8, "<I", 2**32 - 1), "cut"),
+        "the same document": accept(edit_bytes(lambda data: document(data)[1](document(data)[0]))),
+        "no splats": refuse(edit_primitive(lambda p: p["extensions"].clear()), SPLATTING, "mesh"),
+        "linear colours": refuse(edit_splats(colorSpace="lin_rec709_display"), "lin_rec709_display"),
+        "another kernel": refuse(edit_splats(kernel="customShape"), "customShape"),
+        "an unknown compression": refuse(edit_splats(extensions={f"{SPLATTING}_spz_2": {}}), f"{SPLATTING}_spz_2"),
+        **{f"no {name}": lack_attribute(name) for name in ("SCALE", "SH_DEGREE_1_COEF_2", "SH_DEGREE_0_COEF_0")},
+        "an extension of others": refuse(
+            set_json("extensionsRequired", value=["EXT_meshopt_compression"]), "EXT_meshopt_compression"
         ),
-        "another file": refused(place("buffers", 0, "uri", value="b.bin"), "another file"),
-        "sparse values": refused(place(*accessor, "sparse", value={}), "sparse"),
-        "a count of 10^12": refused(place(*accessor, "count", value=10**12), "cut"),
-        "a count of 400 digits": refused(place("accessors", 0, "count", value=10**400), "count"),
-        "a count of 10^9": refused(place("accessors", 0, "count", value=10**9), "cut"),
-        "fewer of one attribute": refused(place(*accessor, "count", value=5), "others"),
-        "a length of 2^62": either(place(*view, "byteLength", value=2**62)),
-        "a stride of 2^62": either(place(*view, "byteStride", value=2**62)),
-        "a node in itself": refused(place("nodes", 0, "children", value=[0]), "node 0"),
-        "a node that stretches": refused(place("nodes", 0, "scale", value=[1, 2, 1]), "stretches"),
-        "a node that mirrors": refused(place("nodes", 0, "scale", value=[-1, -1, -1]), "mirrors"),
-        "the same values twice": refused(edit(twice), "same values"),
-        "nodes in one another": refused(edit(chain), slow=True),
-        "copies without end": refused(edit(copies), slow=True),
-        "200,000 empty nodes": refused(edit(empty), slow=True),
-        "values for many attributes": refused(edit(shared), "same values"),
+        "another file": refuse(set_json("buffers", 0, "uri", value="b.bin"), "another file"),
+        "sparse values": refuse(set_json(*accessor, "sparse", value={}), "sparse"),
+        "a count of 10^12": refuse(set_json(*accessor, "count", value=10**12), "cut"),
+        "a count of 400 digits": refuse(set_json("accessors", 0, "count", value=10**400), "count"),
+        "a count of 10^9": refuse(set_json("accessors", 0, "count", value=10**9), "cut"),
+        "fewer of one attribute": refuse(set_json(*accessor, "count", value=5), "others"),
+        "a length of 2^62": allow(set_json(*view, "byteLength", value=2**62)),
+        "a stride of 2^62": allow(set_json(*view, "byteStride", value=2**62)),
+        "a node in itself": refuse(set_json("nodes", 0, "children", value=[0]), "node 0"),
+        "a node that stretches": refuse(set_json("nodes", 0, "scale", value=[1, 2, 1]), "stretches"),
+        "a node that mirrors": refuse(set_json("nodes", 0, "scale", value=[-1, -1, -1]), "mirrors"),
+        "the same values twice": refuse(edit_json(show_twice), "same values"),
+        "nodes in one another": refuse(edit_json(chain_nodes), slow=True),
+        "copies without end": refuse(edit_json(copy_nodes), slow=True),
+        "200,000 empty nodes": refuse(edit_json(add_empty_nodes), slow=True),
+        "values for many attributes": refuse(edit_json(share_positions), "same values"),
     }
 
 
 def of_glb_of_spz() -> dict[str, Damage]:
     view = ("bufferViews", 0)
     return {
-        "a length of 10^9": refused(place(*view, "byteLength", value=10**9), "cut"),
-        "a negative offset": refused(place(*view, "byteOffset", value=-900), "cut"),
-        "an offset of 4": refused(edit(lambda d: d["bufferViews"][0].update(byteOffset=4, byteLength=100)), "gzip"),
-        "forty .spz in one": refused(many_spz, slow=True),
-        "another buffer": refused(place(*view, "buffer", value=1), "cut"),
+        "a length of 10^9": refuse(set_json(*view, "byteLength", value=10**9), "cut"),
+        "a negative offset": refuse(set_json(*view, "byteOffset", value=-900), "cut"),
+        "an offset of 4": refuse(edit_json(lambda d: d["bufferViews"][0].update(byteOffset=4, byteLength=100)), "gzip"),
+        "forty .spz in one": refuse(write_many_spz, slow=True),
+        "another buffer": refuse(set_json(*view, "buffer", value=1), "cut"),
     }
 
 

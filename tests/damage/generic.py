@@ -9,8 +9,8 @@ import pickle
 import tarfile
 from pathlib import Path, PurePath
 
-from .case import Damage, either, refused, slow
-from .changes import content, cut, of_bytes, of_entries, packed, text, zeros
+from .case import Damage, allow, leave_to_sweep, refuse
+from .changes import cut, edit_bytes, edit_entries, fill_with_zeros, pack_members, write, write_json
 from .sounds import SOUNDS
 
 TERABYTE = 2**40
@@ -33,7 +33,7 @@ def _archive(add: str) -> bytes:
         with tarfile.open(fileobj=stream, mode="w") as archive:
             archive.addfile(tarfile.TarInfo("scene.ply"))
         return stream.getvalue()
-    return packed({"scene.ply": b"ply\n"})
+    return pack_members({"scene.ply": b"ply\n"})
 
 
 # What stands in the place of files that were copied or downloaded, and what the line says of it
@@ -55,18 +55,18 @@ OWN = {"a zip": (".sog", ".npz"), "a gzip": (".spz",), "a PLY file": (".ply", ".
 
 def _pieces(kind: str) -> dict[str, Damage]:
     """Damages of a file as bytes."""
-    outcome = either if kind == "ply, text" or PurePath(SOUNDS[kind].name).suffix in PARTS_MAY_BE_SOUND else refused
+    outcome = allow if kind == "ply, text" or PurePath(SOUNDS[kind].name).suffix in PARTS_MAY_BE_SOUND else refuse
     damages = {f"the first {share:.2%}": outcome(cut(share)) for share in (0.0001, 0.05, 0.3, 0.5, 0.9)}
     damages |= {
-        "all but the end": either(cut(0.999)),
-        "empty": refused(content(b"")),
-        **({} if SOUNDS[kind].scene else {"missing": refused(Path.unlink, "no such file")}),
-        "zeros": refused(content(bytes(5000))),
-        "a pickle": refused(content(pickle.dumps({"a": 1}) * 9)),
-        "bytes that are no text": outcome(content(bytes(range(256)))),
-        "a byte too many": either(of_bytes(lambda data: data + b"x")),
-        "1 TB of zeros": refused(zeros(TERABYTE)),
-        "1 TB of zeros behind it": either(zeros(TERABYTE, None)),
+        "all but the end": allow(cut(0.999)),
+        "empty": refuse(write(b"")),
+        **({} if SOUNDS[kind].scene else {"missing": refuse(Path.unlink, "no such file")}),
+        "zeros": refuse(write(bytes(5000))),
+        "a pickle": refuse(write(pickle.dumps({"a": 1}) * 9)),
+        "bytes that are no text": outcome(write(bytes(range(256)))),
+        "a byte too many": allow(edit_bytes(lambda data: data + b"x")),
+        "1 TB of zeros": refuse(fill_with_zeros(TERABYTE)),
+        "1 TB of zeros behind it": allow(fill_with_zeros(TERABYTE, None)),
     }
     return damages
 
@@ -81,28 +81,28 @@ def _other_content(kind: str, suffix: str) -> dict[str, Damage]:
     for name in names:
         data, said = OTHER_CONTENT[name]
         own = kind == "photos" or suffix in OWN.get(name, ())  # of several photos, one is left out in fewer words
-        damages[name] = refused(content(data), *(() if own else said))
+        damages[name] = refuse(write(data), *(() if own else said))
     return damages
 
 
 def _json() -> dict[str, Damage]:
     """Damages of a document of JSON."""
     return {
-        "JSON of brackets": refused(text(b"[" * BRACKETS)),
-        "JSON of nested objects": refused(text(b'{"a":' * BRACKETS)),
-        "JSON of many digits": refused(text(b"9" * 10_000)),
-        "JSON of a huge number": refused(text(b"1e999")),
-        "JSON that ends": refused(text(b"{")),
-        **{f"JSON {value}": refused(text(json.dumps(value).encode())) for value in ([], [1], {}, 7, "a", None)},
+        "JSON of brackets": refuse(write_json(b"[" * BRACKETS)),
+        "JSON of nested objects": refuse(write_json(b'{"a":' * BRACKETS)),
+        "JSON of many digits": refuse(write_json(b"9" * 10_000)),
+        "JSON of a huge number": refuse(write_json(b"1e999")),
+        "JSON that ends": refuse(write_json(b"{")),
+        **{f"JSON {value}": refuse(write_json(json.dumps(value).encode())) for value in ([], [1], {}, 7, "a", None)},
     }
 
 
 def _archives() -> dict[str, Damage]:
     """Damages of a zip that holds the file's parts."""
     return {
-        "encrypted": either(of_entries(6, 8, lambda flags: flags | 1)),
-        "an unknown compression": refused(of_entries(8, 10, lambda _: 99), "method 99"),
-        "the directory alone": refused(of_bytes(lambda data: data[data.index(b"PK\x01\x02") :])),
+        "encrypted": allow(edit_entries(6, 8, lambda flags: flags | 1)),
+        "an unknown compression": refuse(edit_entries(8, 10, lambda _: 99), "method 99"),
+        "the directory alone": refuse(edit_bytes(lambda data: data[data.index(b"PK\x01\x02") :])),
     }
 
 
@@ -112,8 +112,8 @@ def _all(kind: str) -> dict[str, Damage]:
     damages |= _json() if suffix in WITH_JSON else {}
     damages |= _archives() if suffix in ZIPPED else {}
     if kind in ASKED:
-        damages = {name: either(damage.change) for name, damage in damages.items()}
-    return slow(damages) if SOUNDS[kind].rare else damages
+        damages = {name: allow(damage.change) for name, damage in damages.items()}
+    return leave_to_sweep(damages) if SOUNDS[kind].rare else damages
 
 
 DAMAGES: dict[str, dict[str, Damage]] = {kind: _all(kind) for kind in FILES}

@@ -9,34 +9,34 @@ from typing import Any
 
 import numpy as np
 
-from .case import Change, Damage, either, read, refused
-from .changes import beside, edit, place, put, text
+from .case import Change, Damage, accept, allow, refuse
+from .changes import change_beside, drop_json, edit_json, set_json, write_file, write_json
 from .sounds import NAMES
 
 MOST = 10_000  # cameras of a file
 
 
-def frames(change: Callable[[dict[str, Any]], object]) -> Change:
+def edit_frames(change: Callable[[dict[str, Any]], object]) -> Change:
     """Change every frame."""
 
     def each(data: dict[str, Any]) -> None:
         for frame in data["frames"]:
             change(frame)
 
-    return edit(each)
+    return edit_json(each)
 
 
-def repeated(times: int, key: str = "") -> Change:
+def repeat_first_row(times: int, key: str = "") -> Change:
     """As many times the cameras, or one list of them."""
 
     def change(data: Any) -> None:
         cameras = data[key] if key else data
         cameras[:] = cameras * times
 
-    return edit(change)
+    return edit_json(change)
 
 
-def without_photos(change: Change) -> Change:
+def move_photos(change: Change) -> Change:
     """The photos are not where they are looked for, so that the file alone says where."""
 
     def both(path: Path) -> None:
@@ -46,10 +46,10 @@ def without_photos(change: Change) -> Change:
     return both
 
 
-def large(shared: dict[str, Any], frame: dict[str, Any]) -> Change:
+def write_large(shared: dict[str, Any], frame: dict[str, Any]) -> Change:
     """What all frames share is large, and frames are many: neither is copied for the other."""
     data = {"fl_x": 30, "cx": 12, "cy": 8, **shared, "frames": [frame] * MOST}
-    return lambda path: put(path, json.dumps(data))
+    return lambda path: write_file(path, json.dumps(data))
 
 
 def _large() -> dict[str, Damage]:
@@ -59,7 +59,7 @@ def _large() -> dict[str, Damage]:
     }  # fmt: skip
     kinds = {"empty": {}, "with poses": {"transform_matrix": np.eye(4).tolist(), "file_path": "a"}}
     return {
-        f"large {word}, 10,000 frames {kind}": refused(large(data, frame), slow=True)
+        f"large {word}, 10,000 frames {kind}": refuse(write_large(data, frame), slow=True)
         for word, data in shared.items()
         for kind, frame in kinds.items()
     }
@@ -72,53 +72,54 @@ def of_transforms() -> dict[str, Damage]:
         "outside": "../../../../etc/passwd", "that is a device": "/dev/zero", "with an escape sequence": "\x1b[2J",
     }  # fmt: skip
     damages = {
-        f"path {word}, no images": either(without_photos(frames(lambda frame, v=value: frame.update(file_path=v))))
+        f"path {word}, no images": allow(move_photos(edit_frames(lambda frame, v=value: frame.update(file_path=v))))
         for word, value in places.items()
     }
     for key, value in (("w", 10**400), ("fl_x", 1e300), ("cx", float("nan")), ("k1", 1e9)):
-        damages[f"{key} of {str(value)[:9]}"] = either(place(key, value=value))
+        damages[f"{key} of {str(value)[:9]}"] = allow(set_json(key, value=value))
     fisheye = {"camera_model": "OPENCV_FISHEYE", "k1": 1e5}
     nested = b'{"frames": [{"transform_matrix": ' + b"[" * 900 + b"]" * 900 + b"}]}"
     deep = "a/" * 20_000 + NAMES[0]
     return damages | {
-        "fisheye k1 of 1e5": refused(edit(lambda data: data.update(fisheye)), in_scene=True),
-        "a pose of 1e200": refused(place("frames", 0, "transform_matrix", value=[[1e200] * 4] * 4)),
-        "path with line breaks and no pose": refused(place("frames", 0, value={"file_path": "a\nb\r\n\x1b[2Jc"})),
-        "a nested pose": refused(text(nested)),
-        "300 frames": either(repeated(100, "frames")),
-        "9,999 frames": either(repeated(3333, "frames"), slow=True),
-        "20,001 frames": refused(repeated(6667, "frames"), slow=True),
-        "a path of 20,000 folders": read(place("frames", 0, "file_path", value=deep), slow=True),
+        "fisheye k1 of 1e5": refuse(edit_json(lambda data: data.update(fisheye)), in_scene=True),
+        "a pose of 1e200": refuse(set_json("frames", 0, "transform_matrix", value=[[1e200] * 4] * 4)),
+        "path with line breaks and no pose": refuse(set_json("frames", 0, value={"file_path": "a\nb\r\n\x1b[2Jc"})),
+        "a nested pose": refuse(write_json(nested)),
+        "300 frames": allow(repeat_first_row(100, "frames")),
+        "9,999 frames": allow(repeat_first_row(3333, "frames"), slow=True),
+        "20,001 frames": refuse(repeat_first_row(6667, "frames"), slow=True),
+        "a path of 20,000 folders": accept(set_json("frames", 0, "file_path", value=deep), slow=True),
         **_large(),
     }
 
 
-def many_ids(data: dict[str, Any]) -> None:
+def lengthen_ids(data: dict[str, Any]) -> None:
     for side in data.values():
         for i, entry in enumerate(side):
             entry["camera_id"] = str(i) * 5000
 
 
-def astray(change: Change) -> Change:
+def rename_stray(change: Change) -> Change:
     """Under another name, by which no program has cameras."""
     return lambda path: change(path.rename(path.with_name("stray.json")))
 
 
-MANY = repeated(2 * MOST // 3 + 1)
+MANY = repeat_first_row(2 * MOST // 3 + 1)
 DAMAGES = {
     "transforms": of_transforms(),
     "Blender": {
-        "an angle of 0": refused(place("camera_angle_x", value=0), "finite", place="transforms.json: view 0.png"),
+        "no size": refuse(drop_json("w"), "'w'", "'h'", place="transforms.json: view 0.png"),
+        "an angle of 0": refuse(set_json("camera_angle_x", value=0), "finite", place="transforms.json: view 0.png"),
     },
-    "INRIA": {"a huge width": either(place(0, "width", value=10**400)), "20,001 cameras": refused(MANY, slow=True)},
+    "INRIA": {"a huge width": allow(set_json(0, "width", value=10**400)), "20,001 cameras": refuse(MANY, slow=True)},
     "WorldMirror": {
-        **{f"20,001 {key}": refused(repeated(2 * MOST // 3 + 1, key)) for key in ("extrinsics", "intrinsics")},
-        "camera_id of 5,000 digits": either(edit(many_ids)),
-        "camera_id of 5,000 digits in a stray file": either(astray(edit(many_ids))),
+        **{f"20,001 {key}": refuse(repeat_first_row(2 * MOST // 3 + 1, key)) for key in ("extrinsics", "intrinsics")},
+        "camera_id of 5,000 digits": allow(edit_json(lengthen_ids)),
+        "camera_id of 5,000 digits in a stray file": allow(rename_stray(edit_json(lengthen_ids))),
     },
     "Long-LRM": {
-        "3,000,000 numbers beside it": either(
-            beside("input_frame_idx.txt", lambda path: put(path, "0 " * 3_000_000)), slow=True
+        "3,000,000 numbers beside it": allow(
+            change_beside("input_frame_idx.txt", lambda path: write_file(path, "0 " * 3_000_000)), slow=True
         ),
     },
 }  # fmt: skip

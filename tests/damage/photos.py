@@ -13,8 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .case import Change, Damage, either, read, refused
-from .changes import content, cut, edit, of_bytes, with_numbers, zeros
+from .case import Change, Damage, accept, allow, refuse
+from .changes import cut, edit_bytes, edit_json, fill_with_zeros, put_numbers, write
 from .sounds import NAMES, TINY
 
 Bytes = Callable[[bytes], bytes]
@@ -22,7 +22,7 @@ WIDTH, HEIGHT, VIEWS = TINY.width, TINY.height, len(NAMES)
 ALL = "images"  # what is named where no photo can be used
 
 
-def every(change: Bytes) -> Change:
+def edit_all(change: Bytes) -> Change:
     """Change all photos."""
 
     def both(path: Path) -> None:
@@ -32,7 +32,7 @@ def every(change: Bytes) -> Change:
     return both
 
 
-def recoded(suffix: str, change: Bytes) -> Change:
+def recode(suffix: str, change: Bytes) -> Change:
     """All photos as another format under its own suffix, and changed."""
 
     def both(path: Path) -> None:
@@ -53,7 +53,7 @@ def png(width: int, height: int, data: bytes, *, depth: int = 8, color: int = 2)
     return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
-def with_size(width: int, height: int) -> Bytes:
+def claim_size(width: int, height: int) -> Bytes:
     """A PNG whose header tells another size than its rows have."""
     return lambda data: data[:8] + chunk(b"IHDR", struct.pack(">II", width, height) + data[24:29]) + data[33:]
 
@@ -65,7 +65,7 @@ def black(width: int, height: int) -> bytes:
     return png(width, height, b"".join(packer.compress(row) for _ in range(height)) + packer.flush())
 
 
-def with_chunks(more: bytes) -> Bytes:
+def add_chunks(more: bytes) -> Bytes:
     """A PNG with more chunks between its header and its pixels."""
     return lambda data: data[:33] + more + data[33:]
 
@@ -75,9 +75,9 @@ def texts() -> bytes:
     return b"".join(chunk(b"zTXt", b"a%d\0\0" % i + packed) for i in range(60))
 
 
-def flipped(place: int) -> Change:
+def flip(place: int) -> Change:
     """Some bits of a byte."""
-    return of_bytes(lambda data: data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
+    return edit_bytes(lambda data: data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
 
 
 def tiff(order: str, tags: list[tuple[int, int, int, int]]) -> bytes:
@@ -101,7 +101,7 @@ def with_tile(side: int, order: str = "<", *more: tuple[int, int]) -> bytes:
     return tiff(order, [(tag, 4, 1, value) for tag, value in tags]) + bytes(4) + packed
 
 
-def masks(data: bytes) -> Change:
+def write_masks(data: bytes) -> Change:
     """The bytes as the mask of every view."""
 
     def change(path: Path) -> None:
@@ -113,7 +113,7 @@ def masks(data: bytes) -> Change:
     return change
 
 
-def one_photo(path: Path) -> None:
+def name_one_photo(path: Path) -> None:
     """300 frames that name the same photo of 4 million pixels of one colour, which has 0.2 kB."""
     scene = path.parent.parent
     shutil.rmtree(path.parent)
@@ -128,10 +128,10 @@ def one_photo(path: Path) -> None:
         for key in ("w", "h"):
             del data[key]
 
-    edit(change)(scene / "transforms.json")
+    edit_json(change)(scene / "transforms.json")
 
 
-def jpeg_size(width: int, height: int) -> Bytes:
+def claim_jpeg_size(width: int, height: int) -> Bytes:
     def change(data: bytes) -> bytes:
         start = data.index(b"\xff\xc0") + 5
         return data[:start] + struct.pack(">HH", height, width) + data[start + 4 :]
@@ -152,29 +152,31 @@ def of_png() -> dict[str, Damage]:
     sizes = [(60_000, 60_000), (2**31 - 1, 1), (2**32 - 1, 2**32 - 1), (0, 0), (WIDTH + 1, HEIGHT)]
     bits = png(WIDTH, HEIGHT, zlib.compress(b"\0\xaa" * HEIGHT), depth=1, color=0)
     return {
-        **{f"a PNG that claims {w} x {h}": either(of_bytes(with_size(w, h))) for w, h in sizes},
-        "all PNG claim 60000 x 60000": refused(every(with_size(60_000, 60_000)), place=ALL),
-        "8 GB of zeros": refused(zeros(2**33)),
-        "three bombs": refused(every(lambda _: black(9000, 9000)), place=ALL, slow=True),
-        "solid of 8190 x 8190": refused(every(lambda _: black(8190, 8190)), place=ALL, slow=True),
-        "300 frames of one photo": refused(one_photo, "300 of 2000 x 2000", place="scene", compacts=True, slow=True),
-        "60 texts of 1 MB": read(every(with_chunks(texts())), slow=True),
-        "a million chunks without data": either(every(with_chunks(chunk(b"IDAT", b"") * 1_000_000)), slow=True),
-        "a script": refused(of_bytes(lambda data: b"#!/bin/sh\ntouch executed\n")),
-        "a chunk of 4 GB": refused(of_bytes(with_numbers(33, ">I", 2**32 - 1))),
-        "JPEG of four channels": either(every(cmyk)),
-        "a PNG of 1 bit": read(every(lambda _: bits)),
+        **{f"a PNG that claims {w} x {h}": allow(edit_bytes(claim_size(w, h))) for w, h in sizes},
+        "all PNG claim 60000 x 60000": refuse(edit_all(claim_size(60_000, 60_000)), place=ALL),
+        "8 GB of zeros": refuse(fill_with_zeros(2**33)),
+        "three bombs": refuse(edit_all(lambda _: black(9000, 9000)), place=ALL, slow=True),
+        "solid of 8190 x 8190": refuse(edit_all(lambda _: black(8190, 8190)), place=ALL, slow=True),
+        "300 frames of one photo": refuse(
+            name_one_photo, "300 of 2000 x 2000", place="scene", compacts=True, slow=True
+        ),
+        "60 texts of 1 MB": accept(edit_all(add_chunks(texts())), slow=True),
+        "a million chunks without data": allow(edit_all(add_chunks(chunk(b"IDAT", b"") * 1_000_000)), slow=True),
+        "a script": refuse(edit_bytes(lambda data: b"#!/bin/sh\ntouch executed\n")),
+        "a chunk of 4 GB": refuse(edit_bytes(put_numbers(33, ">I", 2**32 - 1))),
+        "JPEG of four channels": allow(edit_all(cmyk)),
+        "a PNG of 1 bit": accept(edit_all(lambda _: bits)),
     }
 
 
 def of_other_formats() -> dict[str, Damage]:
     lies = {
-        ".jpg": jpeg_size(60_000, 60_000), ".bmp": with_numbers(18, "<ii", 60_000, 60_000),
-        ".webp": with_numbers(26, "<HH", 16383, 16383), ".ppm": lambda data: data.replace(b"6 4", b"60000 60000", 1),
+        ".jpg": claim_jpeg_size(60_000, 60_000), ".bmp": put_numbers(18, "<ii", 60_000, 60_000),
+        ".webp": put_numbers(26, "<HH", 16383, 16383), ".ppm": lambda data: data.replace(b"6 4", b"60000 60000", 1),
     }  # fmt: skip
     tiffs: dict[str, Bytes] = {
-        "whose directory is itself": with_numbers(4, "<I", 0),
-        "whose directory is far away": with_numbers(4, "<I", 2**32 - 1),
+        "whose directory is itself": put_numbers(4, "<I", 0),
+        "whose directory is far away": put_numbers(4, "<I", 2**32 - 1),
         "whose tags are all of it, little-endian": lambda _: with_tags("<"),
         "whose tags are all of it, big-endian": lambda _: with_tags(">"),
         "of a tile of 8192 x 8192": lambda _: with_tile(8192),
@@ -182,22 +184,22 @@ def of_other_formats() -> dict[str, Damage]:
     }
     return {
         **{
-            f"{suffix} that lies": (either if suffix == ".webp" else refused)(recoded(suffix, lie), place=ALL)
+            f"{suffix} that lies": (allow if suffix == ".webp" else refuse)(recode(suffix, lie), place=ALL)
             for suffix, lie in lies.items()
         },
-        ".bmp upside down": read(recoded(".bmp", with_numbers(22, "<i", -HEIGHT))),
-        ".bmp of least height": refused(recoded(".bmp", with_numbers(22, "<i", -(2**31))), place=ALL),
-        **{f".tiff {word}": refused(recoded(".tiff", change), place=ALL) for word, change in tiffs.items()},
+        ".bmp upside down": accept(recode(".bmp", put_numbers(22, "<i", -HEIGHT))),
+        ".bmp of least height": refuse(recode(".bmp", put_numbers(22, "<i", -(2**31))), place=ALL),
+        **{f".tiff {word}": refuse(recode(".tiff", change), place=ALL) for word, change in tiffs.items()},
         **{
-            f".tiff masks of a tile of 26000 x 26000, {order}": refused(
-                masks(with_tile(26_000, order)), "view_000.tiff", "26000 x 26000", place="masks", compacts=True
+            f".tiff masks of a tile of 26000 x 26000, {order}": refuse(
+                write_masks(with_tile(26_000, order)), "view_000.tiff", "26000 x 26000", place="masks", compacts=True
             )
             for order in "<>"
         },
     }
 
 
-def progressive(scans: int) -> Change:
+def write_progressive(scans: int) -> Change:
     """A progressive JPEG of 4 million pixels, with its last scan as many times."""
     picture = np.zeros((2048, 2048), np.uint8)
 
@@ -211,12 +213,15 @@ def progressive(scans: int) -> Change:
 DAMAGES: dict[str, dict[str, Damage]] = {
     "photos": of_png() | of_other_formats(),
     "photo.png": {
-        **{f"byte {place} changed": refused(flipped(place)) for place in (10, 20, 30, 40, -20)},
-        "an unknown critical chunk": refused(of_bytes(with_chunks(chunk(b"ABCD", b"")))),
-        "no picture": refused(content(b"\0no image"), "decoded"),
-        "text": refused(content(b"no image"), "text"),
-        "no bytes": refused(content(b""), "empty"),
-        "half of it": refused(cut(0.5), "decoded"),
+        **{f"byte {place} changed": refuse(flip(place)) for place in (10, 20, 30, 40, -20)},
+        "an unknown critical chunk": refuse(edit_bytes(add_chunks(chunk(b"ABCD", b"")))),
+        "no picture": refuse(write(b"\0no image"), "decoded"),
+        "text": refuse(write(b"no image"), "text"),
+        "no bytes": refuse(write(b""), "empty"),
+        "half of it": refuse(cut(0.5), "decoded"),
     },
-    "photo.jpg": {"a few scans": read(progressive(1)), "5,006 scans": refused(progressive(5001), "5,006 scans")},
+    "photo.jpg": {
+        "a few scans": accept(write_progressive(1)),
+        "5,006 scans": refuse(write_progressive(5001), "5,006 scans"),
+    },
 }

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from .case import READ, REFUSED, USAGE, Change, Damage, either, read, refused
+from .case import READ, REFUSED, USAGE, Change, Damage, accept, allow, refuse
 
 FORMS = {
     "spaces": " a scene  of mine ", "Unicode": "Szene \u00e4\u6f22\u0440 \U0001f600", "a dash": "-scene",
@@ -20,16 +20,16 @@ OF_PHOTOS = {"spaces": "a b  %d", "Unicode": "\u00e4\u6f22 %d", "many digits": "
 FEW = ("line breaks", "no UTF-8")  # forms of names that are tried in every run
 
 
-def renamed(name: str) -> Change:
+def rename(name: str) -> Change:
     """The folder under another name."""
     return lambda folder: [folder.rename(folder.parent / name)]
 
 
-def renamed_ply(name: str) -> Change:
+def rename_ply(name: str) -> Change:
     return lambda folder: [(folder / "scene.ply").rename(folder / name)]
 
 
-def renamed_photos(form: str) -> Change:
+def rename_photos(form: str) -> Change:
     def change(folder: Path) -> None:
         path = folder / "transforms.json"
         for i in range(3):
@@ -43,7 +43,7 @@ def remove(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def replaced(name: str, make: Callable[[Path], object]) -> Change:
+def replace_with(name: str, make: Callable[[Path], object]) -> Change:
     """Something else where a file or folder was."""
 
     def change(folder: Path) -> None:
@@ -53,7 +53,7 @@ def replaced(name: str, make: Callable[[Path], object]) -> Change:
     return change
 
 
-def given(*arguments: str, make: Callable[[Path], object] = lambda path: None) -> Change:
+def add_arguments(*arguments: str, make: Callable[[Path], object] = lambda path: None) -> Change:
     """Arguments after the folder; ``{}`` in them is the folder."""
 
     def change(folder: Path) -> Sequence[object]:
@@ -63,37 +63,37 @@ def given(*arguments: str, make: Callable[[Path], object] = lambda path: None) -
     return change
 
 
-def loop(path: Path) -> None:
+def link_to_itself(path: Path) -> None:
     """A link to itself."""
     path.symlink_to(path)
 
 
-def ring(path: Path) -> None:
+def link_in_ring(path: Path) -> None:
     """Two links that name each other."""
     other = path.with_name(f"{path.name}.other")
     path.symlink_to(other)
     other.symlink_to(path)
 
 
-def endless(path: Path) -> None:
+def make_endless(path: Path) -> None:
     """A folder that holds itself."""
     path.mkdir()
     (path / "again").symlink_to(path)
 
 
-def linked(folder: Path) -> None:
+def link_all(folder: Path) -> None:
     for name in ("scene.ply", "transforms.json", "images"):
         (folder / name).rename(folder / f"real-{name}")
         (folder / name).symlink_to(folder / f"real-{name}")
 
 
-def deep(folder: Path) -> Sequence[object]:
+def move_deep(folder: Path) -> Sequence[object]:
     place = folder.parent.joinpath(*["d" * 100] * 20)
     place.parent.mkdir(parents=True)
     return [folder.rename(place)]
 
 
-def in_parts(change: Callable[[Path], object]) -> Change:
+def split_in_parts(change: Callable[[Path], object]) -> Change:
     """A scene whose views are files of their own, the last of them changed."""
 
     def both(folder: Path) -> None:
@@ -110,21 +110,21 @@ def in_parts(change: Callable[[Path], object]) -> Change:
     return both
 
 
-def pipe(path: Path) -> None:
+def make_pipe(path: Path) -> None:
     """A pipe in the place of a file."""
     path.unlink(missing_ok=True)
     os.mkfifo(path)
 
 
-def many_images(folder: Path) -> None:
+def add_images(folder: Path) -> None:
     for i in range(500):
         (folder / "images" / f"other_{i}.png").write_bytes(b"")
 
 
 def of_names() -> dict[str, Damage]:
-    folders = {word: read(renamed(name), slow=word not in FEW) for word, name in FORMS.items()}
-    plys = {word: read(renamed_ply(FORMS[word][:240] + ".ply"), slow=word not in FEW) for word in list(FORMS)[:5]}
-    photos = {word: read(renamed_photos(form)) for word, form in OF_PHOTOS.items()}
+    folders = {word: accept(rename(name), slow=word not in FEW) for word, name in FORMS.items()}
+    plys = {word: accept(rename_ply(FORMS[word][:240] + ".ply"), slow=word not in FEW) for word in list(FORMS)[:5]}
+    photos = {word: accept(rename_photos(form)) for word, form in OF_PHOTOS.items()}
     return {
         **{f"a folder with {word}": damage for word, damage in folders.items()},
         **{f"a ply with {word}": damage for word, damage in plys.items()},
@@ -135,46 +135,50 @@ def of_names() -> dict[str, Damage]:
 def of_things() -> dict[str, Damage]:
     """A pipe, a link to itself, a ring of links and a folder in the place of each file."""
     damages = {}
-    for thing, make in {"loop": loop, "pipe": pipe}.items():
+    for thing, make in {"loop": link_to_itself, "pipe": make_pipe}.items():
         damages |= {
-            f"scene.ply as a {thing}": refused(replaced("scene.ply", make), place="scene.ply"),
-            f"transforms.json as a {thing}": either(replaced("transforms.json", make)),
-            f"images as a {thing}": either(replaced("images", make)),
-            f"an image as a {thing}": refused(replaced("images/view_000.png", make), place="view_000.png"),
+            f"scene.ply as a {thing}": refuse(replace_with("scene.ply", make), place="scene.ply"),
+            f"transforms.json as a {thing}": allow(replace_with("transforms.json", make)),
+            f"images as a {thing}": allow(replace_with("images", make)),
+            f"an image as a {thing}": refuse(replace_with("images/view_000.png", make), place="view_000.png"),
         }
         for option, name in (
             ("--cameras", "c.json"), ("--cameras", "c.npz"), ("--cameras", "c.txt"), ("--images", "i"),
         ):  # fmt: skip
-            change = given(option, f"{{}}/{name}", make=lambda folder, make=make, name=name: make(folder / name))
-            damages[f"{option} {name}, a {thing}"] = refused(change, place=name)
-        change = given("-o", "{}/out.ply", make=lambda folder, make=make: make(folder / "out.ply"))
+            change = add_arguments(
+                option, f"{{}}/{name}", make=lambda folder, make=make, name=name: make(folder / name)
+            )
+            damages[f"{option} {name}, a {thing}"] = refuse(change, place=name)
+        change = add_arguments("-o", "{}/out.ply", make=lambda folder, make=make: make(folder / "out.ply"))
         damages[f"the output a {thing}"] = Damage(change, (READ, USAGE, REFUSED))
     for name in ("scene.ply", "transforms.json", "images", "images/view_000.png"):
-        damages[f"{name} as a ring"] = either(replaced(name, ring))
-        damages[f"{name} as a folder"] = either(replaced(name, os.mkdir))
+        damages[f"{name} as a ring"] = allow(replace_with(name, link_in_ring))
+        damages[f"{name} as a folder"] = allow(replace_with(name, os.mkdir))
     return damages
 
 
 def of_arguments() -> dict[str, Damage]:
     return {
-        "parts": read(in_parts(lambda path: None)),
-        "a part as a pipe": refused(in_parts(pipe), place="view_002.ply"),
-        "links to all files": read(given(make=linked)),
-        "images in an endless folder": either(replaced("images", endless)),
-        "an endless folder beside the images": read(given(make=lambda folder: endless(folder / "images" / "more"))),
-        "a path of 2000 letters": read(deep),
-        "500 empty images": read(given(make=many_images)),
-        "nothing where the scene was": refused(
-            given(make=lambda folder: remove(folder / "scene.ply")), place="scene", other_kind=True
+        "parts": accept(split_in_parts(lambda path: None)),
+        "a part as a pipe": refuse(split_in_parts(make_pipe), place="view_002.ply"),
+        "links to all files": accept(add_arguments(make=link_all)),
+        "images in an endless folder": allow(replace_with("images", make_endless)),
+        "an endless folder beside the images": accept(
+            add_arguments(make=lambda folder: make_endless(folder / "images" / "more"))
         ),
-        "output in a file": refused(given("-o", "{}/scene.ply/a.ply"), place="a.ply"),
-        "output below a file": refused(given("-o", "{}/transforms.json/a.ply"), place="a.ply"),
-        "a device as the scene": refused(lambda folder: ["/dev/zero"], place="/dev/zero"),
-        "nothing as the scene": refused(lambda folder: ["/dev/null"], place="/dev/null"),
-        "a device as cameras": refused(given("--cameras", "/dev/zero"), place="/dev/zero"),
-        "a device as images": refused(given("--images", "/dev/zero"), place="/dev/zero"),
-        "the ply as cameras": refused(given("--cameras", "{}/scene.ply"), place="scene.ply", other_kind=True),
-        "a name of 5000 letters": refused(lambda folder: [folder / ("x" * 5000) / "a.ply"], place="a.ply"),
+        "a path of 2000 letters": accept(move_deep),
+        "500 empty images": accept(add_arguments(make=add_images)),
+        "nothing where the scene was": refuse(
+            add_arguments(make=lambda folder: remove(folder / "scene.ply")), place="scene", other_kind=True
+        ),
+        "output in a file": refuse(add_arguments("-o", "{}/scene.ply/a.ply"), place="a.ply"),
+        "output below a file": refuse(add_arguments("-o", "{}/transforms.json/a.ply"), place="a.ply"),
+        "a device as the scene": refuse(lambda folder: ["/dev/zero"], place="/dev/zero"),
+        "nothing as the scene": refuse(lambda folder: ["/dev/null"], place="/dev/null"),
+        "a device as cameras": refuse(add_arguments("--cameras", "/dev/zero"), place="/dev/zero"),
+        "a device as images": refuse(add_arguments("--images", "/dev/zero"), place="/dev/zero"),
+        "the ply as cameras": refuse(add_arguments("--cameras", "{}/scene.ply"), place="scene.ply", other_kind=True),
+        "a name of 5000 letters": refuse(lambda folder: [folder / ("x" * 5000) / "a.ply"], place="a.ply"),
     }
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .case import Change, Damage, either, read, refused
-from .changes import of_bytes, put, swap, zeros
+from .case import Change, Damage, accept, allow, refuse
+from .changes import edit_bytes, fill_with_zeros, swap, write_file
 from .sounds import TINY
 
 COUNT = len(TINY.gaussians)
@@ -21,7 +21,7 @@ VERTEX, LAST = f"element vertex {COUNT}\n", "property float rot_3\n"
 MANY = 600_000  # rows, which in one place take long to place
 
 
-def before(line: str, *more: str) -> Change:
+def insert_before(line: str, *more: str) -> Change:
     """Put lines into the header, before one."""
     return swap(line, "".join(f"{one}\n" for one in more) + line)
 
@@ -36,7 +36,7 @@ def rename(*names: str) -> Change:
     return change
 
 
-def with_rest(*ids: int) -> Change:
+def add_harmonics(*ids: int) -> Change:
     """Add columns of zeros for harmonics of these numbers."""
 
     def change(data: bytes) -> bytes:
@@ -45,16 +45,16 @@ def with_rest(*ids: int) -> Change:
         names = "".join(f"property float f_rest_{i}\n" for i in ids)
         return head + names.encode() + mark + np.pad(values, ((0, 0), (0, len(ids)))).tobytes()
 
-    return of_bytes(change)
+    return edit_bytes(change)
 
 
-def packed_columns(path: Path) -> None:
+def rename_to_packed(path: Path) -> None:
     rename(*COLUMNS)(path)
     swap("x_before", "packed_position")(path)
     swap("y_before", "packed_scale")(path)
 
 
-def rows(change: Callable[[np.ndarray], None]) -> Change:
+def edit_rows(change: Callable[[np.ndarray], None]) -> Change:
     """Change the values of the rows: ``[n,17]`` float32."""
 
     def change_rows(data: bytes) -> bytes:
@@ -63,56 +63,56 @@ def rows(change: Callable[[np.ndarray], None]) -> Change:
         change(values)
         return head + mark + values.tobytes()
 
-    return of_bytes(change_rows)
+    return edit_bytes(change_rows)
 
 
 def fill(columns: slice, value: float, which: slice = slice(None)) -> Change:
     def change(values: np.ndarray) -> None:
         values[which, columns] = value
 
-    return rows(change)
+    return edit_rows(change)
 
 
 def random_bits(values: np.ndarray) -> None:
     values.view(np.uint32)[:] = np.random.default_rng(0).integers(0, 2**32, values.shape, dtype=np.uint32)
 
 
-def text_rows(text: str, count: int = COUNT) -> Change:
+def write_rows(text: str, count: int = COUNT) -> Change:
     """Put text in the place of the rows."""
 
     def change(data: bytes) -> bytes:
         head = data.partition(b"end_header\n")[0].replace(b"binary_little_endian", b"ascii")
         return head.replace(VERTEX.encode(), f"element vertex {count}\n".encode()) + b"end_header\n" + text.encode()
 
-    return of_bytes(change)
+    return edit_bytes(change)
 
 
-def repeated(data: bytes) -> bytes:
+def repeat_first_row(data: bytes) -> bytes:
     """Many rows that are the first one."""
     head, mark, body = data.partition(b"end_header\n")
     return head.replace(VERTEX.encode(), f"element vertex {MANY}\n".encode()) + mark + body[: len(body) // COUNT] * MANY
 
 
-def empty_lists(data: bytes) -> bytes:
+def add_empty_lists(data: bytes) -> bytes:
     """A million lists of a byte each behind the rows, every one an object in memory."""
     lists = b"element face 1000000\nproperty list uchar uchar vertex_index\nend_header\n"
     return data.replace(b"end_header\n", lists) + bytes(1_000_000)
 
 
-def header_of(count: int | str, form: str = "binary_little_endian", *more: str) -> Callable[[Path], None]:
+def write_huge_header(count: int | str, form: str = "binary_little_endian", *more: str) -> Callable[[Path], None]:
     """8 GB of zeros behind a header."""
 
     def change(path: Path) -> None:
         head = path.read_bytes().partition(b"end_header\n")[0] + b"end_header\n"
         lines = "".join(f"{line}\n" for line in (*more, f"element vertex {count}"))
         head = head.replace(VERTEX.encode(), lines.encode()).replace(b"binary_little_endian", form.encode())
-        zeros(2**33, head)(path)
+        fill_with_zeros(2**33, head)(path)
 
     return change
 
 
 def cut_header(path: Path) -> None:
-    zeros(2**33, path.read_bytes().partition(b"property")[0])(path)
+    fill_with_zeros(2**33, path.read_bytes().partition(b"property")[0])(path)
 
 
 # Compressed files: as many chunks of noise between two values
@@ -122,14 +122,14 @@ RANGES = tuple(f"{end}_{part}{axis}" for part in ("", "scale_") for end in ("min
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
-def noise(low: float = -3, high: float = 3, chunks: int | None = None) -> Change:
+def write_noise(low: float = -3, high: float = 3, chunks: int | None = None) -> Change:
     def change(path: Path) -> None:
         lines = ["ply", "format binary_little_endian 1.0", f"element chunk {1 if chunks is None else chunks}"]
         lines += [f"property float {name}" for name in RANGES]
         lines += [f"element vertex {COUNT}", *(f"property uint {name}" for name in PACKED), "end_header", ""]
         limits = np.where([name.startswith("min") for name in RANGES], low, high).astype("<f4")
         words = np.random.default_rng(0).integers(0, 2**32, (COUNT, 4), dtype=np.uint32)
-        put(path, "\n".join(lines).encode() + limits.tobytes() + words.tobytes())
+        write_file(path, "\n".join(lines).encode() + limits.tobytes() + words.tobytes())
 
     return change
 
@@ -138,11 +138,11 @@ def _counts() -> dict[str, Damage]:
     wrong = {-1: (-1,), 0: ("one Gaussian", 0), 2**31: (2**31,), 2**63: (), 10**30: (), "9" * 5000: ()}
     huge = f"element more {2**40}"
     return {
-        **{f"count {str(n)[:20]}": refused(swap(VERTEX, f"element vertex {n}\n"), *said) for n, said in wrong.items()},
-        "ascii count 2^62": refused(text_rows("1 2 3\n", 2**62)),
-        "further element of 2^40 rows": refused(before("end_header\n", huge, "property double a"), "'more'"),
-        "first element of 2^40 rows": refused(before(VERTEX, huge, "property double a"), "'more'"),
-        "rows without columns": refused(before(VERTEX, huge), "columns"),
+        **{f"count {str(n)[:20]}": refuse(swap(VERTEX, f"element vertex {n}\n"), *said) for n, said in wrong.items()},
+        "ascii count 2^62": refuse(write_rows("1 2 3\n", 2**62)),
+        "further element of 2^40 rows": refuse(insert_before("end_header\n", huge, "property double a"), "'more'"),
+        "first element of 2^40 rows": refuse(insert_before(VERTEX, huge, "property double a"), "'more'"),
+        "rows without columns": refuse(insert_before(VERTEX, huge), "columns"),
     }
 
 
@@ -150,33 +150,35 @@ def _headers() -> dict[str, Damage]:
     elements = [line for i in range(20_000) for line in (f"element other_{i} 0", "property char a")]
     lists = ("element face 1000000", "property list uchar uint vertex_index")
     return {
-        "another name": refused(swap("element vertex", "element points"), "'vertex'", "'points'"),
-        "name with an escape sequence": refused(swap("element vertex", "element \x1b[31mvertex")),
-        "name of a megabyte": refused(swap(LAST, "property float " + "a" * 2**20 + "\n"), "1 MiB"),
-        "name that is not ascii": refused(swap("f_dc_0", "f_dc_\xe9"), "column f_dc_0"),
-        "keyword that is not ascii": refused(swap("comment", "c\xe9mment"), "line 3"),
-        "no end": refused(swap("end_header\n", ""), "end of file"),
-        "another first line": refused(swap("ply\n", "plywood\n"), "'ply'"),
-        "a column missing": refused(rename("scale_1", "scale_2"), "column scale_1"),
-        "columns missing": refused(rename("opacity", "rot_2"), "columns opacity, rot_2"),
-        "points": refused(rename(*COLUMNS[6:]), "f_dc_0, f_dc_1, f_dc_2, opacity", "splat"),
-        "packed columns alone": refused(packed_columns, "compressed"),
-        **{f"{n} f_rest": refused(with_rest(*range(n)), f"{n} f_rest") for n in (1, 10, 46)},
-        "f_rest with a gap": refused(with_rest(*range(8), 9), "9 f_rest"),
-        "a list of floats": refused(swap(LAST, "property list uchar float rot_3\n"), "list"),
-        "20,000 columns": refused(before(LAST, *(f"property uchar p{i}" for i in range(20_000)))),
-        "20,000 elements": refused(before("end_header\n", *elements), "steps"),
-        "f_rest of 3000 columns": refused(before(LAST, *(f"property float f_rest_{i}" for i in range(3000)))),
-        "list of 2^32": refused(before("property float x\n", "property list uint double many"), "list"),
-        "list of a negative length": refused(before("property float x\n", "property list char double many"), "list"),
-        "million empty lists": refused(before(VERTEX, *lists), "140 MB"),
-        "million empty lists after the vertices": refused(of_bytes(empty_lists), "140 MB"),
-        "100,000 comments": refused(before(VERTEX, *(["comment nothing"] * 100_000)), "1 MiB"),
-        "comment that is not ascii": read(before(VERTEX, "comment \xff\xfe")),
-        "comment with an escape sequence": read(before(VERTEX, "comment \x1b[2J\x07")),
-        "a line of a megabyte": refused(text_rows("1" * 2**20)),
-        "10,000 empty lines": refused(text_rows("\n" * 10_000), f"{COUNT} rows", 0),
-        "fewer rows": refused(of_bytes(lambda data: data[: len(data) // 2]), "'vertex'", COUNT,
+        "another name": refuse(swap("element vertex", "element points"), "'vertex'", "'points'"),
+        "name with an escape sequence": refuse(swap("element vertex", "element \x1b[31mvertex")),
+        "name of a megabyte": refuse(swap(LAST, "property float " + "a" * 2**20 + "\n"), "1 MiB"),
+        "name that is not ascii": refuse(swap("f_dc_0", "f_dc_\xe9"), "column f_dc_0"),
+        "keyword that is not ascii": refuse(swap("comment", "c\xe9mment"), "line 3"),
+        "no end": refuse(swap("end_header\n", ""), "end of file"),
+        "another first line": refuse(swap("ply\n", "plywood\n"), "'ply'"),
+        "a column missing": refuse(rename("scale_1", "scale_2"), "column scale_1"),
+        "columns missing": refuse(rename("opacity", "rot_2"), "columns opacity, rot_2"),
+        "points": refuse(rename(*COLUMNS[6:]), "f_dc_0, f_dc_1, f_dc_2, opacity", "splat"),
+        "packed columns alone": refuse(rename_to_packed, "compressed"),
+        **{f"{n} f_rest": refuse(add_harmonics(*range(n)), f"{n} f_rest") for n in (1, 10, 46)},
+        "f_rest with a gap": refuse(add_harmonics(*range(8), 9), "9 f_rest"),
+        "a list of floats": refuse(swap(LAST, "property list uchar float rot_3\n"), "list"),
+        "20,000 columns": refuse(insert_before(LAST, *(f"property uchar p{i}" for i in range(20_000)))),
+        "20,000 elements": refuse(insert_before("end_header\n", *elements), "steps"),
+        "f_rest of 3000 columns": refuse(insert_before(LAST, *(f"property float f_rest_{i}" for i in range(3000)))),
+        "list of 2^32": refuse(insert_before("property float x\n", "property list uint double many"), "list"),
+        "list of a negative length": refuse(
+            insert_before("property float x\n", "property list char double many"), "list"
+        ),
+        "million empty lists": refuse(insert_before(VERTEX, *lists), "140 MB"),
+        "million empty lists after the vertices": refuse(edit_bytes(add_empty_lists), "140 MB"),
+        "100,000 comments": refuse(insert_before(VERTEX, *(["comment nothing"] * 100_000)), "1 MiB"),
+        "comment that is not ascii": accept(insert_before(VERTEX, "comment \xff\xfe")),
+        "comment with an escape sequence": accept(insert_before(VERTEX, "comment \x1b[2J\x07")),
+        "a line of a megabyte": refuse(write_rows("1" * 2**20)),
+        "10,000 empty lines": refuse(write_rows("\n" * 10_000), f"{COUNT} rows", 0),
+        "fewer rows": refuse(edit_bytes(lambda data: data[: len(data) // 2]), "'vertex'", COUNT,
                               place="scene.ply: truncated or damaged"),
     }  # fmt: skip
 
@@ -184,51 +186,51 @@ def _headers() -> dict[str, Damage]:
 def _values() -> dict[str, Damage]:
     means, colors, opacity, scales, quats = slice(0, 3), slice(6, 9), slice(9, 10), slice(10, 13), slice(13, 17)
     return {
-        "positions 1e38": refused(fill(means, 1e38), place="transforms.json"),
-        "half of the positions NaN": either(fill(means, np.nan, slice(0, None, 2))),
-        "one position 1e30": read(fill(means, 1e30, slice(5, 6))),
-        "colours 1e38": read(fill(colors, 1e38)),
-        "opacities 1e38": read(fill(opacity, 1e38)),
-        "scales 1e38": read(fill(scales, 1e38)),
-        "rotations 1e38": read(fill(quats, 1e38)),
-        "rows of zeros": refused(fill(slice(None), 0), COUNT, "origin"),
-        "random bits": either(rows(random_bits), slow=True),
-        f"{MANY} rows of one place": either(of_bytes(repeated), slow=True),
-        "packed noise": either(noise(), slow=True),
-        "packed between infinities": refused(noise(-np.inf, np.inf), "NaN"),
-        "packed between 3e38": either(noise(-3e38, 3e38), slow=True),
-        "packed with 2^50 chunks": refused(noise(chunks=2**50), "'chunk'"),
-        "packed with no chunks": refused(noise(chunks=0), "1 chunks", COUNT, 0),
+        "positions 1e38": refuse(fill(means, 1e38), place="transforms.json"),
+        "half of the positions NaN": allow(fill(means, np.nan, slice(0, None, 2))),
+        "one position 1e30": accept(fill(means, 1e30, slice(5, 6))),
+        "colours 1e38": accept(fill(colors, 1e38)),
+        "opacities 1e38": accept(fill(opacity, 1e38)),
+        "scales 1e38": accept(fill(scales, 1e38)),
+        "rotations 1e38": accept(fill(quats, 1e38)),
+        "rows of zeros": refuse(fill(slice(None), 0), COUNT, "origin"),
+        "random bits": allow(edit_rows(random_bits), slow=True),
+        f"{MANY} rows of one place": allow(edit_bytes(repeat_first_row), slow=True),
+        "packed noise": allow(write_noise(), slow=True),
+        "packed between infinities": refuse(write_noise(-np.inf, np.inf), "NaN"),
+        "packed between 3e38": allow(write_noise(-3e38, 3e38), slow=True),
+        "packed with 2^50 chunks": refuse(write_noise(chunks=2**50), "'chunk'"),
+        "packed with no chunks": refuse(write_noise(chunks=0), "1 chunks", COUNT, 0),
     }
 
 
 def _huge() -> dict[str, Damage]:
     lists = ("element face 100000000", "property list uchar uchar vertex_index")
     return {
-        "8 GB of zeros after ply": refused(zeros(2**33, b"ply\n"), "1 MiB"),
-        "8 GB of zeros in the header": refused(cut_header, slow=True),
-        "8 GB of zeros as ascii rows": refused(header_of(2**26, "ascii"), slow=True),
-        "8 GB of zeros as lists": refused(header_of(COUNT, "binary_little_endian", *lists), slow=True),
+        "8 GB of zeros after ply": refuse(fill_with_zeros(2**33, b"ply\n"), "1 MiB"),
+        "8 GB of zeros in the header": refuse(cut_header, slow=True),
+        "8 GB of zeros as ascii rows": refuse(write_huge_header(2**26, "ascii"), slow=True),
+        "8 GB of zeros as lists": refuse(write_huge_header(COUNT, "binary_little_endian", *lists), slow=True),
     }
 
 
 # Of a compressed file
 
 
-def without_element(name: str) -> Callable[[bytes], bytes]:
+def drop_element(name: str) -> Callable[[bytes], bytes]:
     return lambda data: re.sub(rb"element %b \d+\n(property \w+ \w+\n)+" % name.encode(), b"", data, count=1)
 
 
 def of_compressed() -> dict[str, Damage]:
     return {
-        "no chunks": refused(of_bytes(without_element("chunk")), "lacks", "'chunk'"),
-        "harmonics of fewer rows": refused(swap("element sh 6\n", "element sh 5\n"), 6, "'sh'"),
-        "another range": refused(swap("property float min_y", "property float middle_y"), "min_y", "'chunk'", "f4"),
+        "no chunks": refuse(edit_bytes(drop_element("chunk")), "lacks", "'chunk'"),
+        "harmonics of fewer rows": refuse(swap("element sh 6\n", "element sh 5\n"), 6, "'sh'"),
+        "another range": refuse(swap("property float min_y", "property float middle_y"), "min_y", "'chunk'", "f4"),
     }
 
 
 DAMAGES = {
-    "ply, text": {"another first line": refused(swap("ply\n", "plywood\n"), "text", "'plywood'")},
+    "ply, text": {"another first line": refuse(swap("ply\n", "plywood\n"), "text", "'plywood'")},
     "rows": _counts() | _headers() | _values() | _huge(),
     "compressed ply": of_compressed(),
 }

@@ -11,8 +11,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .case import Change, Damage, either, read, refused
-from .changes import beside, bomb, cut, edit, of_member, packed, place, put, without, without_member
+from .case import Change, Damage, accept, allow, refuse
+from .changes import (
+    add_bomb,
+    change_beside,
+    cut,
+    drop_json,
+    drop_member,
+    edit_json,
+    edit_member,
+    pack_members,
+    set_json,
+    write_file,
+)
 
 LOSSLESS = (cv2.IMWRITE_WEBP_QUALITY, 101)
 BOX = {"min": [-9, -9, -9], "max": [9, 9, 9]}
@@ -39,46 +50,48 @@ def equal_files(count: int, bands: int) -> dict[str, bytes]:
     return files | {"meta.json": json.dumps({"version": 2, "count": count} | meta).encode()}
 
 
-def equal(count: int, bands: int) -> Change:
-    return lambda path: put(path, packed(equal_files(count, bands)))
+def write_equal(count: int, bands: int) -> Change:
+    return lambda path: write_file(path, pack_members(equal_files(count, bands)))
 
 
-def picture(name: str, *size: int, **settings: int) -> Change:
+def replace_picture(name: str, *size: int, **settings: int) -> Change:
     """Put another picture in the place of a texture."""
-    return of_member(name, lambda _: webp(*size, **settings))
+    return edit_member(name, lambda _: webp(*size, **settings))
 
 
 def swap_pictures(path: Path) -> None:
     """Colours in the place of rotations, whose mode they lack."""
     with zipfile.ZipFile(path) as archive:
         colors = archive.read("sh0.webp")
-    of_member("quats.webp", lambda _: colors)(path)
+    edit_member("quats.webp", lambda _: colors)(path)
 
 
 def of_sog() -> dict[str, Damage]:
     return {
-        "no version": refused(without("version"), "version 2"),
-        "version as a list": refused(place("version", value=[2]), "version 2"),
-        "a count of 10^18": refused(place("count", value=10**18), "count"),
-        "a count of 400 digits": refused(place("count", value=HUGE), "count"),
-        "a count beyond the pixels": refused(place("count", value=17), "4 x 4", 17),
-        "a count in words": refused(place("count", value="three\nlines"), "count"),
-        "a million equal Gaussians": refused(equal(1_000_000, 3), "126 MB"),
-        "900 equal Gaussians": read(equal(900, 3)),
-        "a texture missing": refused(without_member("quats.webp")),
-        "a texture from outside": refused(place("quats", "files", value=["../../etc/passwd"]), "../../etc/passwd"),
-        "a codebook of one code": refused(place("sh0", "codebook", value=[0.5]), 256),
-        "a huge minimum": refused(place("means", "mins", value=[HUGE] * 3), "too large"),
-        "a minimum of NaN": refused(place("means", "mins", value=[float("nan")] * 3), "NaN"),
-        "a texture with losses": refused(picture("scales.webp", 4, 4, quality=50), "without loss"),
-        "a texture of a million pixels": refused(picture("scales.webp", 1024, 1024), "scales.webp", "1024 x 1024"),
-        "a texture of its header": refused(of_member("scales.webp", lambda data: data[:25]), "scales.webp", "damaged"),
-        "rotations of no mode": refused(swap_pictures, "mode"),
-        "a palette of 10^9": refused(place("shN", value={"count": 10**9, "bands": 3, "files": ["a", "b"]}), 65536),
-        "meta.json of bzip2": refused(
-            bomb("meta.json", zipfile.ZIP_BZIP2), "method 12", place="a.sog: 'meta.json'", slow=True
+        "no version": refuse(drop_json("version"), "version 2"),
+        "version as a list": refuse(set_json("version", value=[2]), "version 2"),
+        "a count of 10^18": refuse(set_json("count", value=10**18), "count"),
+        "a count of 400 digits": refuse(set_json("count", value=HUGE), "count"),
+        "a count beyond the pixels": refuse(set_json("count", value=17), "4 x 4", 17),
+        "a count in words": refuse(set_json("count", value="three\nlines"), "count"),
+        "a million equal Gaussians": refuse(write_equal(1_000_000, 3), "126 MB"),
+        "900 equal Gaussians": accept(write_equal(900, 3)),
+        "a texture missing": refuse(drop_member("quats.webp")),
+        "a texture from outside": refuse(set_json("quats", "files", value=["../../etc/passwd"]), "../../etc/passwd"),
+        "a codebook of one code": refuse(set_json("sh0", "codebook", value=[0.5]), 256),
+        "a huge minimum": refuse(set_json("means", "mins", value=[HUGE] * 3), "too large"),
+        "a minimum of NaN": refuse(set_json("means", "mins", value=[float("nan")] * 3), "NaN"),
+        "a texture with losses": refuse(replace_picture("scales.webp", 4, 4, quality=50), "without loss"),
+        "a texture of a million pixels": refuse(
+            replace_picture("scales.webp", 1024, 1024), "scales.webp", "1024 x 1024"
         ),
-        "meta.json that promises less": refused(bomb("meta.json", zipfile.ZIP_DEFLATED), slow=True),
+        "a texture of its header": refuse(edit_member("scales.webp", lambda data: data[:25]), "scales.webp", "damaged"),
+        "rotations of no mode": refuse(swap_pictures, "mode"),
+        "a palette of 10^9": refuse(set_json("shN", value={"count": 10**9, "bands": 3, "files": ["a", "b"]}), 65536),
+        "meta.json of bzip2": refuse(
+            add_bomb("meta.json", zipfile.ZIP_BZIP2), "method 12", place="a.sog: 'meta.json'", slow=True
+        ),
+        "meta.json that promises less": refuse(add_bomb("meta.json", zipfile.ZIP_DEFLATED), slow=True),
     }
 
 
@@ -90,13 +103,13 @@ def leaf(*files: int, count: int = 900) -> dict[str, Any]:
     return {"bound": BOX, "children": children}
 
 
-def chunks_of(count: int = 900, chunks: int = 1, bands: int = 0, **changes: Any) -> Change:
+def write_chunks(count: int = 900, chunks: int = 1, bands: int = 0, **changes: Any) -> Change:
     """An index of equal chunks, whose entries are changed."""
 
     def change(path: Path) -> None:
         names = [f"{number}/meta.json" for number in range(chunks)]
         document = {"version": 1, "lodLevels": 1, "filenames": names, "tree": leaf(*range(chunks), count=count)}
-        put(path, json.dumps(document | changes))
+        write_file(path, json.dumps(document | changes))
         for name in names:
             chunk = (path.parent / name).parent
             chunk.mkdir()
@@ -106,9 +119,9 @@ def chunks_of(count: int = 900, chunks: int = 1, bands: int = 0, **changes: Any)
     return change
 
 
-def two_names(path: Path) -> None:
+def name_twice(path: Path) -> None:
     """Two chunks that are one by a link."""
-    chunks_of(filenames=["0/meta.json", "1/meta.json"], tree=leaf(0, 1))(path)
+    write_chunks(filenames=["0/meta.json", "1/meta.json"], tree=leaf(0, 1))(path)
     (path.parent / "1").symlink_to("0")
 
 
@@ -117,7 +130,7 @@ def link_out(path: Path) -> None:
     (path.parent / "0_0").symlink_to(path.parent.parent / "outside")
 
 
-def fewer(index: dict[str, Any]) -> None:
+def count_fewer(index: dict[str, Any]) -> None:
     """A count that agrees with all of the index, and not with the chunk."""
     index["tree"]["lods"]["0"]["count"] -= 1
     index.update(count=index["count"] - 1, counts=[index["counts"][0] - 1, *index["counts"][1:]])
@@ -135,52 +148,58 @@ def deepen(index: dict[str, Any]) -> None:
         index["tree"] = {"bound": BOX, "children": [index["tree"]]}
 
 
-def more_name(name: str) -> Change:
-    return edit(lambda index: index["filenames"].append(name))
+def add_name(name: str) -> Change:
+    return edit_json(lambda index: index["filenames"].append(name))
 
 
 def of_levels() -> dict[str, Damage]:
     chunk, lods = "0_0/meta.json", ("tree", "lods")
     return {
-        "another version": refused(place("version", value=2), "version 1", 2),
-        "a version as a list": refused(place("version", value=[]), "version 1"),
-        "fewer levels than its tree": refused(place("lodLevels", value=1), "level"),
-        "a tree as a list": refused(place("tree", value=[])),
-        "leaves and children": refused(place("tree", "children", value=[]), "either children or lods"),
-        "a box turned": refused(place("tree", "bound", value={"min": [9, 9, 9], "max": [1, 1, 1]}), "bound"),
-        "a box of NaN": refused(place("tree", "bound", "min", value=[float("nan")] * 3), "bound"),
-        "a box of huge integers": either(place("tree", "bound", value={"min": [HUGE] * 3, "max": [HUGE] * 3})),
-        "another count": refused(place("count", value=5), "the tree has 9"),
-        "a file beyond the list": refused(place(*lods, "0", "file", value=2), "file"),
-        "an offset of true": refused(place(*lods, "0", "offset", value=True), "offset"),
-        "a gap": refused(place(*lods, "0", "offset", value=1), "runs of file 0"),
-        "a level in words": refused(place(*lods, "finest", value={}), "finest"),
-        "a chunk of two levels": refused(place(*lods, "1", "file", value=0), "two levels"),
-        "a chunk above": refused(more_name("../lod-meta.json"), "../lod-meta.json"),
-        "a chunk above, as Windows has it": refused(more_name("..\\meta.json")),
-        "a chunk of another name": refused(more_name("0_0/other.json"), "0_0/other.json"),
-        "an environment above": refused(place("environment", value="../meta.json"), "../meta.json"),
-        "a chunk by a link out": refused(link_out, "link"),
-        "a chunk by two names": refused(two_names, "link"),
-        "a chunk missing": refused(lambda path: shutil.rmtree(path.parent / "0_0"), place=chunk),
-        "a texture missing": refused(beside("0_0/quats.webp", Path.unlink), place="quats.webp"),
-        "a texture of 16 million pixels": refused(
-            beside("0_0/scales.webp", lambda path: put(path, webp(4096, 4096, channels=3))), "4096 x 4096", place=chunk
+        "another version": refuse(set_json("version", value=2), "version 1", 2),
+        "a version as a list": refuse(set_json("version", value=[]), "version 1"),
+        "fewer levels than its tree": refuse(set_json("lodLevels", value=1), "level"),
+        "a tree as a list": refuse(set_json("tree", value=[])),
+        "leaves and children": refuse(set_json("tree", "children", value=[]), "either children or lods"),
+        "a box turned": refuse(set_json("tree", "bound", value={"min": [9, 9, 9], "max": [1, 1, 1]}), "bound"),
+        "a box of NaN": refuse(set_json("tree", "bound", "min", value=[float("nan")] * 3), "bound"),
+        "a box of huge integers": allow(set_json("tree", "bound", value={"min": [HUGE] * 3, "max": [HUGE] * 3})),
+        "another count": refuse(set_json("count", value=5), "the tree has 9"),
+        "a file beyond the list": refuse(set_json(*lods, "0", "file", value=2), "file"),
+        "an offset of true": refuse(set_json(*lods, "0", "offset", value=True), "offset"),
+        "a gap": refuse(set_json(*lods, "0", "offset", value=1), "runs of file 0"),
+        "a level in words": refuse(set_json(*lods, "finest", value={}), "finest"),
+        "a chunk of two levels": refuse(set_json(*lods, "1", "file", value=0), "two levels"),
+        "a chunk above": refuse(add_name("../lod-meta.json"), "../lod-meta.json"),
+        "a chunk above, as Windows has it": refuse(add_name("..\\meta.json")),
+        "a chunk of another name": refuse(add_name("0_0/other.json"), "0_0/other.json"),
+        "an environment above": refuse(set_json("environment", value="../meta.json"), "../meta.json"),
+        "a chunk by a link out": refuse(link_out, "link"),
+        "a chunk by two names": refuse(name_twice, "link"),
+        "a chunk missing": refuse(lambda path: shutil.rmtree(path.parent / "0_0"), place=chunk),
+        "a texture missing": refuse(change_beside("0_0/quats.webp", Path.unlink), place="quats.webp"),
+        "a texture of 16 million pixels": refuse(
+            change_beside("0_0/scales.webp", lambda path: write_file(path, webp(4096, 4096, channels=3))),
+            "4096 x 4096",
+            place=chunk,
         ),
-        "fewer rows than its chunk": refused(edit(fewer), 5, 6, place=chunk),
-        "a texture from outside": refused(
-            beside(chunk, place("quats", "files", value=["../../etc/passwd"])), "../../etc/passwd", place=chunk
+        "fewer rows than its chunk": refuse(edit_json(count_fewer), 5, 6, place=chunk),
+        "a texture from outside": refuse(
+            change_beside(chunk, set_json("quats", "files", value=["../../etc/passwd"])),
+            "../../etc/passwd",
+            place=chunk,
         ),
-        "a chunk's count of 10^15": refused(beside(chunk, place("count", value=10**15)), "MB", place=chunk),
-        "a chunk of version 1": refused(beside(chunk, without("version")), "version 2", 1, place=chunk),
-        "a chunk that is cut": refused(beside("0_0/means_l.webp", cut(0.5)), "means_l.webp", place=chunk),
-        "chunks of equal Gaussians": read(chunks_of(chunks=2)),
-        "many chunks of equal Gaussians": refused(chunks_of(180_000, 4, 3), slow=True),
-        "100,000 names": read(chunks_of(filenames=[f"{number}/meta.json" for number in range(100_000)]), slow=True),
-        "a deep tree": read(edit(deepen)),
-        "no version": read(edit(forget)),
-        "no more than an empty list": refused(
-            lambda path: put(path, '{"version": 1, "filenames": [], "lodLevels": 1}')
+        "a chunk's count of 10^15": refuse(change_beside(chunk, set_json("count", value=10**15)), "MB", place=chunk),
+        "a chunk of version 1": refuse(change_beside(chunk, drop_json("version")), "version 2", 1, place=chunk),
+        "a chunk that is cut": refuse(change_beside("0_0/means_l.webp", cut(0.5)), "means_l.webp", place=chunk),
+        "chunks of equal Gaussians": accept(write_chunks(chunks=2)),
+        "many chunks of equal Gaussians": refuse(write_chunks(180_000, 4, 3), slow=True),
+        "100,000 names": accept(
+            write_chunks(filenames=[f"{number}/meta.json" for number in range(100_000)]), slow=True
+        ),
+        "a deep tree": accept(edit_json(deepen)),
+        "no version": accept(edit_json(forget)),
+        "no more than an empty list": refuse(
+            lambda path: write_file(path, '{"version": 1, "filenames": [], "lodLevels": 1}')
         ),
     }
 

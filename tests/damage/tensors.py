@@ -15,8 +15,8 @@ from safetensors.numpy import load_file, save_file
 
 from gsmerge.io.formats import gsm
 
-from .case import Change, Damage, refused
-from .changes import at, of_bytes, packed, put, zeros
+from .case import Change, Damage, refuse
+from .changes import edit_bytes, fill_with_zeros, pack_at, pack_members, write_file
 
 RESULTS = ("means", "quats", "scales", "opacities", "sh0", "shN", "viewmats", "Ks")
 FEATURES = ("merged.means", "refined.latents", "views", "group", "samples.means", "unseen.means", "saliency", "origin")
@@ -37,12 +37,12 @@ def save(path: Path, arrays: dict[str, np.ndarray], form: str, header: Any) -> N
     save_file(arrays, path, {form: header if isinstance(header, str) else json.dumps(header)})
 
 
-def with_text(text: str, form: str | None = None) -> Change:
+def write_header(text: str, form: str | None = None) -> Change:
     """Another text in place of the header, under the file's own format or another."""
     return lambda path: save(path, load_file(path), form or entry(path)[0], text)
 
 
-def of_header(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Change:
+def edit_header(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Change:
     """Change the header."""
 
     def both(path: Path) -> None:
@@ -52,19 +52,19 @@ def of_header(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Change:
     return both
 
 
-def with_header(**changes: Any) -> Change:
-    return of_header(lambda said: said | changes)
+def set_header(**changes: Any) -> Change:
+    return edit_header(lambda said: said | changes)
 
 
-def with_about(**changes: Any) -> Change:
-    return of_header(lambda said: said | {"about": said["about"] | changes})
+def set_about(**changes: Any) -> Change:
+    return edit_header(lambda said: said | {"about": said["about"] | changes})
 
 
-def without_entry(name: str) -> Change:
-    return of_header(lambda said: {key: value for key, value in said.items() if key != name})
+def drop_entry(name: str) -> Change:
+    return edit_header(lambda said: {key: value for key, value in said.items() if key != name})
 
 
-def of_arrays(change: Callable[[dict[str, np.ndarray]], Any]) -> Change:
+def edit_arrays(change: Callable[[dict[str, np.ndarray]], Any]) -> Change:
     """Change the arrays by name, in place."""
 
     def both(path: Path) -> None:
@@ -75,15 +75,15 @@ def of_arrays(change: Callable[[dict[str, np.ndarray]], Any]) -> Change:
     return both
 
 
-def of_array(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    return of_arrays(lambda arrays: arrays.update({name: change(arrays[name])}))
+def edit_array(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return edit_arrays(lambda arrays: arrays.update({name: change(arrays[name])}))
 
 
-def without_array(name: str) -> Change:
-    return of_arrays(lambda arrays: arrays.pop(name))
+def drop_array(name: str) -> Change:
+    return edit_arrays(lambda arrays: arrays.pop(name))
 
 
-def negated(name: str) -> Change:
+def negate(name: str) -> Change:
     """The signs of an array changed behind the back of its checksum."""
 
     def change(path: Path) -> None:
@@ -102,10 +102,10 @@ def fill(name: str, value: float) -> Change:
         array.flat[array.size // 2] = value
         return array
 
-    return of_array(name, change)
+    return edit_array(name, change)
 
 
-def with_metadata(metadata: object) -> Change:
+def set_metadata(metadata: object) -> Change:
     """Another value in the place of the texts by name of a safetensors file."""
 
     def change(data: bytes) -> bytes:
@@ -113,24 +113,24 @@ def with_metadata(metadata: object) -> Change:
         head = json.dumps({**json.loads(data[8:end]), "__metadata__": metadata}).encode()
         return len(head).to_bytes(8, "little") + head + data[end:]
 
-    return of_bytes(change)
+    return edit_bytes(change)
 
 
 def of_any() -> dict[str, Damage]:
     """What is wrong with any file."""
     metadata = ([1, "a"], "text", 7, True, {"gsmerge": 1}, {"gsmerge": ["a"]}, {"gsmerge": {"a": "b"}})
     return {
-        "a byte too many": refused(of_bytes(lambda data: data + b"x")),
-        "all but the end": refused(of_bytes(lambda data: data[:-1])),
-        "a huge header": refused(at(0, "8s", b"\xff" * 8)),
-        "1 TB of zeros": refused(zeros(2**40), "header"),
-        "1 TB of zeros behind a header": refused(zeros(2**40, (2).to_bytes(8, "little") + b"{}")),
-        "1 TB of zeros behind it": refused(zeros(2**40, None)),
-        "no header": refused(lambda path: save_file(load_file(path), path)),
-        "a header of no JSON": refused(with_text("{")),
-        "a header of a list": refused(with_text("[]")),
-        "a header of brackets": refused(with_text("[" * 100_000)),
-        **{f"metadata as {json.dumps(value)}": refused(with_metadata(value)) for value in metadata},
+        "a byte too many": refuse(edit_bytes(lambda data: data + b"x")),
+        "all but the end": refuse(edit_bytes(lambda data: data[:-1])),
+        "a huge header": refuse(pack_at(0, "8s", b"\xff" * 8)),
+        "1 TB of zeros": refuse(fill_with_zeros(2**40), "header"),
+        "1 TB of zeros behind a header": refuse(fill_with_zeros(2**40, (2).to_bytes(8, "little") + b"{}")),
+        "1 TB of zeros behind it": refuse(fill_with_zeros(2**40, None)),
+        "no header": refuse(lambda path: save_file(load_file(path), path)),
+        "a header of no JSON": refuse(write_header("{")),
+        "a header of a list": refuse(write_header("[]")),
+        "a header of brackets": refuse(write_header("[" * 100_000)),
+        **{f"metadata as {json.dumps(value)}": refuse(set_metadata(value)) for value in metadata},
     }
 
 
@@ -138,98 +138,98 @@ def of_each(arrays: Iterable[str], floats: Iterable[str]) -> dict[str, Damage]:
     """Each array missing, of another type and of another shape; those of numbers with a NaN."""
     damages: dict[str, Damage] = {}
     for name in arrays:
-        damages[f"no {name}"] = refused(without_array(name), name)
-        damages[f"{name} of another type"] = refused(
-            of_array(name, lambda a: a.astype(np.float32 if a.dtype == np.float64 else np.float64)), name
+        damages[f"no {name}"] = refuse(drop_array(name), name)
+        damages[f"{name} of another type"] = refuse(
+            edit_array(name, lambda a: a.astype(np.float32 if a.dtype == np.float64 else np.float64)), name
         )
-        damages[f"{name} of another shape"] = refused(of_array(name, lambda a: a[None]), name)
-    return damages | {f"NaN in {name}": refused(fill(name, float("nan")), name) for name in floats}
+        damages[f"{name} of another shape"] = refuse(edit_array(name, lambda a: a[None]), name)
+    return damages | {f"NaN in {name}": refuse(fill(name, float("nan")), name) for name in floats}
 
 
 def of_results() -> dict[str, Damage]:
     headers = {
-        "networks": with_text("{}", "gsmerge-networks"),
-        **{f"no {name}": without_entry(name) for name in ("schema", "kind", "width", "names")},
-        "an older schema": with_header(schema=0),
-        "another kind": with_header(kind="mood"),
-        "views without pixels": with_header(width=0),
-        "views of 65536 x 65536": with_header(width=65536, height=65536),
-        "a width of true": with_header(width=True),
-        "about in a list": with_header(about=[]),
-        "a name less": with_header(names=["a"]),
-        "names by number": with_header(names=[1, 2]),
+        "networks": write_header("{}", "gsmerge-networks"),
+        **{f"no {name}": drop_entry(name) for name in ("schema", "kind", "width", "names")},
+        "an older schema": set_header(schema=0),
+        "another kind": set_header(kind="mood"),
+        "views without pixels": set_header(width=0),
+        "views of 65536 x 65536": set_header(width=65536, height=65536),
+        "a width of true": set_header(width=True),
+        "about in a list": set_header(about=[]),
+        "a name less": set_header(names=["a"]),
+        "names by number": set_header(names=[1, 2]),
     }
     arrays = {
-        "no images": without_array("images"),
-        "images of another size": of_array("images", lambda a: a[:, 1:]),
-        "an image less": of_array("images", lambda a: a[1:]),
-        "harmonics of degree 5": of_array("shN", lambda a: np.zeros((len(a), 35, 3), np.float32)),
-        "no Gaussian is finite": of_array("means", lambda a: a * np.float32(np.nan)),
-        "intrinsics of zeros": of_array("Ks", np.zeros_like),
-        "views of zeros": of_array("viewmats", np.zeros_like),
+        "no images": drop_array("images"),
+        "images of another size": edit_array("images", lambda a: a[:, 1:]),
+        "an image less": edit_array("images", lambda a: a[1:]),
+        "harmonics of degree 5": edit_array("shN", lambda a: np.zeros((len(a), 35, 3), np.float32)),
+        "no Gaussian is finite": edit_array("means", lambda a: a * np.float32(np.nan)),
+        "intrinsics of zeros": edit_array("Ks", np.zeros_like),
+        "views of zeros": edit_array("viewmats", np.zeros_like),
         "views of 1e300": fill("viewmats", 1e300),
     }
     return {
-        **{name: refused(change) for name, change in (headers | arrays).items()},
+        **{name: refuse(change) for name, change in (headers | arrays).items()},
         **of_each(RESULTS, ("viewmats", "Ks")),
-        "the schema before": refused(with_header(schema=2), "run extend again"),
-        "a schema to come": refused(with_header(schema=9, gsmerge="9.9"), "update gsmerge"),
-        "three million objects": refused(with_about(notes=[[]] * 3_000_000), slow=True),
-        "a changed sign": refused(negated("sh0"), "expected the checksum", place="a.gsm: sh0"),
+        "the schema before": refuse(set_header(schema=2), "run extend again"),
+        "a schema to come": refuse(set_header(schema=9, gsmerge="9.9"), "update gsmerge"),
+        "three million objects": refuse(set_about(notes=[[]] * 3_000_000), slow=True),
+        "a changed sign": refuse(negate("sh0"), "expected the checksum", place="a.gsm: sh0"),
     }
 
 
 def of_features() -> dict[str, Damage]:
     changes = {
-        "no networks": without_entry("networks"),
-        "networks of another size": with_header(networks={"width": 32, "heads": 2, "latent": 4}),
-        "a unit of zero": with_header(unit=0.0),
-        "no unit": without_entry("unit"),
+        "no networks": drop_entry("networks"),
+        "networks of another size": set_header(networks={"width": 32, "heads": 2, "latent": 4}),
+        "a unit of zero": set_header(unit=0.0),
+        "no unit": drop_entry("unit"),
         "views beyond": fill("views", 99),
         "merged views beyond": fill("merged.views", -2),
-        "groups of no members": of_array("num_members", np.zeros_like),
-        "samples without pixels": of_array("samples.opacities", lambda a: a[:, :0]),
+        "groups of no members": edit_array("num_members", np.zeros_like),
+        "samples without pixels": edit_array("samples.opacities", lambda a: a[:, :0]),
         "means of 3e38": fill("merged.means", 3e38),
     }
     return {
-        **{name: refused(change) for name, change in changes.items()},
+        **{name: refuse(change) for name, change in changes.items()},
         **of_each(FEATURES, ("merged.means", "refined.latents", "group", "saliency", "origin")),
-        "a changed sign": refused(negated("merged.sh0"), "expected the checksum", place="a.gsm: merged.sh0"),
+        "a changed sign": refuse(negate("merged.sh0"), "expected the checksum", place="a.gsm: merged.sh0"),
     }
 
 
-def torch_file(path: Path) -> None:
+def write_torch_file(path: Path) -> None:
     """As torch saves its files."""
-    put(path, packed({"archive/data.pkl": pickle.dumps({"a": 1})}, zipfile.ZIP_STORED))
+    write_file(path, pack_members({"archive/data.pkl": pickle.dumps({"a": 1})}, zipfile.ZIP_STORED))
 
 
 def of_checkpoint() -> dict[str, Damage]:
     changes = {
-        "a torch file": torch_file,
-        "another program's": with_text("{}", "networks"),
-        "another schema": with_header(schema=1),
-        "no version": with_header(gsmerge=None),
-        "no options": with_header(options=None),
-        "unknown options": with_header(options={"depth": 3}),
-        "enormous options": with_header(options={"width": 1000000000}),
-        "options of another type": with_header(options={"width": "48"}),
-        "bounds that bound nothing": with_header(options={"bounds": {"mean": 1e9}}),
-        "bounds that are no table": with_header(options={"bounds": 3}),
-        "unknown bounds": with_header(options={"bounds": {"far": 1.0}}),
-        "other sizes": with_header(options={"width": 64}),
-        "training that is no table": with_header(training=3),
-        "a tensor too many": of_arrays(lambda arrays: arrays.update(more=np.ones(1, np.float32))),
+        "a torch file": write_torch_file,
+        "another program's": write_header("{}", "networks"),
+        "another schema": set_header(schema=1),
+        "no version": set_header(gsmerge=None),
+        "no options": set_header(options=None),
+        "unknown options": set_header(options={"depth": 3}),
+        "enormous options": set_header(options={"width": 1000000000}),
+        "options of another type": set_header(options={"width": "48"}),
+        "bounds that bound nothing": set_header(options={"bounds": {"mean": 1e9}}),
+        "bounds that are no table": set_header(options={"bounds": 3}),
+        "unknown bounds": set_header(options={"bounds": {"far": 1.0}}),
+        "other sizes": set_header(options={"width": 64}),
+        "training that is no table": set_header(training=3),
+        "a tensor too many": edit_arrays(lambda arrays: arrays.update(more=np.ones(1, np.float32))),
         "infinity": fill(WEIGHT, float("inf")),
     }
-    damages = of_any() | of_each([WEIGHT], [WEIGHT]) | {name: refused(change) for name, change in changes.items()}
-    return {name: refused(d.change, *(d.says or ("expected",)), slow=d.slow) for name, d in damages.items()}
+    damages = of_any() | of_each([WEIGHT], [WEIGHT]) | {name: refuse(change) for name, change in changes.items()}
+    return {name: refuse(d.change, *(d.says or ("expected",)), slow=d.slow) for name, d in damages.items()}
 
 
 def of_batches() -> dict[str, Damage]:
     """What ``extend`` alone reads."""
     return {
-        "batches by number": refused(with_about(batches=5), "batches"),
-        "batches of numbers": refused(with_about(batches=[5]), "batches"),
+        "batches by number": refuse(set_about(batches=5), "batches"),
+        "batches of numbers": refuse(set_about(batches=[5]), "batches"),
     }
 
 

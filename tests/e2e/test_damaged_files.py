@@ -79,7 +79,7 @@ def spoil(name: str, folder: Path, *, quick: bool = False) -> tuple[Path, list[s
     target = folder / "scene" if sound.scene else path
     arguments = [str(argument) for argument in (other if isinstance(other, list) else [target])]
     words = sound.words[: 1 if damage.compacts else None]
-    return path, [*words, *["--"] * arguments[0].startswith("-"), *arguments]
+    return path, [*words, *arguments]
 
 
 def one_line(err: str) -> None:
@@ -173,7 +173,7 @@ def test_damaged_files_are_read_within_a_budget(name: str, tmp_path: Path, serve
         return
     assert listing(tmp_path) == before
     if outcome.code == 3 and words[0] == COMPACT[0] and not damage.other_kind and not OPTIONS & {*words}:
-        files = [word for word in words[1:] if word not in ("--cameras", "--dry-run", "--")]
+        files = [word for word in words[1:] if word not in ("--cameras", "--dry-run")]
         checked = server.run(["inspect", "--quiet", "--", *files], limits(num_bytes))
         within_budget(checked, num_bytes)
         refused_by_inspect(outcome, checked)
@@ -184,7 +184,7 @@ def test_damaged_files_are_read_within_a_budget(name: str, tmp_path: Path, serve
 def test_damaged_files_can_be_inspected(name: str, tmp_path: Path, server: CommandServer) -> None:
     words = spoil(name, tmp_path)[1]
     num_bytes = size_of(tmp_path)
-    target = next(word for word in words[1:] if not word.startswith("-") or "--" in words)
+    target = next(word for word in words[1:] if not word.startswith("-"))
     outcome = server.run(["inspect", "--", target], limits(num_bytes))
     within_budget(outcome, num_bytes, describes=True)
     assert not list(tmp_path.rglob(MARKER))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damage.tensors import negated
+from damage.tensors import negate
 from former_formats import compressed_bytes
 from messages import ERROR, says
 from sweeps import sweep
@@ -107,7 +107,7 @@ WRONG: dict[str, tuple[Any, ...]] = {
     "a bit of a sog": ("away/a.sog", member_bit, "", "CRC-32"),
     "a bit of an npz": ("views.npz", member_bit, "", "CRC-32"),
     "a bit of a gsm": ("state.gsm", flip(-9), "", "checksum"),
-    "an array of a gsm": ("state.gsm", negated("means"), "means", "checksum"),
+    "an array of a gsm": ("state.gsm", negate("means"), "means", "checksum"),
     "no file": ("scene.ply", Path.unlink, "", "no such file"),
 }
 

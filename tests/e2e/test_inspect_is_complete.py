@@ -50,7 +50,7 @@ def with_one_photo(folder: Path) -> None:
 STATE = ("compact", "--fit", "none", "-o", "made.ply", "--overwrite", "a.gsm")
 KINDS = {
     "rows": Kind("scene.ply", many=FEWER),
-    "parts": Kind("view_*.ply", change=places.in_parts(lambda path: None), many=FEWER),
+    "parts": Kind("view_*.ply", change=places.split_in_parts(lambda path: None), many=FEWER),
     "transforms": Kind("transforms.json", named=("--cameras", "transforms.json")),
     "photos": Kind("images/*.png", change=with_one_photo, named=("--images", "images")),
     "views.npz": Kind("views.npz", "views.npz", named=("--cameras", "views.npz")),

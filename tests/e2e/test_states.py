@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from damage.case import Change
 from damage.changes import cut
-from damage.tensors import negated
+from damage.tensors import negate
 from scripts import load_script
 
 import gsmerge
@@ -318,7 +318,7 @@ def test_the_papers_online_experiment(
 # what may go wrong
 
 
-@pytest.mark.parametrize("spoil", [cut(0.5), negated("sh0")], ids=["half", "a changed byte"])
+@pytest.mark.parametrize("spoil", [cut(0.5), negate("sh0")], ids=["half", "a changed byte"])
 def test_a_damaged_state_is_refused_by_all(spoil: Change, state: Path, walks: list[Path], run: Run) -> None:
     spoil(state)
     (out := state.parent / "out.ply").write_text("precious")

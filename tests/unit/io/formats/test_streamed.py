@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from damage.changes import zeros
+from damage.changes import fill_with_zeros
 from messages import NO_FOLDER, refuses
 from slow_readers import corners, drawn
 from splat_transform_programs import needs_program, put_stand_in, run_here, write_set
@@ -51,7 +51,7 @@ def test_other_files_beside_a_chunk_do_not_count(scene: Scene, tmp_path: Path) -
     write_set(tmp_path / "lod-meta.json", [drawn(scene, 1)])
     before = read_gaussians(tmp_path / "lod-meta.json").info.file_bytes
     for meta in list(tmp_path.rglob("*/meta.json")):
-        zeros(40 << 30)(meta.with_name("unused"))
+        fill_with_zeros(40 << 30)(meta.with_name("unused"))
     assert read_gaussians(tmp_path / "lod-meta.json").info.file_bytes == before
     assert load_scene(tmp_path / "lod-meta.json").recognised["bytes"] == before  # as reports have it
     assert before > 2 * (tmp_path / "lod-meta.json").stat().st_size
