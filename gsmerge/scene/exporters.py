@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from gsmerge.alignment import ESTIMATED, MAY_BE_UNALIGNED, Layout
 from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.table import FFGS
-from gsmerge.settings.reading import QuatChoice, ReadHints
-from gsmerge.settings.setting import join_words
+from gsmerge.settings.reading import SCENE_ARGUMENTS, QuatChoice, ReadHints
+from gsmerge.settings.setting import join_words, suggest_name
 
 if TYPE_CHECKING:
     from gsmerge.io.formats.read import FileInfo

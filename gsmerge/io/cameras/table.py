@@ -25,8 +25,8 @@ from gsmerge.io.cameras.view_layout import (
     rotation_of_vector,
 )
 from gsmerge.io.first_bytes import read_start
+from gsmerge.io.formats.table import STATE_ENDING
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
-from gsmerge.settings.extend import SUFFIX
 
 _lazy = lazy_functions(__package__)
 CHUNK = ".torch"  # ending of re10k's chunks
@@ -201,6 +201,6 @@ CAMERA_FORMATS = (
                  ".npz", _READ_DA3, W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
     RE10K,
     SHARP_PLY,
-    CameraFormat("state", "inside a `.gsm` of gsmerge extend", SUFFIX, _READ_STATE, W2C_OPENCV, "pixels"),
+    CameraFormat("state", "inside a `.gsm` of gsmerge extend", STATE_ENDING, _READ_STATE, W2C_OPENCV, "pixels"),
 )  # fmt: skip
 CAMERA_ENDINGS = (*dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")), LOG)

@@ -1,8 +1,8 @@
-"""Compute the gradient of the fit's image loss in one pass over the rows, without intermediate images.
+"""The gradient of the fit's image loss in one pass over the rows: no image is written but the result.
 
-Structural similarity needs sums over windows of image, photo and their products, then sums over windows of terms that
-are computed from those. Differences between neighbouring pixels follow row by row. Every sum is added up in the same
-order wherever a range of rows begins, so results do not depend on the split of rows among threads.
+Structural similarity needs sums over windows of image, photo and their products, and then sums over windows of what
+those give. Differences between neighbouring pixels follow row by row. Every sum is added up in the same order
+wherever a range of rows begins, so results do not depend on how rows are shared out.
 """
 
 from __future__ import annotations
@@ -11,21 +11,12 @@ import numpy as np
 
 from gsmerge.kernels.signature import STATUS, f4, i8, native
 
-SIDE = 7  # side of the windows, pixels
+SIDE = 7  # of the windows, pixels
 C1, C2 = np.float32(1e-4), np.float32(9e-4)  # SSIM's constants for a data range of 1
 
-ROWS, TERMS = 12, 3  # rows of derivatives in memory, and terms of each value
-EDGE_ROWS = 7  # rows of differences, weights and gradients of pairs
-CHUNK, PAD = 96, 9  # values that are summed at a time, and padding beside a row
-
-
-# ``terms`` and ``rows`` are scratch; their width is rounded up to CHUNK, plus PAD
-_loss_gradient = declare(
-    "loss_gradient", STATUS, image=f4("height", "width"), photo=f4("height", "width"), weight=f4("height", "pixels"),
-    ssim_lambda=f4(), edge_weight=f4(), first=i8(least=0, most="height"), last=i8(least="first", most="height"),
-    gradient=f4("height", "width", out=True), errors=f4("height", out=True), terms=f4(ROWS, TERMS, "room", out=True),
-    rows=f4(EDGE_ROWS, "room", out=True),
-)  # fmt: skip
+ROWS, TERMS = 12, 3  # rows of derivatives that are kept at a time, and numbers of each of their values
+EDGE_ROWS = 7  # of differences, weights and what they give
+CHUNK, PAD = 96, 9  # values that are summed at a time, and beside a row
 
 
 def room_of(width):
@@ -42,9 +33,9 @@ def room_of(width):
 def loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows):
     """Write the gradient of (1 - ssim_lambda) |e| + ssim_lambda (1 - SSIM) + edge_weight |difference of e|.
 
-    e is ``image - photo``. Differences of e are taken to the next pixel of a row and of a column. Pixels have weights,
-    and a pair of pixels has the smaller weight of the two. Windows of SSIM are uniform, with 7 x 7 pixels, and pixels
-    beyond the border are zero.
+    e is ``image - photo``; differences of e are taken to the next pixel of a row and of a column. Pixels have weights,
+    and a pair of pixels has the smaller weight of the two. Windows of SSIM are uniform, of 7 x 7 pixels, zero beyond
+    the border.
 
     Args:
         image: ``[h,3w]`` float32, interleaved channels.
@@ -52,6 +43,7 @@ def loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, g
         edge_weight: Weight of the differences between neighbouring pixels, float32.
         first: First row.
         last: Last row, exclusive.
-        gradient: ``[h,3w]`` float32; the rows are written, divided by the number of pixels.
-        errors: ``[h]`` float32, written: weighted squared error of each row.
+        gradient: ``[h,3w]`` float32, the rows are written, divided by the number of pixels.
+        errors: ``[h]`` float32, weighted squared error of each row, written.
+        terms, rows: Buffers as long as :func:`room_of` says, overwritten.
     """
