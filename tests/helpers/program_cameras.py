@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scenes
-from hostile.case import HEIGHT, VIEWS, WIDTH
 from tiny_scene import FLIP
 
 from gsmerge.geometry import motion_vectors
 from gsmerge.kernels.matrices import invert, matmul
 
+VIEWS, WIDTH, HEIGHT = 3, 24, 16
 W2C = scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64)
 C2W = invert(W2C)
 C2W_OPENGL = matmul(C2W, FLIP)

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile.case import HEIGHT, VIEWS, WIDTH
 from messages import refuses
-from program_cameras import C2W, CX, CY, FORMATS, FX, FY, K_DIVIDED, NAMES, W2C, K
+from program_cameras import C2W, CX, CY, FORMATS, FX, FY, HEIGHT, K_DIVIDED, NAMES, VIEWS, W2C, WIDTH, K
 from tiny_scene import edited_json, rotation
 
 from gsmerge.errors import SceneError
