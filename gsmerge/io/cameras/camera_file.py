@@ -19,20 +19,23 @@ from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath
 
-MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # beyond them no camera is, and numbers would overflow later
-_MAX_COEFFICIENT = 1e6  # of a lens; what a smaller one does to the photos is checked with them
-_MAX_FOCAL_SIDES, _MAX_CENTRE_SIDES = 1e5, 1e3  # of the image's longer side: focal length, principal point
+# Limits of numbers in poses and intrinsics, sides and focal lengths; no camera is beyond them, and later steps overflow
+MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6
+_MAX_COEFFICIENT = 1e6  # of a lens; the effect of smaller coefficients is checked when photos are undistorted
+_MAX_FOCAL_SIDES, _MAX_CENTRE_SIDES = 1e5, 1e3  # largest focal length and principal point, in longer sides of the image
 _MAX_ROTATION_ERROR = 0.02  # of the entries of R R^T
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
 
-CENTRED_PX = 1e-3  # by which twice a principal point in the middle may differ from the image's size
+# A principal point is in the middle if twice it differs by at most these pixels from the image's size
+CENTRED_PX = 1e-3
 PATCH = 14  # sides of vision transformers' inputs are multiples of it
-_OTHER_SIZE, _WHOLE = 0.1, 1e-3  # share by which a side differs from that of another size; pixels off a whole number
-MAX_NORMALISED_FOCAL = 10.0  # a longer one is in pixels; and no image is that small
+_OTHER_SIZE = 0.1  # sides of another size differ at least by this share
+_WHOLE = 1e-3  # a side is a whole number up to these pixels
+MAX_NORMALISED_FOCAL = 10.0  # a longer focal length is in pixels, and no image is that small
 
-# Of the rows of a file, which a file of cameras may name
+# Orders of the Gaussians' rows that a camera file may name
 ORDERS: tuple[str, ...] = get_args(Order)
-# How a format stores poses: direction of the matrix, and the camera's axes.
+# How a format stores poses: direction of the matrix, and axes of the camera
 Convention = tuple[str, str]
 W2C_OPENCV: Convention = ("world-to-camera", "OpenCV")
 C2W_OPENCV: Convention = ("camera-to-world", "OpenCV")
@@ -40,14 +43,14 @@ W2C_OPENGL: Convention = ("world-to-camera", "OpenGL")
 C2W_OPENGL: Convention = ("camera-to-world", "OpenGL")
 CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 
-COEFFICIENTS = {  # their names, in order
+COEFFICIENTS = {  # names of a lens's coefficients, in order
     "perspective": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
-# Share of an undistorted photo's pixels that lie within the photo, at least: at half of the image's diagonal r, a lens
-# with k1 = 1 / r^2, stronger than any, still has a third
+# Smallest share of an undistorted photo's pixels that lie within the photo. A lens with k1 = 1 / r^2, where r is half
+# of the image's diagonal, is stronger than any real lens and still has a third
 _MIN_SHARE = 0.25
-_GRID = 32  # pixels a side on which that is measured
+_GRID = 32  # pixels on each side of the grid on which this share is measured
 
 
 @dataclass(frozen=True)
@@ -55,12 +58,12 @@ class Lens:
     """A lens: perspective with distortion, or fisheye."""
 
     name: str  # as the camera file calls the model
-    model: Literal["perspective", "fisheye"]  # radial and tangential, as ``cv2.undistort``; as ``cv2.fisheye``
-    coefficients: tuple[float, ...]  # the first of COEFFICIENTS; others are 0
+    model: Literal["perspective", "fisheye"]  # as ``cv2.undistort`` (radial, tangential), or ``cv2.fisheye``
+    coefficients: tuple[float, ...]  # the first of COEFFICIENTS; further coefficients are 0
 
 
 def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients: Sequence[float]) -> Lens | None:
-    """Make a lens; None for a pinhole, which is a perspective lens without distortion."""
+    """Make a lens; return None for a pinhole, which is a perspective lens without distortion."""
     return Lens(name, model, tuple(coefficients)) if model == "fisheye" or any(coefficients) else None
 
 
@@ -78,12 +81,12 @@ class CameraFile:
     convention: Convention = W2C_OPENCV  # how the format stores poses
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
     order: str = "auto"  # order of the Gaussians' rows where the file names it, otherwise "auto"
-    lenses: tuple[Lens | None, ...] = ()  # of each camera where one of them is no pinhole; empty where all are
-    # how a focal length was estimated that the file lacks, one sentence; "" where it has one, None where that is to do
+    lenses: tuple[Lens | None, ...] = ()  # of each camera, None for a pinhole; empty if all are pinholes
+    # "" if the file has focal lengths; otherwise one sentence about how they were estimated, None until they are
     focal: str | None = ""
-    # how photos of a size are brought to the cameras' where the photos have shown it; None where that is to be found
+    # Size of the photos, and how photos of it are brought to the cameras' size; None until it is found
     photo_map: tuple[Size, PhotoTransform] | None = None
-    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 for none, where the rows have shown the cameras by it
+    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 for none, if the cameras were estimated from the rows
     pixel_ids: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -94,7 +97,7 @@ class CameraFile:
 
 
 def drop_repeats(file: CameraFile) -> CameraFile:
-    """Leave out views with the name, pose and intrinsics of an earlier one; the file itself where it holds images."""
+    """Drop views with the name, pose and intrinsics of an earlier view, unless the file holds images or pixel ids."""
     keys = [
         (name, viewmat.tobytes(), K.tobytes())
         for name, viewmat, K in zip(file.names, file.viewmats, file.Ks, strict=True)
@@ -118,7 +121,7 @@ class StoredView(NamedTuple):
 
     name: str  # of its image
     pose: np.ndarray  # 3x4 or 4x4, in the file's convention
-    # ``[3,3]`` intrinsics, pixels, or divided by the image's size in all views of the file; None in all without any
+    # ``[3,3]`` intrinsics in pixels, or in all views divided by the image's size; None in all views without any
     K: np.ndarray | None
     size: tuple[int, int] = (0, 0)  # (width, height), pixels; 0 where unknown
     lens: Lens | None = None  # None for a pinhole
@@ -139,14 +142,15 @@ def make_camera_file(
 ) -> CameraFile:
     """Make a camera file from poses in any convention: convert them to OpenCV world-to-camera, and check them.
 
-    ``images [c,h,w,3]`` and the ``order`` of rows are given if the file holds them. SceneError if there is no camera, a
-    number is infinite or too large, a rotation is not orthonormal, or a focal length is not positive.
+    Intrinsics that are small enough in all views to be divided by the image's size become pixels. ``images [c,h,w,3]``
+    and the ``order`` of rows are given if the file holds them. SceneError if there is no camera, a number is infinite
+    or too large, a rotation is not orthonormal, or a focal length is not positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
     check_count(path, len(views))
-    missing = all(view.K is None for view in views)
-    if missing:  # a place holder, until the focal length is estimated
+    lacks_intrinsics = all(view.K is None for view in views)
+    if lacks_intrinsics:  # placeholders until the focal length is estimated
         sides = [float(max(view.size)) or 1.0 for view in views]
         views = [view._replace(K=make_pinhole(f, f, 0, 0)) for view, f in zip(views, sides, strict=True)]
     poses, Ks = np.tile(np.eye(4), (len(views), 1, 1)), np.array([view.K for view in views], np.float64)
@@ -181,7 +185,7 @@ def make_camera_file(
         images=images,
         order=order,
         lenses=lenses if any(lenses) else (),
-        focal=None if missing else "",
+        focal=None if lacks_intrinsics else "",
     )
 
 
@@ -286,16 +290,17 @@ def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> CameraFile:
-    """Return cameras of no stored size with that of which their principal points are the middle, unless photos have it.
+    """Give cameras without a size the size of which their principal points are the middle, unless the photos have it.
 
-    ``size``: of the photos. Networks make each side a multiple of ``PATCH``, of which only a rough middle is needed.
+    ``size`` is (width, height) of the photos. Twice the principal points must have the photos' shape. Sides that are no
+    whole numbers are rounded to multiples of ``PATCH``, as which networks choose the sides of their inputs.
     """
     if size is None or camera_file.focal is None or _stored_sizes(camera_file) != [(0, 0)]:
         return camera_file
     sides = 2 * np.median(camera_file.Ks[:, :2, 2], 0)
     ratios = sides / size
-    alike = float(ratios.max()) < (1 + _OTHER_SIZE) * float(ratios.min())
-    if not alike or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > _OTHER_SIZE).all():
+    has_photo_shape = float(ratios.max()) < (1 + _OTHER_SIZE) * float(ratios.min())
+    if not has_photo_shape or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > _OTHER_SIZE).all():
         return camera_file
     unit = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH
     width, height = (np.full(len(camera_file), unit * round(side / unit)) for side in sides.tolist())
@@ -306,7 +311,7 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
     """Convert to cameras of one image size (width, height) in pixels; None: the file's size.
 
-    Intrinsics of another size are scaled, each axis by itself. SceneError if no size is given and the cameras of the
+    Intrinsics for another size are scaled, each axis by itself. SceneError if no size is given and the cameras of the
     file have no size or several, or if a lens is not a pinhole.
 
     Example:
@@ -339,8 +344,8 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
 def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFile, PhotoArrays, list[str]]:
     """Undistort photos, and make their cameras pinholes with the same intrinsics; also return a note.
 
-    SceneError if a lens is not a pinhole and photos are missing or of another shape, or if a lens shows next to nothing
-    of a photo.
+    SceneError if a lens is not a pinhole and photos are missing or of another shape, or if an undistorted photo would
+    show next to nothing of the photo.
     """
     if not camera_file.lenses:
         return camera_file, photos, []
@@ -374,17 +379,17 @@ def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFil
 def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> PhotoArrays:
     """Undistort photos to those of pinholes with the same intrinsics; borders repeat the nearest pixels.
 
-    ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` at their size, the top-left pixel's centre at (0.5, 0.5).
+    ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` are for their size, with the top-left pixel's centre at (0.5, 0.5).
     """
 
-    def one(view: int, photo: np.ndarray) -> np.ndarray:
+    def undistort(view: int, photo: np.ndarray) -> np.ndarray:
         lens = lenses[view]
         if lens is None:
             return photo
         maps = _rectify_maps(Ks[view], lens, (photo.shape[1], photo.shape[0]))
         return cv2.remap(photo, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
-    return change_photos(photos, one)
+    return change_photos(photos, undistort)
 
 
 def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:
@@ -405,22 +410,22 @@ def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: 
     degrees, distances = pose_changes(start, end)
     shifts = distances / depth if depth > 0 else distances
     return [
-        {"view": name, "degrees": round(turn, 4), "shift": round(shift, 6)}
-        for name, turn, shift in zip(names, degrees.tolist(), shifts.tolist(), strict=True)
+        {"view": name, "degrees": round(angle, 4), "shift": round(shift, 6)}
+        for name, angle, shift in zip(names, degrees.tolist(), shifts.tolist(), strict=True)
     ]
 
 
 def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
     """Describe the mean and the largest of camera moves in words."""
-    turns, shifts = ([move[key] for move in moves] for key in ("degrees", "shift"))
-    mean, most = (f"{f(turns):.2g} degrees and {100 * f(shifts):.3g} % of the depth" for f in (np.mean, max))
+    angles, shifts = ([move[key] for move in moves] for key in ("degrees", "shift"))
+    mean, most = (f"{f(angles):.2g} degrees and {100 * f(shifts):.3g} % of the depth" for f in (np.mean, max))
     return f"{mean} on average, {most} at most"
 
 
 def make_similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
-    """Make the similarity of a matrix ``[3,4]`` and the scale after it; SceneError if it is none."""
+    """Make the map X' = scale (matrix [X; 1]) of a matrix ``[3,4]``; SceneError if it is no similarity."""
     R = matrix[:3, :3]
-    odd = not is_orthonormal(R) or determinant(R) < 0 or not 0 < scale < MAX_NUMBER
-    if odd or not np.all(np.abs(matrix) < MAX_NUMBER):
+    is_similarity = is_orthonormal(R) and determinant(R) >= 0 and 0 < scale < MAX_NUMBER
+    if not is_similarity or not np.all(np.abs(matrix) < MAX_NUMBER):
         raise SceneError(path, "expected 'transform' to rotate and shift and 'scale' to be positive, found another map")
     return Similarity(R, scale, scale * matrix[:3, 3], f"moved into the Gaussians' frame by {path.name}", "other")

@@ -17,7 +17,7 @@ from gsmerge.io.bounds import MAX_MODEL_BYTES, read_lines
 from gsmerge.io.cameras.camera_file import StoredView, check_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 
-# number of parameters of each model, in the order of their ids; the first are focal lengths and principal point
+# Number of parameters of each model, in the order of the models' ids; the first are focal lengths and principal point
 _NUM_PARAMS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
@@ -25,16 +25,17 @@ _NUM_PARAMS = {
 _NAMES = dict(enumerate(_NUM_PARAMS))
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
-_SAME_SHAPE, _SMALLER = 0.01, 0.9  # relative, of the sides of pictures of one shape, and of a smaller one
+_SAME_SHAPE = 0.01  # relative difference between the two sides' ratios up to which images have one shape
+_SMALLER = 0.9  # ratio of the sides below which an image is another, smaller one
 _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 
 MAX_NAME = 1 << 16  # bytes of an image's name
-_NAME_PART = 64  # of them at a time
+_NAME_PART = 64  # bytes of a name that are read at a time
 
-_MAX_WORDS = 4 + max(_NUM_PARAMS.values())  # of a camera's line
-_MAX_DIGITS = 18  # of a whole number
+_MAX_WORDS = 4 + max(_NUM_PARAMS.values())  # in a camera's line
+_MAX_DIGITS = 18  # in a whole number
 _WHOLE = re.compile(rf"[+-]?[0-9]{{1,{_MAX_DIGITS}}}([.]0*)?")
-_NOT_UNIT = 0.05  # difference of its length from 1 by which four numbers are no rotation
+_NOT_UNIT = 0.05  # four numbers are no quaternion if their length differs more from 1
 
 _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
@@ -45,7 +46,7 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
     try:
         if suffix == ".bin":
-            with camera_path.open("rb") as file:  # mapped, a file that becomes shorter would end the process
+            with camera_path.open("rb") as file:  # not mapped: a mapped file that is cut short would end the process
                 cameras = _binary_cameras(camera_path, file)
             with image_path.open("rb") as file:
                 images = _binary_images(image_path, file)
@@ -102,11 +103,16 @@ def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], param
 
 
 def _size_of(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the size that intrinsics are of: WorldMirror 1 writes those of what it saw with the size of the photos."""
-    own = 2 * K[:2, 2]
-    x, y = own / np.maximum(size, 1)
+    """Return the image size that intrinsics belong to: the stored size, or of WorldMirror 1 that of the model's input.
+
+    WorldMirror 1 writes intrinsics for the model's input beside the size of the photos. The size of the input is twice
+    the principal point; it is smaller than the photos, has their shape, and is whole.
+    """
+    sides = 2 * K[:2, 2]
+    x, y = sides / np.maximum(size, 1)
     same_shape = abs(x - y) <= _SAME_SHAPE * abs(x)
-    return (int(own[0]), int(own[1])) if same_shape and x < _SMALLER and (own == np.rint(own)).all() else size
+    is_input = same_shape and x < _SMALLER and (sides == np.rint(sides)).all()
+    return (int(sides[0]), int(sides[1])) if is_input else size
 
 
 def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
@@ -136,13 +142,13 @@ def _binary_images(path: Path, file: BinaryIO) -> list[_Image]:
     return images
 
 
-def _says_something(line: str) -> bool:
+def _has_content(line: str) -> bool:
     return line.strip()[:1] not in ("", "#")
 
 
 def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
     cameras: dict[int, StoredView] = {}
-    for line in filter(_says_something, lines):
+    for line in filter(_has_content, lines):
         check_count(path, len(cameras) + 1)
         camera_id, model, width, height, *params = line.split(maxsplit=_MAX_WORDS)
         if len(params) != _NUM_PARAMS.get(model, len(params)) or max(len(width), len(height)) > _MAX_DIGITS:
@@ -153,13 +159,13 @@ def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
 
 
 def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredView]) -> list[_Image]:
-    """Parse the lines of the images: pose and name, which may have spaces; a line of points may follow each.
+    """Parse the lines of the images: a pose, and a name that may have spaces. A line of points may follow each.
 
-    Programs that rewrite ``images.txt`` leave out the lines of points, or only empty ones.
+    Programs that rewrite ``images.txt`` drop the lines of points, or only those that are empty.
     """
     images: list[_Image] = []
     after_image = False
-    for line in filter(_says_something, lines):
+    for line in filter(_has_content, lines):
         if after_image and _lists_points(line, cameras):
             after_image = False
             continue

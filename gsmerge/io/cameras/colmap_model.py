@@ -1,7 +1,8 @@
 """Write COLMAP models (colmap.github.io, "Output Format"): cameras, views, and Gaussians as points with tracks.
 
-Trainers begin with the points, and COLMAP's dense steps choose by the tracks which views to compare. A track is what a
-view sees of a point: here the place where its centre falls, so that reprojection errors are zero.
+Trainers begin with the points, and COLMAP's dense steps choose by the tracks which views to compare. The track of a
+point lists the views that see it, and where in their images. Here that is the projection of the Gaussian's centre, so
+reprojection errors are zero.
 """
 
 from __future__ import annotations
@@ -17,16 +18,16 @@ from gsmerge.geometry import project, rotmat_to_quat, sh0_to_rgb
 from gsmerge.io.formats.table import CAMERAS, IMAGES, POINTS
 from gsmerge.types import Cameras, Gaussians
 
-_FOREIGN = ("rigs.bin", "frames.bin")  # which COLMAP writes since 3.12, and would read with ours
-_PINHOLE = 1  # the number of the camera model
+_FOREIGN = ("rigs.bin", "frames.bin")  # files of COLMAP since 3.12, which it would read together with this model
+_PINHOLE = 1  # COLMAP's id of the camera model
 _SEEN = np.dtype([("place", "<f8", 2), ("point", "<i8")])
 _POINT = np.dtype(
     [("id", "<u8"), ("mean", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("num_seen", "<u8")]
-)  # and then for each view that sees it its id, and the point's place in the view's list, as int32
+)  # two int32 follow for each view that sees the point: the view's id, and the point's index in the view's list
 
 
 def files_beside(points: Path) -> tuple[Path, Path]:
-    """Return the paths of the cameras and views of a model; SceneError if other files of COLMAP are beside them."""
+    """Return the paths of a model's cameras and views; SceneError if COLMAP's own files are in the folder."""
     foreign = next((points.with_name(name) for name in _FOREIGN if points.with_name(name).exists()), None)
     if foreign is not None:
         raise SceneError(foreign, "expected no model of another program in the folder", "choose another folder")
@@ -36,7 +37,7 @@ def files_beside(points: Path) -> tuple[Path, Path]:
 def model_files(
     gaussians: Gaussians, cameras: Cameras, names: Sequence[str], seen: Sequence[np.ndarray]
 ) -> dict[str, bytes]:
-    """Encode the files of a model by name; ``seen``: for each view, the rows of the Gaussians that it shows."""
+    """Encode the files of a model by name; ``seen`` lists for each view the rows of the Gaussians that it shows."""
     Ks, camera_ids = np.unique(cameras.Ks.astype(np.float64), axis=0, return_inverse=True)
     files = {CAMERAS: _cameras(Ks, cameras.width, cameras.height)}
     files[IMAGES] = _images(gaussians, cameras, names, seen, camera_ids.reshape(-1) + 1)

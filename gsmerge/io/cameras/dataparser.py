@@ -18,12 +18,13 @@ DATAPARSER = "dataparser_transforms.json"
 
 
 def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
-    """Read the similarities that a nerfstudio ``dataparser_transforms.json`` may mean, or Metashape's file of cameras.
+    """Read the similarities that nerfstudio or Metashape may have applied to the cameras: candidates to be measured.
 
-    The file says how cameras were moved into the Gaussians' world: X' = scale (transform [X; 1]). ``transform`` starts
-    from the world of the capture. Poses of a ``transforms.json`` with ``applied_transform`` (and ``applied_scale``)
-    have been moved by that already, so it is undone. Which reading is right has to be measured. SceneError if the file
-    lacks a rotation, shift and positive scale.
+    Nerfstudio's ``dataparser_transforms.json`` says how cameras were moved into the Gaussians' world: X' = scale
+    (transform [X; 1]). ``transform`` starts from the world of the capture. Poses of a ``transforms.json`` with
+    ``applied_transform`` (and ``applied_scale``) have been moved by that already, so the second candidate undoes it.
+    Metashape's ``.xml`` has the map into its world, which exports apply with or without its scale. Empty if there is no
+    such file. SceneError if a file lacks a rotation, shift and positive scale.
     """
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
@@ -34,16 +35,16 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
         return [] if world is None else [world, replace(world, scale=1.0, shift=world.shift / world.scale)]
     data = read_json(path)
     with number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
-        moved = _square(data["transform"])
+        transform = _square(data["transform"])
         scale = to_number(data["scale"])
-    frames = [make_similarity(path, moved, scale)]
+    candidates = [make_similarity(path, transform, scale)]
     camera_data = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
     if isinstance(camera_data, dict) and "applied_transform" in camera_data:
         with number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
             applied = _square(camera_data["applied_transform"])
             factor = to_number(camera_data.get("applied_scale") or 1)
-            frames.append(make_similarity(path, matmul(moved, invert(applied)), scale / factor))
-    return frames
+            candidates.append(make_similarity(path, matmul(transform, invert(applied)), scale / factor))
+    return candidates
 
 
 def _square(values: Any) -> np.ndarray:

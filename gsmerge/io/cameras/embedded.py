@@ -10,16 +10,15 @@ from gsmerge.io.cameras.camera_file import StoredView, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.formats.table import PLY, find_format
 
-SHARP = "SHARP"  # source of such cameras
-_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # the last not in its first versions
-SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
+SHARP = "SHARP"  # ``source`` of these cameras
+_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first versions lack the last
+SHARP_LAYERS = 2  # Gaussians in each cell of the grid: a front and a back layer
 
 
 def read_sharp(source: CameraSource) -> StoredCameras | None:
-    """Read the camera that SHARP writes into its ``.ply``, at the size of the file's grid; None without one.
+    """Read the camera that SHARP writes into its ``.ply``, at the size of the grid of Gaussians; None without one.
 
-    The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are
-    damaged.
+    The grid is square, because SHARP stretches photos of any shape to a square. SceneError if the numbers are damaged.
     """
     if find_format(source.path).read is not PLY.read:
         return None
@@ -30,7 +29,7 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
     for element in (data[name] for name in present):
         if element.count > 16 or len(element.properties) != 1 or isinstance(element.properties[0], PlyListProperty):
             return None
-    with np.errstate(all="ignore"):  # of signalling NaN, which are refused with the cameras
+    with np.errstate(all="ignore"):  # NaN are refused with the cameras
         numbers = {name: np.asarray([row[0] for row in data[name].data], np.float64) for name in present}
     extrinsic, intrinsic = numbers["extrinsic"], numbers["intrinsic"]
     if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions: focal lengths and size

@@ -1,4 +1,4 @@
-"""What programs leave beside photos: where cameras that are read lie, and of others the export that is read."""
+"""Places of camera files that are read, and programs whose cameras are not read, with the export to use instead."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from gsmerge.io.image_names import IMAGE_SUFFIXES
 
 
 class Foreign(NamedTuple):
-    """Patterns of a program's files, the export of it that is read if they are not, and what they start with."""
+    """Files of a program whose cameras are not read."""
 
-    files: str
-    program: str = ""
-    remedy: str = ""
-    start: str = ""  # regular expression
+    files: str  # patterns of their names, separated by spaces
+    program: str
+    remedy: str  # the export of the program that is read
+    start: str = ""  # regular expression that is found in the first bytes of its files
 
 
-POSE_FOLDERS = ("pose", "poses")  # with a file for each view
-# Beside poses, the first that exists; a folder has a file for each view
+POSE_FOLDERS = ("pose", "poses")  # each has a file for each view
+# Places of intrinsics beside poses, of which the first that exists is read; a folder has a file for each view
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt", "pred_intrinsics.txt", "intrinsic/intrinsic_color.txt", "intrinsics")
-_DEPTH, _MAX_PATHS = 3, 10_000  # of folders that are searched for it, and paths in them
-_OWN = "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
-_MODEL = f"name the COLMAP model that it was made from, or {_OWN}"
+_DEPTH, _MAX_PATHS = 3, 10_000  # levels of folders that are searched for files of PROGRAMS, and most paths in them
+_WRITE = "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
+_MODEL = f"name the COLMAP model that it was made from, or {_WRITE}"
 _NERFSTUDIO = "`ns-process-data {}` of nerfstudio makes a transforms.json of it"
 _KAPTURE = "kapture_import_{}.py and kapture_export_colmap.py of kapture make a COLMAP model of it"
 _OPF = "export OPF from PIX4Dmatic, of which `opf2colmap` of pyopf makes a COLMAP model"
@@ -35,16 +35,15 @@ _REALITY = "RealityScan or RealityCapture", "export its registration as COLMAP, 
 _OPENMVS = "{}InterfaceCOLMAP of OpenMVS make a COLMAP model of it"
 _ODM = "ODM", "name its opensfm/reconstruction.json"
 _OPENMVG = "OpenMVG", "openMVG_main_openMVG2Colmap makes a COLMAP model of it"
+# The first that exists is read. A COLMAP model directly in the folder comes last, because Depth Anything 3 puts one
+# there at the photos' own size
 CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
     "cameras.json", "camera_params.json", "sparse/0", "sparse", "colmap/sparse/0", "colmap", "exports/npz/results.npz",
     "exports/mini_npz/results.npz", "results.npz", "cameras.npz", "camera_poses.txt", "keyframes/corrected_cameras",
     "keyframes/cameras", "reconstruction.json", "opensfm/reconstruction.json", "cameras.xml", *POSE_FOLDERS, "0", ".",
 )  # fmt: skip
-# Of those that are read the first that exists wins; a COLMAP model directly in the folder comes last, because Depth
-# Anything 3 puts one there at the photos' own size. The others matter where none of them is there.
 PROGRAMS = (
-    *map(Foreign, CAMERA_PLACES),
     Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
     Foreign("*.psx *.psz", "Metashape", "File > Export > Export Cameras writes the .xml that is read"),
     Foreign("*.xml", "ContextCapture or DJI Terra", _OPENMVS.format("InterfaceMetashape and "), "<BlocksExchange"),
@@ -65,58 +64,65 @@ PROGRAMS = (
     Foreign("metadata.json *.r3d", "Record3D", _NERFSTUDIO.format("record3d"), '^PK|"(poses|perFrameIntrinsicCoeffs)"'),
     Foreign("*.vrs *_loop_trajectory.csv", "Project Aria", _NERFSTUDIO.format("aria")),
     Foreign("*.sens", "ScanNet", "its SensReader exports poses and intrinsics, which are read"),
-    Foreign("*.traj", "ARKitScenes", _OWN), Foreign("*.jgz", "CO3D", _OWN),
-    Foreign("*.json", "Open3D", _OWN, '"PinholeCamera'),
-    Foreign("*.json", "3D Scanner App", _OWN, '"cameraPoseARFrame"'),
-    Foreign("camera/*.json", "Nerfies", _OWN, '"(orientation|principal_point)"'),
-    Foreign("*_par.txt *.conf", "Middlebury or Matterport", _OWN, r"^\s*\d+\s|^dataset"),
-    Foreign("*.out *.mve/meta.ini", "MVE", _OWN, "drews|MVE view"),
-    Foreign("*.csv", "EuRoC's body", _OWN, "#(timestamp|time)"),
-    Foreign("camera/*.npz poses.npz", "CUT3R or Spann3R", _OWN, "pose"),
-    Foreign("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _OWN),
+    Foreign("*.traj", "ARKitScenes", _WRITE), Foreign("*.jgz", "CO3D", _WRITE),
+    Foreign("*.json", "Open3D", _WRITE, '"PinholeCamera'),
+    Foreign("*.json", "3D Scanner App", _WRITE, '"cameraPoseARFrame"'),
+    Foreign("camera/*.json", "Nerfies", _WRITE, '"(orientation|principal_point)"'),
+    Foreign("*_par.txt *.conf", "Middlebury or Matterport", _WRITE, r"^\s*\d+\s|^dataset"),
+    Foreign("*.out *.mve/meta.ini", "MVE", _WRITE, "drews|MVE view"),
+    Foreign("*.csv", "EuRoC's body", _WRITE, "#(timestamp|time)"),
+    Foreign("camera/*.npz poses.npz", "CUT3R or Spann3R", _WRITE, "pose"),
+    Foreign("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _WRITE),
     Foreign("*.json", "a path of nerfstudio's viewer, or ns-export", "name the transforms.json of the capture",
            r'"camera_path"\s*:|^\[\s*\{[^{}]*"transform"\s*:'),
     Foreign("*.psht", "Postshot", "name the cameras that were loaded into it"),
     Foreign("*.abc *.fbx *.chan *.blend *.ma", "3D programs", "BlenderNeRF, in Blender, writes transforms_train.json"),
 )  # fmt: skip
 
-# Words of places, turns and matrices, by which a text file that nothing reads shows that it has poses
-_PLACE = r'\b(position|location|translation|transform|[xyz]|([tp]|loc|pos)[_.]?x)\b|"t":'
-_TURN = r'\b(rotation|quaternion|orientation|transform|heading|omega|yaw|(q|r|rot|quat|rotation)[_.]?[wx])\b|"r":'
+# Words for positions, rotations and matrices, by which a text file of an unknown format shows that it has poses
+_POSITION = r'\b(position|location|translation|transform|[xyz]|([tp]|loc|pos)[_.]?x)\b|"t":'
+_ROTATION = r'\b(rotation|quaternion|orientation|transform|heading|omega|yaw|(q|r|rot|quat|rotation)[_.]?[wx])\b|"r":'
 _MATRIX = r"\b(extrinsics?|c2w|w2c|cam(era)?_?(to|2)_?world|world_?(to|2)_?cam(era)?|view_?matrix|poses?)\b\W*[\d{[]"
 
 
 def starts_like_poses(path: Path) -> bool:
-    """Return whether a text file starts as one of camera poses: a table by its head, others by several views."""
+    """Return whether a text file seems to have camera poses, by words of its first bytes.
+
+    The first line of a table must have words for position and rotation. JSON and XML must have them several times, or a
+    word for a pose before a number.
+    """
     suffix, text = path.suffix.lower(), read_start(path).decode("latin-1").lower().lstrip()
     if suffix in (".csv", ".txt"):
-        return all(re.search(words, text.partition("\n")[0]) for words in (_PLACE, _TURN))
-    several = all(len(re.findall(words, text)) > 1 for words in (_PLACE, _TURN))
+        return all(re.search(words, text.partition("\n")[0]) for words in (_POSITION, _ROTATION))
+    several = all(len(re.findall(words, text)) > 1 for words in (_POSITION, _ROTATION))
     return suffix in (".json", ".xml") and (several or re.search(_MATRIX, text) is not None)
 
 
 def check_unknown(path: Path) -> None:
-    """Raise SceneError if a file that nothing reads starts as one of camera poses."""
+    """Raise SceneError if a file of an unknown format seems to have camera poses."""
     if starts_like_poses(path):
-        raise SceneError(path, "expected cameras that are read, found those of a program that is not known", _OWN)
+        raise SceneError(
+            path, "expected cameras of a supported format, found those of a program that is not known", _WRITE
+        )
 
 
 def check_program(place: Path) -> None:
-    """Raise SceneError with the program and its export that is read, if a file, or one below a folder, is not read."""
+    """Raise SceneError if a file, or one below a folder, is of :data:`PROGRAMS`, with the export to use instead."""
     if (path := find_unread(place)) is not None:
         foreign = next(foreign for foreign in PROGRAMS if _is_of(path, foreign))
-        raise SceneError(path, f"expected cameras that are read, found those of {foreign.program}", foreign.remedy)
+        problem = f"expected cameras of a supported format, found those of {foreign.program}"
+        raise SceneError(path, problem, foreign.remedy)
 
 
 def find_unread(place: Path) -> Path | None:
-    """Find a file of cameras that are not read: a path itself, or one below a folder, but of no scene there."""
+    """Find a file of :data:`PROGRAMS`: the path itself, or a file below a folder that belongs to no scene below it."""
     paths = (path for depth in range(_DEPTH) for path in place.glob("*/" * depth + "[!.]*"))
     files = sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]
     scenes = {p.parent for p in files if p.suffix == ".ply" and p.parent != place and header_content(p) == "Gaussians"}
-    others = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES and scenes.isdisjoint(path.parents)]
-    return next((path for foreign in PROGRAMS for path in others if _is_of(path, foreign)), None)
+    files = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES and scenes.isdisjoint(path.parents)]
+    return next((path for foreign in PROGRAMS for path in files if _is_of(path, foreign)), None)
 
 
 def _is_of(path: Path, foreign: Foreign) -> bool:
-    named = foreign.remedy and any(map(path.match, foreign.files.split())) and path.is_file()
-    return bool(named) and re.search(foreign.start, read_start(path).decode("latin-1")) is not None
+    has_name = any(map(path.match, foreign.files.split())) and path.is_file()
+    return has_name and re.search(foreign.start, read_start(path).decode("latin-1")) is not None

@@ -1,6 +1,6 @@
 """Cameras in ``.npz``: ``results.npz`` of Depth Anything 3, and ``views.npz`` of any model.
 
-``views.npz`` is what a user writes out of a running model that saves no cameras (``examples/04_dump_views.py``):
+A user writes ``views.npz`` out of a running model that saves no cameras (``examples/04_dump_views.py``). It has
 ``c2w [v,4,4]`` (or 3x4; OpenCV axes), ``K [v,3,3]`` (pixels of the processed images, or divided by their size),
 ``images [v,h,w,3]`` as the network saw them (uint8, or float in [0, 1]; also ``[v,3,h,w]``), and ``order``, the
 order of the rows of the ``.ply``, where it is known.
@@ -28,33 +28,36 @@ from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.colmap import read_colmap
 from gsmerge.io.photo_files import PhotoArrays
 
-_LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of names in ``cameras.npz`` of Lyra 2, by its scripts
+_LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of the arrays' names in ``cameras.npz`` of Lyra 2's scripts
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
-_MAX_INTRINSIC, _SMALL, _SAME = 1e12, 1e-9, 1e-5
+_MAX_INTRINSIC = 1e12
+_SMALL = 1e-9  # least principal point that is divided by
+_SAME = 1e-5  # relative difference up to which intrinsics of two files are equal
 _MAX_HEADER = 1 << 16  # bytes of an array's header
-_POINTS, _SAMPLE_POINTS = "world_points", 1000  # of each view, by which poses are read
-_KINDS = "biufU"
+_POINTS = "world_points"  # array of the points of all pixels
+_SAMPLE_POINTS = 1000  # points of each view that are compared with the depth maps
+_KINDS = "biufU"  # NumPy's kinds of arrays that are read: numbers and text
 
 
 def is_da3(path: Path) -> bool:
-    """Return whether an npz has poses under the names that Depth Anything 3 uses."""
+    """Return whether an npz has poses under a name that Depth Anything 3 uses."""
     return not array_names(path).isdisjoint(_EXTRINSICS[:2])
 
 
 def read_da3(source: CameraSource) -> StoredCameras:
     """Read the cameras (and images, if stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
-    Intrinsics that are normalised, or of another image size than the depth maps (as after a COLMAP export in the same
-    call), are scaled to the depth maps. Other readable files: ``cameras.npz`` of Lyra 2; the output of VGGT
-    (``extrinsic``, world to camera), of MapAnything (camera to world, as its points show) and of AnySplat (the same,
-    normalised, in a batch of one).
-    SceneError if the file cannot be read or lacks an array.
+    Intrinsics that are divided by the size, or for another image size than the depth maps (as after a COLMAP export in
+    the same call), are scaled to the depth maps. These files are read as well: ``cameras.npz`` of Lyra 2; the output of
+    VGGT (``extrinsic``, world to camera); that of MapAnything (camera to world, as its points show); and that of
+    AnySplat (camera to world, intrinsics divided by the size, in a batch of one). SceneError if the file cannot be read
+    or lacks an array.
     """
     path = source.path
-    sizes = () if holds_images(path) else _DEPTHS  # of depths only the shape counts, the confidence is never read
-    arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *sizes})
+    size_names = () if holds_images(path) else _DEPTHS  # depths are read for their shape alone
+    arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *size_names})
     poses, Ks, images, depths = (_first(arrays, names) for names in (_EXTRINSICS, _INTRINSICS, _IMAGES, _DEPTHS))
     if poses is None:
         raise _missing(path, [n for n, a in (("extrinsics", poses), ("intrinsics", Ks)) if a is None], arrays)
@@ -79,17 +82,18 @@ def read_da3(source: CameraSource) -> StoredCameras:
 
 
 def _are_camera_to_world(path: Path, poses: np.ndarray) -> bool:
-    """Return whether the stored points of the pixels lie at the depths of the maps if poses are camera-to-world."""
+    """Return whether stored points fit the depth maps better with camera-to-world than with world-to-camera poses."""
     points, depths = read_arrays(path, (_POINTS,))[_POINTS], read_depths(path)
-    fits = depths is not None and len(depths) == len(poses) and points.shape == (*depths.shape, 3)
-    if depths is None or not fits or points.dtype.kind not in "fiu":
+    same_grid = depths is not None and len(depths) == len(poses) and points.shape == (*depths.shape, 3)
+    if depths is None or not same_grid or points.dtype.kind not in "fiu":
         return False
-    few = slice(None), slice(None, None, max(1, depths[0].size // _SAMPLE_POINTS))
-    z, xyz = (array.reshape(len(poses), depths[0].size, -1)[few].astype(np.float64) for array in (depths, points))
+    sample = slice(None), slice(None, None, max(1, depths[0].size // _SAMPLE_POINTS))
+    z, xyz = (array.reshape(len(poses), depths[0].size, -1)[sample].astype(np.float64) for array in (depths, points))
     rotations, shifts = poses[:, None, :3, :3].astype(np.float64), poses[:, None, :3, 3].astype(np.float64)
     with np.errstate(all="ignore"):
-        each = (xyz * rotations[..., 2, :]).sum(-1) + shifts[..., 2], ((xyz - shifts) * rotations[..., 2]).sum(-1)
-        errors = np.abs(np.array(each) - z[..., 0])
+        z_w2c = (xyz * rotations[..., 2, :]).sum(-1) + shifts[..., 2]
+        z_c2w = ((xyz - shifts) * rotations[..., 2]).sum(-1)
+        errors = np.abs(np.array((z_w2c, z_c2w)) - z[..., 0])
     as_w2c, as_c2w = errors[:, np.isfinite(errors).all(0)]
     return len(as_w2c) > 0 and bool(np.median(as_c2w) < np.median(as_w2c))
 
@@ -122,7 +126,7 @@ def holds_poses(path: Path) -> bool:
 
 
 def missing_of_depths(path: Path) -> list[str]:
-    """List the arrays that the depth maps of an npz lack; empty without depth maps."""
+    """List the arrays that an npz with depth maps lacks; empty if it has no depth maps."""
     names = array_names(path)
     groups = (("c2w",), ("K",), _IMAGES[1:]) if names & {"c2w", "K"} else (_EXTRINSICS, _INTRINSICS)
     return [] if names.isdisjoint(_DEPTHS) else [group[0] for group in groups if names.isdisjoint(group)]
@@ -139,7 +143,7 @@ def read_depths(path: Path) -> np.ndarray | None:
 
 
 class DepthFrame(NamedTuple):
-    """One view with its depth map, as DA3-Streaming writes each into a file of its own."""
+    """One view with its depth map, which DA3-Streaming writes into a file of its own."""
 
     depth: np.ndarray  # ``[h,w]``, along z
     image: np.ndarray  # ``[h,w,3]`` uint8
@@ -152,7 +156,7 @@ class DepthFrame(NamedTuple):
 
 
 def read_depth_frame(path: Path) -> DepthFrame:
-    """Read a frame of DA3-Streaming; SceneError if an array is missing or of another shape than the others."""
+    """Read a frame of DA3-Streaming; SceneError if an array is missing or the shapes differ."""
     names = ("depth", "image", "intrinsics")
     arrays = read_arrays(path, names)
     missing = [name for name in names if name not in arrays]
@@ -182,7 +186,7 @@ def _views(poses: np.ndarray, Ks: np.ndarray | None, size: tuple[int, int]) -> l
 
 
 def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tuple[str, str]) -> None:
-    """Refuse arrays other than c poses and ``[c,3,3]`` intrinsics of finite numbers; ``names`` are for messages."""
+    """Raise SceneError unless arrays are c poses and intrinsics ``[c,3,3]`` of finite numbers, called ``names``."""
     Ks = np.zeros((*poses.shape[:1], 3, 3)) if Ks is None else Ks
     for name, array in zip(names, (poses, Ks), strict=True):
         if array.dtype.kind not in "fiu":
@@ -192,11 +196,11 @@ def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tu
         raise SceneError(path, f"expected {names[0]} and {names[1]}, found {poses.shape} and {Ks.shape}")
     check_count(path, len(poses))
     if not (np.isfinite(poses).all() and np.all(np.abs(Ks.astype(np.float64)) < _MAX_INTRINSIC)):
-        raise SceneError(path, f"expected finite numbers in {names[0]} and {names[1]}, found others")
+        raise SceneError(path, f"expected finite numbers in {names[0]} and {names[1]}, found NaN or inf")
 
 
 def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
-    """Convert images of any usual form to ``[c,h,w,3]`` uint8; infinite values become black or white."""
+    """Convert images ``[c,h,w,3]`` or ``[c,3,h,w]``, uint8 or [0, 1], to ``[c,h,w,3]`` uint8; NaN become black."""
     if images.ndim == 4 and images.shape[1] == 3 and images.shape[3] != 3:
         images = images.transpose(0, 2, 3, 1)
     if images.ndim != 4 or images.shape[0] != count or images.shape[3] != 3:
@@ -214,7 +218,7 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 
 
 def _without_colmap_scale(path: Path, Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Scale intrinsics to the depth maps that a COLMAP export of the same call has scaled to the photos' sizes."""
+    """Scale intrinsics back to the depth maps if a COLMAP export of the same call has scaled them to the photos."""
     folder = path.parent.parent.parent
     for suffix in (".bin", ".txt"):
         with suppress(SceneError):
@@ -226,11 +230,11 @@ def _without_colmap_scale(path: Path, Ks: np.ndarray, width: int, height: int) -
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Scale intrinsics to an image size with the principal point in the middle, as these networks assume."""
+    """Scale intrinsics to an image size. These networks assume that the principal point is in the middle."""
     size = np.array([width, height])
     ratio = 2 * np.maximum(Ks[:, :2, 2], _SMALL) / size
     normalised = (Ks[:, 0, 0] < 10) & (Ks[:, 0, 2] < 2) & (width > 10)
-    # the same ratio on both axes, clearly: another size; otherwise a principal point that is not in the middle
+    # intrinsics are for another size if both axes clearly have the same ratio; otherwise the principal point is off
     other_size = (np.abs(ratio[:, 0] / ratio[:, 1] - 1) < 0.03) & (np.abs(ratio[:, 0] - 1) > 0.1)
     scaled = Ks.copy()
     scaled[normalised, :2] *= size[:, None]
@@ -240,7 +244,7 @@ def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def array_names(path: Path) -> frozenset[str]:
-    """List the names of the arrays in an ``.npz``; none if it cannot be read."""
+    """List the names of the arrays in an ``.npz``; empty if it cannot be read."""
     try:
         if not path.is_file() or not zipfile.is_zipfile(path):
             return frozenset()
@@ -260,7 +264,7 @@ def array_shape(path: Path, name: str) -> tuple[int, ...]:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read arrays from an ``.npz`` by name, without names that it lacks.
+    """Read arrays from an ``.npz`` by name; names that it lacks are left out.
 
     SceneError if the file cannot be read, if an array holds anything but numbers and text, or if the arrays take more
     memory than the file allows.
@@ -270,14 +274,14 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
         raise SceneError(path, "expected a readable .npz file, found something else")
     try:
         with open_archive(path) as archive, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of headers in old styles
+            warnings.simplefilter("ignore")  # about headers in old styles
             members = {name: info for name, info in _members(archive).items() if name in names}
             budget.check_memory(sum(info.file_size for info in members.values()), "arrays")
             return {name: _read_array(path, archive, info) for name, info in members.items()}
     except (SceneError, MemoryError):
         raise
     except Exception as error:  # whatever a damaged archive makes the libraries raise
-        cause = re.sub(r" at 0x[0-9a-f]+", "", str(error))  # of an object, which is another in every process
+        cause = re.sub(r" at 0x[0-9a-f]+", "", str(error))  # addresses of objects differ in every process
         raise SceneError(path, f"expected a readable .npz file, found a damaged one ({cause})") from error
 
 
@@ -306,7 +310,7 @@ def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def read_matrices(path: Path) -> np.ndarray | None:
-    """Read finite matrices ``[c,4,4]`` from a ``.npy``; None if it holds none."""
+    """Read matrices ``[c,4,4]`` from a ``.npy``; None if it holds something else, or numbers that are not finite."""
     with suppress(Exception):  # whatever a damaged file makes the library raise
         size, (shape, dtype) = check_file(path), _read_header(path.open("rb"))
         if dtype.kind == "f" and shape[1:] == (4, 4) and 0 < math.prod(shape) * dtype.itemsize <= size:

@@ -1,7 +1,7 @@
-"""Text files of poses, as KITTI, TUM, RealEstate10K, ScanNet and DA3-Streaming have them, and of intrinsics.
+"""Text files of poses, as KITTI, TUM, RealEstate10K, ScanNet and DA3-Streaming write them, and of intrinsics.
 
-DA3-Streaming has ``results_output/frame_N.npz`` beside it as well: depth map, image and intrinsics of the view of line
-N, from 0 on.
+Beside the poses, DA3-Streaming writes ``results_output/frame_N.npz`` with depth map, image and intrinsics of the view
+whose pose is in line N, counted from 0.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ from gsmerge.io.formats.table import FRAMES, POSES
 from gsmerge.io.image_names import natural_key
 
 _FRAME = re.compile(r"frame_(\d{1,9})\.npz")
-_POSE_COLUMNS = (12, 16)  # numbers of a pose in a line
-# of a matrix's row; of a time, shift and quaternion xyzw (TUM); of a time, intrinsics, two zeros and a pose
-_ROW, _TUM, _RE10K = 4, 8, 19
+_POSE_COLUMNS = (12, 16)  # numbers in a line that is a pose
+_ROW = 4  # numbers in a line that is a row of a matrix
+_TUM = 8  # a time, the camera's centre and a quaternion xyzw
+_RE10K = 19  # a time, fx, fy, cx, cy, two zeros and a pose
 _MOST_COLUMNS = _RE10K
-_OTHER_LINE = re.compile(r"\s*(#|https?:)")  # comments, and the address of RealEstate10K's video
+_NO_NUMBERS = re.compile(r"\s*(#|https?:)")  # a comment, or the address of RealEstate10K's video
 
 
 def lists_poses(path: Path) -> bool:
-    """Return whether the first numbers of a text file, or of the files of a folder, are a pose or a matrix's row."""
+    """Return whether a text file, or the files of a folder, begin with a pose or with a row of a matrix."""
     if path.is_dir() and path.name not in POSE_FOLDERS:
         return False
     with suppress(OSError, ValueError, SceneError):
@@ -43,58 +44,61 @@ def lists_poses(path: Path) -> bool:
 
 
 def read_poses(source: CameraSource) -> StoredCameras:
-    """Read the cameras of a text file, or of a folder's, with one pose per line or a matrix in four.
+    """Read the cameras of a text file, or of the text files in a folder: a pose per line, or a matrix in four lines.
 
-    A pose of 12 or 16 numbers, row by row, is camera-to-world with OpenCV axes, as is TUM's; RealEstate10K's is
-    world-to-camera and has intrinsics before it. Those of others are beside it, see :data:`INTRINSICS`: fx, fy, cx, cy
-    in pixels or a matrix, for all views or for each; or nothing. The size is that of DA3-Streaming's frames, or of the
-    images. Views of a folder whose matrix is not finite have no camera. SceneError if a line has another number of
-    numbers.
+    Poses have 12 or 16 numbers, row by row, or are those of TUM; they are camera-to-world with OpenCV axes. Only those
+    of RealEstate10K are world-to-camera, and have intrinsics before them. Intrinsics of other poses may be in a file
+    beside them, see :data:`INTRINSICS`: fx, fy, cx, cy in pixels or a matrix, for all views or for each. The size is
+    that of DA3-Streaming's frames, otherwise unknown. Views of a folder whose matrix is not finite are left out.
+    SceneError if a line has another count of numbers.
     """
     path = source.path
     columns = len(_words(next(filter(str.strip, _lines(path)), "")))
     rows = _parse(path, _lines(path), (columns,) if columns in (_ROW, _TUM, _RE10K) else _POSE_COLUMNS)
     poses, names = _join_rows(path, rows), [f"{i:06d}" for i in range(len(rows))]
-    beside = [path.parent / name for name in INTRINSICS]
-    place = next((file for file in beside if file.exists()), None)
-    Ks = [] if place is None or columns == _RE10K else _read_intrinsics(place)
+    intrinsics = next((path.parent / name for name in INTRINSICS if (path.parent / name).exists()), None)
+    Ks = [] if intrinsics is None or columns == _RE10K else _read_intrinsics(intrinsics)
     if columns == _TUM:
         with np.errstate(all="ignore"):  # what is not finite is refused with the cameras
-            names, turns = [f"{row[0]:.6f}" for row in rows], quat_to_rotmat(np.array(rows)[:, [7, 4, 5, 6]])
-        poses = [np.column_stack([turn, row[1:4]]) for turn, row in zip(turns, rows, strict=True)]
+            names, rotations = [f"{row[0]:.6f}" for row in rows], quat_to_rotmat(np.array(rows)[:, [7, 4, 5, 6]])
+        poses = [np.column_stack([rotation, row[1:4]]) for rotation, row in zip(rotations, rows, strict=True)]
     elif columns == _RE10K:
         names, Ks = [f"{row[0]:.0f}" for row in rows], [make_pinhole(*row[1:5]) for row in rows]
         poses = [row[7:] for row in rows]
     elif path.is_dir():
         names = [file.stem for file in _files(path)]
-    if place is not None and len(Ks) not in (1, len(poses)):
-        raise SceneError(place, f"expected one line, or one for each of {len(poses)} views, found {len(Ks)}")
+    if intrinsics is not None and len(Ks) not in (1, len(poses)):
+        raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(Ks)}")
     shape = array_shape(path.parent / FRAMES / "frame_0.npz", "depth")  # empty without frames
     size = (shape[1], shape[0]) if len(shape) == 2 and Ks else (0, 0)
-    each = repeat(Ks[0] if Ks else None) if len(Ks) < 2 else Ks
-    views = [StoredView(name, pose.reshape(-1, 4), K, size) for name, pose, K in zip(names, poses, each, strict=False)]
+    Ks_by_view = repeat(Ks[0] if Ks else None) if len(Ks) < 2 else Ks
+    triples = zip(names, poses, Ks_by_view, strict=False)
+    views = [StoredView(name, pose.reshape(-1, 4), K, size) for name, pose, K in triples]
     views = [view for view in views if not path.is_dir() or np.isfinite(view.pose).all()]
     return StoredCameras(views, convention=W2C_OPENCV if columns == _RE10K else None)
 
 
 def _read_intrinsics(path: Path) -> list[np.ndarray]:
-    """Read lines of fx, fy, cx, cy or of matrices, or a matrix in several lines, or SRN's and NSVF's f, cx, cy, 0."""
+    """Read intrinsics ``[3,3]``: lines of fx, fy, cx, cy or of matrices, or a matrix in several lines.
+
+    SRN and NSVF write f, cx, cy, 0 in the first line, and other numbers in further lines.
+    """
     rows = _join_rows(path, _parse(path, _lines(path), (1, 2, 3, 4, 9, 16)))
     if len(rows) > 1 and len(rows[0]) == 4 != len(rows[-1]):
         rows = [rows[0][[0, 0, 1, 2]]]
     if any(len(row) not in (4, 9, 16) for row in rows):
-        raise SceneError(path, "expected fx, fy, cx, cy or a matrix of 9 or 16 numbers, found other lines")
+        raise SceneError(path, "expected lines of fx, fy, cx, cy or a matrix of 9 or 16 numbers, found another count")
     sides = {9: 3, 16: 4}
     return [make_pinhole(*row) if len(row) == 4 else row.reshape(sides[len(row)], -1)[:3, :3] for row in rows]
 
 
 def _join_rows(path: Path, rows: list[np.ndarray]) -> list[np.ndarray]:
-    """Join the rows of matrices, a line each, of which the last is 0 0 1 or 0 0 0 1; unchanged where they are none."""
+    """Join the rows of matrices whose last row is 0 0 1 or 0 0 0 1; return other rows unchanged."""
     side = len(rows[-1]) if rows else 0
     if side not in (3, 4) or rows[-1].tolist() != [0] * (side - 1) + [1]:
         return rows
     if len(rows) % side or {len(row) for row in rows} != {side}:
-        raise SceneError(path, f"expected {side} lines of {side} numbers for each matrix, found others")
+        raise SceneError(path, f"expected {side} lines of {side} numbers for each matrix, found another count")
     return [np.concatenate(rows[i : i + side]) for i in range(0, len(rows), side)]
 
 
@@ -105,21 +109,22 @@ def _files(path: Path) -> list[Path]:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a text file, or of all in a folder; empty ones for comments and the indices of a ``.log``.
+    """Yield the lines of a text file, or of all text files in a folder.
 
-    SceneError if the files of a folder together have more bytes than one may have.
+    Comments, and the lines of indices in a ``.log``, become empty. SceneError if the files of a folder together have
+    more bytes than a single file may have.
     """
     files = _files(path) if path.is_dir() else [path]
     if sum(map(check_file, files)) > MAX_TEXT_BYTES:
         raise SceneError(path, f"expected text files of at most {MAX_TEXT_BYTES >> 20} MiB together, found more")
     for file in files:
         for line in read_lines(file):
-            is_other = _OTHER_LINE.match(line) or (file.suffix == ".log" and len(line.split()) == 3)
-            yield "" if is_other else line
+            has_no_pose = _NO_NUMBERS.match(line) or (file.suffix == ".log" and len(line.split()) == 3)
+            yield "" if has_no_pose else line
 
 
 def list_frames(folder: Path) -> list[Path]:
-    """List the frames of DA3-Streaming in its folder or in ``results_output`` by number; empty without poses.
+    """List the frames of DA3-Streaming by number, in its folder or in ``results_output``; empty if there are no poses.
 
     SceneError if a number is missing.
     """
@@ -137,7 +142,7 @@ def list_frames(folder: Path) -> list[Path]:
 
 
 def pose_of_frame(frame: Path) -> np.ndarray:
-    """Read the pose ``[3,4]`` or ``[4,4]``, camera to world, of a frame of DA3-Streaming; SceneError without one."""
+    """Read the camera-to-world pose ``[3,4]`` or ``[4,4]`` of a frame of DA3-Streaming; SceneError if it has none."""
     match, path = _FRAME.fullmatch(frame.name), frame.parent.parent / POSES
     number = int(match[1]) if match else 0
     lines = (line for line in read_lines(path) if line.strip())
@@ -165,5 +170,5 @@ def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...], first: in
 
 
 def _words(line: str) -> list[str]:
-    """Split a line into words; the last word holds the rest of the line after the numbers of a pose."""
+    """Split a line into words; the last word holds all that follows the largest count of numbers in a line."""
     return line.replace(",", " ").split(maxsplit=_MOST_COLUMNS)

@@ -1,4 +1,4 @@
-"""List the views of programs that store them in several lists or files: OpenSfM, Polycam, WorldMirror."""
+"""List the views of programs that keep them in several lists or files: OpenSfM, Polycam, WorldMirror."""
 
 from __future__ import annotations
 
@@ -58,6 +58,7 @@ def join_matrices(source: CameraSource) -> list[Entry]:
 
 
 def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
+    """Return the matrices of a list by their ``camera_id``; the last of equal ids counts."""
     entries: Sequence[Mapping[str, Any]] = source.object[key]
     if not isinstance(entries, list):
         raise SceneError(source.path, f"expected {key!r} to be a list, found something else")
@@ -67,7 +68,7 @@ def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
 
 
 def set_centred_size(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
-    """Set the size of which all principal points are the middle; leave it unknown if there is none."""
+    """Set the size of which all principal points are the middle; return the views unchanged if there is none."""
     sides = 2 * np.array([view.K for view in views])[:, :2, 2].reshape(-1, 2) if views else np.zeros((0, 2))
     whole = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
     centred = len(sides) > 0 and bool((np.abs(sides - whole) <= CENTRED_PX).all())

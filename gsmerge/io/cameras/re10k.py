@@ -1,6 +1,6 @@
 """``.torch`` chunks of RealEstate10K as pixelSplat and its relatives read them: scenes with their photos.
 
-torch reads them, by its loader that makes containers, numbers and tensors alone, and executes nothing.
+torch's loader for weights reads them. It makes only containers, numbers and tensors, and executes no code.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _COLUMNS = 18  # fx fy cx cy 0 0, then world to camera, 3x4
 
 
 def read_re10k(source: CameraSource) -> StoredCameras:
-    """Read the cameras and photos of one scene from a chunk; a chunk with one scene needs no key.
+    """Read the cameras and photos of the scene with the key ``source.scene``; a chunk with one scene needs no key.
 
     A chunk is a list of ``{key, cameras, images}``: ``cameras [v,18]`` are fx, fy, cx, cy divided by the image's
     size, two zeros and a world-to-camera 3x4 (OpenCV axes); ``images`` are v JPEG files as tensors of bytes.
-    SceneError if it cannot be read, has no scene of that key, or an array has another shape.
+    SceneError if the chunk cannot be read, has no scene of that key, or an array has another shape.
     """
     path, scene = source.path, source.scene
     entries = _load(path)
@@ -41,7 +41,7 @@ def read_re10k(source: CameraSource) -> StoredCameras:
 
 
 def read_scenes(path: Path) -> Iterator[StoredCameras]:
-    """Read the cameras and photos of all scenes of a chunk, one after the other, as :func:`read_re10k`."""
+    """Read the cameras and photos of all scenes of a chunk, as :func:`read_re10k`, one scene at a time."""
     return (_read_scene(path, entry) for entry in _load(path))
 
 
@@ -82,7 +82,7 @@ def _rows(path: Path, cameras: Any) -> np.ndarray:
 
 
 def _photos(path: Path, images: Any, names: list[str]) -> PhotoArrays:
-    """Decode the photos ``[v,h,w,3]`` uint8; none where the chunk has none."""
+    """Decode the photos ``[v,h,w,3]`` uint8; empty if the chunk has none."""
     listed = isinstance(images, list | tuple)
     if images is None or (listed and not images):
         return ()
@@ -90,5 +90,5 @@ def _photos(path: Path, images: Any, names: list[str]) -> PhotoArrays:
         count = len(images) if listed else type(images).__name__
         raise SceneError(path, f"expected {len(names)} images, one per camera, found {count}")
     if not all(isinstance(image, torch.Tensor) and (image.ndim, image.dtype) == (1, torch.uint8) for image in images):
-        raise SceneError(path, "expected images as tensors [bytes] of uint8, found others")
+        raise SceneError(path, "expected images as tensors [bytes] of uint8, found another type or shape")
     return decode_embedded(read_budget(path), names, [image.numpy() for image in images])

@@ -27,11 +27,11 @@ def viewer_cameras_path(output: Path) -> Path:
 def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     """Return the text of cameras as INRIA's ``cameras.json``, for SuperSplat and other viewers.
 
-    :func:`gsmerge.io.cameras.json_files.read_inria` reads it. Viewers assume a principal point in the middle; another
-    one is written as ``cx`` and ``cy``.
+    :func:`gsmerge.read_cameras` reads it. Viewers assume that the principal point is in the middle; one that is not is
+    written as ``cx`` and ``cy``, which viewers ignore.
     """
 
-    def point(K: np.ndarray) -> dict[str, float]:
+    def principal_point(K: np.ndarray) -> dict[str, float]:
         centred = np.allclose(2 * K[:2, 2], (cameras.width, cameras.height), rtol=0, atol=CENTRED_PX)
         return {} if centred else {"cx": float(K[0, 2]), "cy": float(K[1, 2])}
 
@@ -40,7 +40,7 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
         {
             "id": i, "img_name": name, "width": cameras.width, "height": cameras.height,
             "position": centres[i].tolist(), "rotation": rotations[i].tolist(),
-            "fy": float(cameras.Ks[i, 1, 1]), "fx": float(cameras.Ks[i, 0, 0]), **point(cameras.Ks[i]),
+            "fy": float(cameras.Ks[i, 1, 1]), "fx": float(cameras.Ks[i, 0, 0]), **principal_point(cameras.Ks[i]),
         }
         for i, name in enumerate(names)
     ]  # fmt: skip

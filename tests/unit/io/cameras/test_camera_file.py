@@ -68,7 +68,7 @@ K = np.array([[180.0, 0, 96], [0, 170, 77], [0, 0, 1]])
 
 
 def bent(x: np.ndarray, y: np.ndarray, model: str, c: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Where a lens shows a point of the plane z = 1; the formulas of COLMAP's and OpenCV's documents."""
+    """Project a point of the plane z = 1 through a lens, by the formulas of COLMAP's and OpenCV's documents."""
     r = np.sqrt(x * x + y * y)
     if model == "fisheye":
         angle = elementary.arctan2(r, 1)
@@ -111,7 +111,7 @@ def test_zero_coefficients_are_a_pinhole_but_not_of_a_fisheye() -> None:
 
 
 def bent_photos(tiny: Tiny, coefficients: list[float]) -> Tiny:
-    """The scene's photos as a lens with these coefficients takes them."""
+    """Make the photos that a lens with these coefficients takes of the scene."""
     y, x = np.mgrid[: tiny.height, : tiny.width].astype(np.float32)
     centred = tiny.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     points = np.stack([x, y], -1).reshape(-1, 1, 2)

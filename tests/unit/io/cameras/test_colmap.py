@@ -40,7 +40,7 @@ def test_colmap_by_one_of_its_files(tmp_path: Path, tiny: Tiny) -> None:
 def test_sizes_that_are_the_photos_not_those_of_intrinsics(
     tmp_path: Path, tiny: Tiny, centre: tuple[float, float], size: tuple[int, int]
 ) -> None:
-    """As WorldMirror 1 writes them: whole numbers, off alike in both directions."""
+    """WorldMirror 1 writes them: twice the principal point is whole and has the photos' shape."""
     K = np.array([[30, 0, centre[0]], [0, 30, centre[1]], [0, 0, 1.0]])
     write_colmap_text(tmp_path, replace(tiny, K=K, width=80, height=56))
     cameras = read_cameras(tmp_path)
@@ -78,7 +78,7 @@ def test_truncated_colmap_files_are_named(tmp_path: Path, tiny: Tiny, name: str)
 
 
 def test_a_model_that_shrinks_while_it_is_read(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One line, not the signal that reading mapped pages beyond the end would be."""
+    """The message is one line. Reading mapped pages beyond the end would end the process by a signal."""
     write_colmap_binary(tmp_path, tiny)
     path, make_pose = tmp_path / "images.bin", colmap._pose
     data = path.read_bytes()

@@ -70,7 +70,7 @@ def test_models_of_colmap_itself_are_not_mixed_with_ours(tmp_path: Path) -> None
 
 
 def test_pycolmap_reads_the_same(model: Path, tiny: Tiny) -> None:
-    """Its own errors of the tracks say that poses, intrinsics and pixel centres are its own."""
+    """Its reprojection errors of the tracks are zero only if it reads poses, intrinsics and pixel centres as we do."""
     pycolmap = pytest.importorskip("pycolmap")
     read = pycolmap.Reconstruction(str(model))
     read.update_point_3d_errors()

@@ -26,16 +26,16 @@ NOTE = "the cameras are moved into the Gaussians' frame by dataparser_transforms
 
 
 def trained(folder: Path, *, move: bool = True) -> Tiny:
-    """Some of the Gaussians in no order, where nerfstudio puts them: X' = s (T [X; 1]); photos beside them."""
+    """Save some Gaussians in random order, moved as nerfstudio does: X' = s (T [X; 1]); with photos beside them."""
     some = np.random.default_rng(0).permutation(1296)[:864]
     gaussians = SMOOTH.gaussians[some]
     if move:
         means = SCALE * (gaussians.means.astype(np.float64) @ TURN.T + SHIFT)
         gaussians = replace(gaussians, means=means.astype(np.float32), scales=SCALE * gaussians.scales)
-    there = replace(SMOOTH, gaussians=gaussians)
-    there.save(folder, cameras=False)
+    scene = replace(SMOOTH, gaussians=gaussians)
+    scene.save(folder, cameras=False)
     write_dataparser(folder)
-    return there
+    return scene
 
 
 def write_dataparser(folder: Path, **changes: object) -> None:
@@ -73,7 +73,7 @@ def test_other_cameras_of_the_capture_are_moved_with_them(tmp_path: Path) -> Non
 
 
 def test_poses_that_are_moved_already(tmp_path: Path) -> None:
-    """``transform`` starts from the world before ``applied_transform``, in which the poses no longer are."""
+    """The poses are in the world after ``applied_transform``, but ``transform`` starts from the world before it."""
     trained(tmp_path)
     applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.25], [0, 0, 0, 1]])
     data = frames_of(SMOOTH)
@@ -130,7 +130,7 @@ MOVE = "<transform><rotation>0 -1 0 1 0 0 0 0 1</rotation><translation>2 4 6</tr
 
 @pytest.mark.parametrize("place", ["<chunk>", '<components><component id="1"/><component id="0">'])
 def test_metashape_s_world_is_a_frame_of_its_largest_component(tmp_path: Path, place: str) -> None:
-    """In it Metashape's other exports are, and at the scale of the cameras those of nerfstudio."""
+    """Metashape's other exports are in this world; those of nerfstudio have the cameras' scale."""
     path = FORMATS["Metashape"].write(tmp_path)
     end = "</component></components>" if "id" in place else ""
     text = path.read_text().replace("<chunk>", f"<chunk>{place.replace('<chunk>', '')}{MOVE}{end}")

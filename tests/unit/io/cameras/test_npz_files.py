@@ -97,7 +97,7 @@ def test_npz_that_are_refused(tmp_path: Path, tiny: Tiny) -> None:
 
 
 def test_damage_is_told_in_the_same_words_every_time(tmp_path: Path) -> None:
-    """NumPy's own text names an object by its address."""
+    """NumPy's message has the address of an object, which differs in every process."""
     head = b"{'descr': name, 'fortran_order': False, 'shape': (3,)}\n"
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("extrinsics.npy", b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(24))

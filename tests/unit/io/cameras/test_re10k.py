@@ -51,7 +51,7 @@ def test_the_only_scene_needs_no_name(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_photos_that_were_cropped(tmp_path: Path) -> None:
-    """DepthSplat's file beside its dataset: resized, cropped and trimmed, turned into the first camera."""
+    """DepthSplat's file beside its dataset: photos are resized and cropped, and the first camera is the world."""
     tiny = smooth_scene(48, 48)
     mapping = resize_and_crop((96, 54), (48, 48))
     matrix = np.array([[mapping.scale_x, 0, -mapping.left], [0, mapping.scale_y, -mapping.top], [0, 0, 1]])

@@ -105,7 +105,7 @@ def flat_matrices(data: Any) -> None:
 
 
 def reversed_numbers(data: Any) -> None:
-    """Count the views from behind, as 10, 9, 8."""
+    """Name the views 10, 9, 8 in the order of the file, which is from the last to the first."""
     for entries in data.values():
         entries.reverse()
         for i, entry in enumerate(entries):
