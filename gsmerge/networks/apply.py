@@ -1,7 +1,7 @@
-"""Application of the networks: padded tables of tokens by size, run in parallel, and the corrections applied.
+"""Run the networks on padded tables of tokens, in parallel, and apply their corrections.
 
-All is arrays. In training, :class:`gsmerge.research.training.predict.TrainingContext` puts the same formulas on tensors
-in place of the methods of :class:`NetworkContext`, so that gradients pass from stage to stage.
+Everything here works on arrays. In training, :class:`gsmerge.research.training.predict.TrainingContext` replaces
+methods of :class:`NetworkContext` by the same formulas on tensors, so that gradients pass from stage to stage.
 """
 
 from __future__ import annotations
@@ -28,25 +28,24 @@ from gsmerge.networks.tokens import (
     sample_members,
     split_tables,
 )
-from gsmerge.networks.weights import RunnableNetworks
 from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
-# What a Feature Gaussian says of itself; its members, their weights and its view are those of its cluster.
-OWN = (*CORRECTED, "gains", "shN", "footprints")
-RunTable = Callable[[np.ndarray, int], Array]  # rows and width of a table -> [rows, columns]
+# Columns of a Feature Gaussian itself; members, their weights and the view belong to its cluster
+OWN_COLUMNS = (*CORRECTED, "gains", "shN", "footprints")
+RunTable = Callable[[np.ndarray, int], Array]  # takes rows and width of a table, returns [rows, columns]
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkContext(Corrector):
-    """Networks, with the inputs that they read besides Feature Gaussians."""
+    """Networks, with their inputs other than Feature Gaussians."""
 
-    networks: RunnableNetworks  # encoder, merger, refiner and decoder heads
+    networks: NetworkWeights | Networks  # encoder, merger, refiner and decoder heads; in training torch modules
     members: Members  # the scene's Gaussians
-    cameras: Cameras  # its views
-    seed: int = 0  # chooses the members of groups that are too large to read whole
+    cameras: Cameras  # the scene's views
+    seed: int = 0  # of the sampling of members in large groups
 
     @property
     def options(self) -> NetworkOptions:
@@ -59,11 +58,11 @@ class NetworkContext(Corrector):
         return self.options.max_children
 
     def encode(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Run the encoder, see :func:`encode_features`, and the head for K = 1 if its geometry is carried on."""
+        """Run the encoder, see :func:`encode_features`, and the head for K = 1 if ``geometry`` is ``"carried"``."""
         encoded = encode_features(features, self)
         if self.options.geometry != "carried":
             return encoded
-        # scales and rotations alone: the mean stays the encoder's (paper section 4.2)
+        # only scales and rotations are those of the head; the mean is that of the encoder (paper section 4.2)
         return replace(encoded, covars=self.decode_covars(encoded))
 
     def decode_covars(self, features: FeatureGaussians) -> Array:
@@ -78,13 +77,13 @@ class NetworkContext(Corrector):
         """Correct c merged Feature Gaussians with the merger (paper section 4.4).
 
         Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. In the
-        paper the merger corrects the first of these rows instead of the pooled one.
+        paper the merger corrects the first of these rows instead of the pooled Feature Gaussian.
         """
         options = self.options
         if not options.merger:
             return pooled
         if options.merger_start == "first":
-            first = {name: getattr(parts, name)[order[cuts]] for name in OWN}
+            first = {name: getattr(parts, name)[order[cuts]] for name in OWN_COLUMNS}
             pooled = replace(pooled, **first)
         group_features, base = self.describe(pooled), self.make_base(parts)
         sizes, seeds = np.diff(np.append(cuts, len(order))), point_seeds(as_array(pooled.means), self.seed)
@@ -104,7 +103,7 @@ class NetworkContext(Corrector):
 
     @stage("refine")
     def refine(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Correct Feature Gaussians with the refiner, which reads their neighbours (paper section 4.5)."""
+        """Correct Feature Gaussians with the refiner, whose inputs include their neighbours (paper section 4.5)."""
         options = self.options
         if len(features) == 0 or not options.refiner:
             return features
@@ -128,7 +127,7 @@ class NetworkContext(Corrector):
 
     @property
     def makes_children(self) -> bool:
-        """Whether the heads make children of nothing."""
+        """True if the heads make children without analytic ones."""
         return self.options.makes_children
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
@@ -196,11 +195,11 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
 
 
 def find_neighbors(means: np.ndarray, count: int) -> np.ndarray:
-    """Find the nearest neighbours ``[g,count]`` int64 of points ``[g,3]``; -1 where there are fewer."""
+    """Find the nearest neighbours ``[g,count]`` int64 of points ``[g,3]``; -1 if there are fewer."""
     means, neighbors = means.astype(np.float64), np.full((len(means), count), -1, np.int64)
     rows = np.flatnonzero(np.isfinite(means).all(1))
-    near = nearest_of_other_views(means[rows], np.full(len(rows), -1, np.int64), count)  # all of another view
-    neighbors[rows] = np.where(near < 0, -1, rows[near])
+    nearest = nearest_of_other_views(means[rows], np.full(len(rows), -1, np.int64), count)  # -1: no views
+    neighbors[rows] = np.where(nearest < 0, -1, rows[nearest])
     return neighbors
 
 
@@ -217,8 +216,8 @@ def decode_gaussians(
     """Correct the children of Feature Gaussians with the decoder head for their number (paper section 4.3).
 
     Children of one Feature Gaussian are adjacent; ``parents [n]`` are rows of ``group_features``, ascending. Three
-    children use three slots of the head for four. Five to eight are corrected in two halves, each as a group of its
-    own, which heads with absolute outputs cannot do.
+    children use three slots of the head for four. Five to eight children are corrected in two halves, each as a
+    separate group; heads with absolute outputs cannot do this.
     """
     children = prepare_children(children, parents, group_features, context.options)
     residuals = as_array(run_heads(contiguous(children), parents, group_features, context))
@@ -230,8 +229,8 @@ def prepare_children(
 ) -> Gaussians:
     """Prepare the children that heads correct: unchanged, or round Gaussians for heads with absolute outputs.
 
-    A round Gaussian has the mean of its group, its base colour, and the axes of its frame; the head's outputs are
-    offsets from these (paper section 4.3). It is as large as the group and half transparent.
+    A round Gaussian has the mean and the base colour of its group, and the axes of the group's frame. The outputs of
+    the head are offsets from these (paper section 4.3). Its size is that of the group, and its opacity is 0.5.
     """
     if not options.makes_children:
         return children
@@ -249,10 +248,10 @@ def prepare_children(
 def run_heads(
     children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
 ) -> Array:
-    """Compute bounded corrections ``[n,13]`` of children; zero where no head exists for their number."""
+    """Compute bounded corrections ``[n,13]`` of children; zero if there is no head for their number."""
     options = context.options
     count, halves = len(group_features.features), options.max_children > SLOTS[-1]
-    first, sizes, owners = _families(parents, count, halves=halves)
+    first, sizes, owners = _split_siblings(parents, count, halves=halves)
     outputs, places, total = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
     for slots, fewest in zip(SLOTS, (1, 2, 3), strict=True):
         rows = np.flatnonzero((sizes >= fewest) & (sizes <= slots))
@@ -267,8 +266,11 @@ def run_heads(
     return scale_outputs(concat_rows(outputs)[places], WIDE if options.makes_children else options.bounds)
 
 
-def _families(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find first row, number and parent of the children that a head reads together: of many, those of each half."""
+def _split_siblings(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return first row, number and parent of each run of children that a head corrects together.
+
+    With ``halves``, the children of a parent with more than four are split into two runs.
+    """
     sizes = np.bincount(parents, minlength=count)
     first = np.cumsum(sizes) - sizes
     large = (sizes > SLOTS[-1]) & halves
@@ -284,7 +286,7 @@ def _run_head(
     group_features: GroupFeatures,
     context: NetworkContext,
 ) -> Array:
-    """Compute outputs ``[r·slots,13]`` for a table of parents' rows, children's rows and mask."""
+    """Compute outputs ``[r·slots,13]`` for a table: rows of parents, rows of children, and mask."""
     parents, ids, mask = table
     slots, latents = mask.shape[1], group_features.features.latents
 

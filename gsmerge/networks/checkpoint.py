@@ -1,4 +1,4 @@
-"""Networks in a safetensors file: data alone, with their sizes and their training in the header."""
+"""Read and write networks as a safetensors file: only data, with sizes and facts about the training in the header."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gsmerge.networks.weights import NetworkWeights
 from gsmerge.types import StrPath
 from gsmerge.version import __version__
 
-SCHEMA = 2  # version of the tensors' names and of the tokens that they were trained on
+SCHEMA = 2  # version of the tensors' names and of the tokens that the networks take
 FORMAT = "gsmerge-networks"
 REMEDY = "give another file, or --set checkpoint=none"
 SHIPPED = Path(__file__).with_name("shipped.safetensors")
@@ -34,7 +34,7 @@ class Checkpoint:
 
     networks: NetworkWeights
     path: Path  # the file
-    version: str  # the gsmerge that wrote it
+    version: str  # version of gsmerge that wrote it
     training: Mapping[str, Any]  # facts about the training, as the trainer wrote them
 
     def facts(self) -> dict[str, Any]:
@@ -51,15 +51,15 @@ def save_checkpoint(path: str | PathLike[str], networks: NetworkWeights, trainin
     with atomic_output(path, overwrite=True) as temporary:
         temporary.write_bytes(
             save(dict(networks.arrays), {FORMAT: json.dumps(header)})
-        )  # one entry: several have no fixed order
+        )  # a single entry, since several entries would have no fixed order
 
 
 def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
     """Read networks from a file; nothing in the file is executed.
 
     Raises:
-        SceneError: If the file is missing or damaged, of another format or version, or its tensors do not fit the
-            sizes in its header or are not finite.
+        SceneError: If the file is missing, damaged or of another format or version, or if its tensors are not finite or
+            do not have the sizes in its header.
     """
     path = Path(path)
     if not path.is_file():
@@ -71,9 +71,9 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
 
 
 def build_networks(path: Path, options: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> NetworkWeights:
-    """Build networks from options, as ``NetworkOptions.from_dict`` takes them, and weights by name.
+    """Build networks from options, see ``NetworkOptions.from_dict``, and weights by name.
 
-    Raises SceneError with ``path`` if the sizes are out of range, or the weights do not fit them.
+    Raises SceneError with ``path`` if the sizes are out of range, or if the weights have other sizes.
     """
     try:
         sizes = NetworkOptions.from_dict(options)
@@ -88,12 +88,12 @@ def build_networks(path: Path, options: Mapping[str, Any], arrays: Mapping[str, 
             have, want = list(array.shape), list(expected[name])
             raise SceneError(path, f"{name}: expected float32 {want}, found {array.dtype} {have}", REMEDY)
         if not np.isfinite(array).all():
-            raise SceneError(path, f"{name}: expected finite numbers, found others", REMEDY)
+            raise SceneError(path, f"{name}: expected finite numbers, found NaN or infinity", REMEDY)
     return NetworkWeights(sizes, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
 def _header(header: Mapping[str, str], budget: ReadBudget) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """Read sizes of the networks, facts about the training, and the version that wrote them."""
+    """Read the sizes of the networks, facts about the training, and the version that wrote the file."""
     path = budget.path
     if FORMAT not in header:
         raise SceneError(path, "expected networks of gsmerge, found another safetensors file", REMEDY)
@@ -118,8 +118,9 @@ def _header_error(path: StrPath, error: Exception) -> SceneError:
 def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, list[str]]:
     """Load a checkpoint by name, with notes for the user; None for the analytic stages.
 
-    ``name`` is a file, ``"shipped"`` or ``"paper"`` in the package, or ``"none"``. If a checkpoint cannot be used, a
-    file or ``required`` one is refused by a SceneError; otherwise a note is added, and the stages run without networks.
+    ``name`` is a file, ``"shipped"`` or ``"paper"`` in the package, or ``"none"``. Raises SceneError if a file, or a
+    ``required`` checkpoint of the package, cannot be used. Otherwise a note is added, and the stages run without
+    networks.
     """
     if name == "none":
         return None, []
@@ -128,4 +129,4 @@ def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, li
     except SceneError as error:
         if required or name not in IN_PACKAGE:
             raise
-        return None, [f"no networks, analytic stages alone: {error}"]
+        return None, [f"no networks, only the analytic stages: {error}"]

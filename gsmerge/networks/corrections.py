@@ -1,8 +1,9 @@
-"""Corrections of Gaussians and Feature Gaussians within bounds; a correction of zero changes no bit.
+"""Apply bounded corrections to Gaussians and Feature Gaussians; a correction of zero changes no bit.
 
-A correction has 13 columns: shift of the mean (3) and rotation vector (3) in the group's frame, change of the log
-scales (3) along the principal axes, of the opacity (1) and of the base colour (3). That of a Feature Gaussian has one
-more, the change of the logarithm of its mass beyond what its size and opacity change.
+A correction has 13 columns: shift of the mean (3), change of the log scales (3) along the principal axes, rotation
+vector (3), change of the logit of the opacity (1) and of the base colour (3). Shift and rotation vector are in the
+group's frame. A correction of a Feature Gaussian has one more column, the change of the logarithm of its mass in
+addition to the change by size and opacity.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from gsmerge.types import FeatureGaussians, Gaussians
 
 MEAN, SIZE, ROTATION, LOGIT, COLOR, MASS = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13), 13
 HALF = 0.5  # share of the bounds that each stage before the decoder may use
-ROWS = 8192  # per task
+ROWS = 8192  # rows per task
 
 
 def residual_limits(bounds: Bounds) -> np.ndarray:
-    """Return the largest correction of each of a Feature Gaussian's 14 columns, ``[14]`` float32."""
+    """Return the bound of each of the 14 columns of a Feature Gaussian's correction, ``[14]`` float32."""
     b = bounds
     return np.array([b.mean] * 3 + [b.size] * 3 + [b.turn] * 3 + [b.logit] + [b.color] * 3 + [b.logit], np.float32)
 
@@ -50,10 +51,11 @@ def move_gaussians(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarr
 def move_features(
     features: FeatureGaussians, base: Gaussians, residuals: np.ndarray, frames: np.ndarray
 ) -> FeatureGaussians:
-    """Apply corrections ``[g,14]`` to Feature Gaussians; opacity depends only on its own column, not on the scales.
+    """Apply corrections ``[g,14]`` to Feature Gaussians; the opacity depends only on its own column, not on the scales.
 
-    ``base``: one Gaussian for each group; ``frames [g,3,3]``: axes of each group as columns, world. The tenth
-    correction is added to the logarithms of integrated optical depth and of mass, the last to that of mass alone.
+    ``base`` has one Gaussian for each group. ``frames [g,3,3]`` have the axes of each group as columns, in the world.
+    The tenth column is added to the logarithms of integrated optical depth and mass, and the last column to the
+    logarithm of mass only.
     """
     names = ("means", "covars", "masses", "extinctions", "sh0")
     columns = {name: np.array(getattr(features, name), np.float32, order="C") for name in names}

@@ -1,4 +1,4 @@
-"""What corrects the analytic stages: nothing here, networks in :class:`gsmerge.networks.apply.NetworkContext`."""
+"""Interface of corrections to the analytic stages; :class:`gsmerge.networks.apply.NetworkContext` has networks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gsmerge.types import FeatureGaussians, Gaussians
 
 
 class Corrector:
-    """The closed formulas alone: every stage's result stays as it is."""
+    """Correct nothing: the results of the analytic stages do not change."""
 
     @property
     def max_children(self) -> int:
@@ -23,7 +23,7 @@ class Corrector:
     def merge(
         self, pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     ) -> FeatureGaussians:
-        """Correct Feature Gaussians pooled from the rows ``order`` of ``parts``, in runs from ``cuts``."""
+        """Correct pooled Feature Gaussians; ``cuts`` are the starts of their runs in ``order``, rows of ``parts``."""
         return pooled
 
     def refine(self, features: FeatureGaussians) -> FeatureGaussians:
@@ -32,7 +32,7 @@ class Corrector:
 
     @property
     def makes_children(self) -> bool:
-        """Whether :meth:`decode` makes children of nothing, so that every group can have any number of them."""
+        """True if :meth:`decode` makes children without analytic ones, so that every group can have any number."""
         return False
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:

@@ -1,4 +1,4 @@
-"""Agreement of the Gaussians of other views with a Feature Gaussian, without any photo, and nearest neighbours."""
+"""Measure the agreement of Feature Gaussians with the Gaussians of other views, without photos; find neighbours."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ NEAR_LOG = 0.03  # largest difference of the logarithms of two depths on the sam
 FAR = 0.3  # larger differences of the logarithms of depths are clipped to this
 MIN_OPACITY = 1 / 255  # more transparent Gaussians show no surface
 ROWS = 8192  # points per task
-MOST = 64  # points that are looked at for each neighbour that is asked for, and at least for FEW
-FEW = 16
+# The search compares MAX_COMPARED points per neighbour, for at least MIN_NEIGHBORS neighbours
+MAX_COMPARED, MIN_NEIGHBORS = 64, 16
 
 
 def cross_view_stats(
@@ -28,10 +28,11 @@ def cross_view_stats(
 ) -> np.ndarray:
     """Measure how well points agree with the Gaussians that they project onto in every other view.
 
-    Points ``means [g,3]`` with base colours ``sh0 [g,1,3]`` belong to ``views [g]`` int64, which are left out. Of each
-    view's points the ``most`` nearest views are asked; None: all. The statistics ``[g,7]`` float32 are: the logarithm
-    of the number of views that see the point; the shares of these views with a surface at the point, behind it and in
-    front of it; the mean differences of colours and of relative depths; the logarithm of the number of all views.
+    Points ``means [g,3]`` with base colours ``sh0 [g,1,3]`` belong to ``views [g]`` int64, which are left out. Each
+    point is compared with the ``most`` views nearest to its own; None: with all. The statistics ``[g,7]`` float32 are
+    the logarithm of the number of views that see the point; the shares of these views with a surface at the point,
+    behind it and in front of it; the mean differences of colours and of relative depths; and the logarithm of the
+    number of all views.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, 6] = math.log(len(cameras)) / 4
@@ -60,12 +61,13 @@ def cross_view_stats(
 def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
     """Find the nearest points of other views, ``[g,count]`` int64, nearest first (paper section 4.4).
 
-    -1 if there are fewer. A point is also not found behind ``MOST`` times as many nearer points, at least 1,024, which
-    are mostly of the own view: points behind those overlap nothing. Points are ``means [g,3]`` float64, finite; a view
-    below 0 counts as another view.
+    The result is -1 if there are fewer. The search ends after ``MAX_COMPARED`` times ``count`` nearer points, at least
+    1,024. Most of these are of the own view, and Gaussians behind them do not overlap. Points are ``means [g,3]``
+    float64, finite. A view below 0 counts as different from all others.
     """
     num = len(means)
-    neighbors, means, most = np.empty((num, count), np.int64), np.ascontiguousarray(means), MOST * max(count, FEW)
+    neighbors, means = np.empty((num, count), np.int64), np.ascontiguousarray(means)
+    most = MAX_COMPARED * max(count, MIN_NEIGHBORS)
     order, axes, splits = make_tree(means)
     with use_threads() as threads:
         parallel_map(

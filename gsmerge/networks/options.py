@@ -1,4 +1,4 @@
-"""Sizes of the networks, the bounds of their corrections, and the names and shapes of their weights."""
+"""Define the sizes of the networks, the bounds of their corrections, and the names and shapes of their weights."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ OUTPUTS = ("residual", "absolute")
 STARTS = ("pooled", "first")
 GEOMETRIES = ("analytic", "carried")
 PART = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
-MEMBER = PART + 6  # and its position in footprints and its colour
+MEMBER = PART + 6  # columns of a member: also its position in footprints and its colour
 GROUP = 19 + NUM_STATS  # columns of a whole group
 RESIDUAL = 13  # columns of a correction, see gsmerge.networks.corrections
-FEATURE = RESIDUAL + 1  # of a correction of a Feature Gaussian, whose last column is the mass
-CORRECTED = ("means", "covars", "masses", "extinctions", "sh0", "latents")  # of a Feature Gaussian, by networks
-PAPER_NUMBERS = (4, 8, 9, 10)  # columns of a group that the paper's decoder reads: mass and base colour
+FEATURE = RESIDUAL + 1  # columns of a correction of a Feature Gaussian; the last one is the mass
+CORRECTED = ("means", "covars", "masses", "extinctions", "sh0", "latents")  # columns of Feature Gaussians that change
+PAPER_NUMBERS = (4, 8, 9, 10)  # columns of a group that the paper's decoder takes: mass and base colour
 
 
 @dataclass(frozen=True)
 class Bounds(Settings):
-    """Largest corrections by the decoder, 0: none; merger, refiner and encoder may each correct by half of that."""
+    """Largest corrections by the decoder, 0: none; merger, refiner and encoder may each correct by half as much."""
 
     mean: float = setting(1.0, "Shift along each axis of the group's frame, in units of the Gaussian's size.", least=0,
         most=8)  # fmt: skip
@@ -36,7 +36,7 @@ class Bounds(Settings):
     color: float = setting(0.25, "Change of each channel of the base colour, sRGB in [0, 1].", least=0, most=8)
 
 
-WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # of absolute outputs
+WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # bounds of absolute outputs
 
 
 @dataclass(frozen=True)
@@ -53,18 +53,18 @@ class NetworkOptions(Settings):
     neighbors: int = setting(8, "Neighbours that the refiner reads.", least=1, most=64)
     bounds: Bounds = setting(Bounds(), "Largest corrections.")
     outputs: str = setting("residual", "`residual`: the heads correct the analytic children.",
-        "`absolute`, as in the paper: they do not read these, and correct a round Gaussian of the group's mean and "
+        "`absolute`, as in the paper: they do not read these, and correct a round Gaussian with the group's mean and "
         "base colour, within wide bounds.", choices=OUTPUTS)  # fmt: skip
-    encoder: bool = setting(True, "Whether there is one; without it all latents are zero.")
-    merger: bool = setting(True, "Whether there is one; without it clusters are pooled, and no more.")
-    merger_start: str = setting("pooled", "What the merger corrects: `pooled`: the moments of the whole cluster.",
-        "`first`, as in the paper: its 0th Feature Gaussian.", choices=STARTS)  # fmt: skip
-    geometry: str = setting("analytic", "Whose scales and rotations Feature Gaussians have.",
-        "`analytic`: those of the moments. `carried`: those of the K = 1 head from the encoder on, as in the paper.",
+    encoder: bool = setting(True, "Use the encoder; without it all latents are zero.")
+    merger: bool = setting(True, "Use the merger; without it clusters are only pooled.")
+    merger_start: str = setting("pooled", "Input that the merger corrects: `pooled`: the moments of the whole cluster.",
+        "`first`, as in the paper: the first Feature Gaussian of the cluster.", choices=STARTS)  # fmt: skip
+    geometry: str = setting("analytic", "Source of the scales and rotations of Feature Gaussians.",
+        "`analytic`: the moments. `carried`: the K = 1 head from the encoder on, as in the paper.",
         choices=GEOMETRIES)  # fmt: skip
-    refiner: bool = setting(True, "Whether there is one.")
-    group_numbers: bool = setting(True, "Whether the heads read all numbers that describe a group, which are ours.",
-        "Without them a head reads latent, base colour and mass, as in the paper.")  # fmt: skip
+    refiner: bool = setting(True, "Use the refiner.")
+    group_numbers: bool = setting(True, "Give the heads all numbers that describe a group, which the paper does not.",
+        "Otherwise a head reads latent, base colour and mass, as in the paper.")  # fmt: skip
 
     @property
     def head_numbers(self) -> tuple[int, ...]:
@@ -73,19 +73,19 @@ class NetworkOptions(Settings):
 
     @property
     def reads_children(self) -> bool:
-        """Whether the heads read the Gaussians that they correct; absolute heads read only the group's size."""
+        """True if heads take the Gaussians that they correct as inputs; absolute heads take only the group's size."""
         return self.group_numbers or not self.makes_children
 
     @property
     def makes_children(self) -> bool:
-        """Whether heads make the children of a group of nothing, so that there are K of every group."""
+        """True if heads make children without analytic ones, so that every group has K children."""
         return self.outputs == "absolute"
 
     @property
     def max_children(self) -> int:
         """Largest number of children that heads correct.
 
-        Five or more are corrected in two halves, which absolute heads cannot do.
+        Five or more are corrected in two halves; absolute heads cannot do this.
         """
         return SLOTS[-1] if self.makes_children else 2 * SLOTS[-1]
 
@@ -157,7 +157,7 @@ def _block(name: str, width: int) -> dict[str, tuple[int, ...]]:
 
 
 def _mlp(name: str, *widths: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of linear layers; their numbers are even, since activations have the odd ones."""
+    """Return the shapes of linear layers; their numbers are even, since activations have the odd numbers."""
     layers = (_linear(f"{name}.{2 * i}", *pair) for i, pair in enumerate(pairwise(widths)))
     return {key: shape for layer in layers for key, shape in layer.items()}
 

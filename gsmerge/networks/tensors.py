@@ -1,4 +1,4 @@
-"""Corrections of Gaussians as tensors, differentiable, for training; :mod:`gsmerge.networks.corrections` on arrays."""
+"""Apply corrections to Gaussians of tensors, with gradients, as :mod:`gsmerge.networks.corrections` does to arrays."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
 
 def rotate_quats(vectors: Tensor, quats: Tensor) -> Tensor:
     """Rotate quaternions ``[n,4]`` by rotation vectors ``[n,3]`` in world axes."""
-    half = (vectors.square().sum(-1, keepdim=True) + 1e-20).sqrt() / 2  # has a gradient at zero, too
+    half = (vectors.square().sum(-1, keepdim=True) + 1e-20).sqrt() / 2  # the gradient is finite at zero, too
     w, (x, y, z) = half.cos()[:, 0], (half.sin() / (2 * half) * vectors).unbind(-1)
     a, b, c, d = quats.unbind(-1)
     return torch.stack(

@@ -1,8 +1,8 @@
-"""Inputs of the networks: numbers without a unit, in a frame of each group.
+"""Compute the inputs of the networks: numbers without a unit, in the frame of each group.
 
-The frame is aligned to the ray that the group was seen along, with the image's right and down of its own view. Lengths
-are in units of the Feature Gaussian's size or of one pixel's footprint there, so that nothing depends on depth, focal
-length, resolution or the scale of the world.
+The axes of the frame are the ray from the camera to the group, and the image's right and down of the group's view.
+Lengths are in units of the Feature Gaussian's size or of the footprint of one pixel. So the inputs do not depend on
+depth, focal length, resolution or the scale of the world.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from gsmerge.networks.options import GROUP, MEMBER, PART
 from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
-TOKENS = 4096  # tokens of one table: a megabyte of activations, which stay in a processor's cache
+TOKENS = 4096  # tokens of one table; their activations take a megabyte, which fits a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class GroupFeatures:
-    """Feature Gaussians in the form that networks read, float32; in training, numbers are tensors."""
+    """Inputs of the networks for Feature Gaussians, float32; in training, numbers are tensors."""
 
     features: FeatureGaussians  # g of them
     base: Gaussians  # g Gaussians without corrections
     frames: Array  # [g,3,3] axes (right, down, away) as columns, world
     sizes: Array  # [g] geometric mean of the two largest scales, world units
     footprints: np.ndarray  # [g] size of one pixel, world units
-    views: np.ndarray  # [g] int64 view that the frame belongs to
+    views: np.ndarray  # [g] int64 view of the frame
     group: Array  # [g,GROUP] numbers that describe the whole group
 
 
@@ -47,7 +47,8 @@ def describe_features(
 ) -> GroupFeatures:
     """Compute the networks' inputs from Feature Gaussians, their views, numbers of members and statistics.
 
-    ``views [g]``: view of each Feature Gaussian; ``num_members [g]``; ``stats [g,7]``: agreement with other views.
+    ``views [g]`` is the view of each Feature Gaussian, ``num_members [g]`` its number of members, and ``stats [g,7]``
+    its agreement with other views.
     """
     bare = make_group_features(features, views, np.zeros((len(features), GROUP), np.float32), cameras)
     base, group = bare.base, np.empty((len(features), GROUP), np.float32)
@@ -71,7 +72,7 @@ def make_group_features(
 
 
 def contiguous(gaussians: Gaussians) -> Gaussians:
-    """Convert Gaussians to float32 arrays in C order, as the kernels read them."""
+    """Convert Gaussians to float32 arrays in C order, as the kernels take them."""
     return Gaussians(*(in_order(column) for column in vars(gaussians).values()))
 
 
@@ -85,7 +86,7 @@ def _viewmats(cameras: Cameras) -> np.ndarray:
 
 
 def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
-    """Choose a view ``[g]`` int64 for each Feature Gaussian: its own or, if merged, the view with the most opacity."""
+    """Choose a view ``[g]`` int64 for each Feature Gaussian: its own or, if merged, that with most summed opacity."""
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)
     if len(merged) == 0:
@@ -104,7 +105,8 @@ def part_tokens(
 ) -> np.ndarray:
     """Make tokens that describe the Gaussians ``ids [n]`` relative to their groups ``owners [n]``.
 
-    Returns ``[n,columns]``: PART columns for every Gaussian, then MEMBER columns only for members; the rest is zero.
+    Returns ``[n,columns]``. The first PART columns are written for all Gaussians, the others up to MEMBER only for
+    members.
     """
     g, out = group_features, np.zeros((len(ids), columns), np.float32)
     describe_parts(
@@ -117,9 +119,9 @@ def part_tokens(
 def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray, int]]:
     """Split groups of ``sizes [g]`` into tables of similar size: yield rows of ``sizes`` and a width (power of two).
 
-    Which groups share a table depends only on the sizes. Groups larger than ``max_width`` are sampled.
+    The split depends only on the sizes. Groups larger than ``max_width`` have to be sampled.
     """
-    bits = np.frexp(np.maximum(sizes, 1) - 0.5)[1].astype(np.int64)  # of the next power of two
+    bits = np.frexp(np.maximum(sizes, 1) - 0.5)[1].astype(np.int64)  # exponents of the next power of two
     widths = np.minimum(1 << bits, max_width)
     for width in np.unique(widths):
         rows = np.flatnonzero(widths == width)
@@ -136,12 +138,12 @@ def group_rows(begins: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sample at most ``width`` members of every group, evenly along their ``keys [m]``, independent of order.
+    """Sample at most ``width`` members of every group, evenly along their ``keys [m]``, independent of their order.
 
-    Keys come group by group, ``sizes [g]`` of each. A group that is too large is cut along its key into ``width`` runs
-    of similar length, and one random member is taken from each by ``seeds [g]`` uint64, so the sample covers the group
-    (paper supplement, encoder compute). Returns positions ``[g,width]`` in ``keys``, and a mask of the valid ones;
-    invalid positions repeat the first of the group.
+    ``keys`` are group after group, and ``sizes [g]`` are the numbers of each group. A group larger than ``width`` is
+    sorted by its keys and cut into ``width`` runs of similar length. One random member is taken from each run, by
+    ``seeds [g]`` uint64, so the sample covers the group (paper supplement, encoder compute). Returns positions
+    ``[g,width]`` in ``keys``, and a mask of the valid positions; the others repeat the first one of the group.
     """
     first = np.cumsum(sizes) - sizes
     order = np.lexsort((keys, np.repeat(np.arange(len(sizes)), sizes)))

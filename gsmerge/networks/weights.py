@@ -1,7 +1,7 @@
-"""The networks as arrays of weights, and their forward pass through the native library.
+"""Run the forward pass of the networks on arrays with the native library.
 
-It is the arithmetic of :mod:`gsmerge.research.training.modules`, which training needs, to rounding, without torch.
-Every group is computed alone: results depend neither on the table that it shares with others nor on the number of
+The arithmetic is that of the torch modules for training, :mod:`gsmerge.research.training.modules`, up to rounding.
+Every group is computed by itself. So results depend neither on the other groups of its table nor on the number of
 threads.
 """
 
@@ -43,7 +43,7 @@ class NetworkWeights:
     options: NetworkOptions
     arrays: Mapping[str, np.ndarray]
 
-    in_parallel = True  # tables of groups may run in several threads
+    in_parallel = True  # tables may run in several threads
 
     @property
     def num_parameters(self) -> int:
@@ -60,8 +60,8 @@ class NetworkWeights:
     def run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
         """Run ``"encoder"``, ``"merger"``, ``"refiner"`` or ``"heads.K"`` on a table of b groups.
 
-        Inputs are those of the module of the same name. Returns its outputs side by side, ``[b,columns]``, after tanh,
-        with 0 for NaN; outputs of a head are ``[b,K * 13]``.
+        Inputs are those of the module of the same name. Returns its concatenated outputs ``[b,columns]`` after tanh,
+        with 0 for NaN. Outputs of a head are ``[b,K * 13]``.
         """
         if name.startswith("heads."):
             return self._run_head(name, *inputs)
@@ -98,7 +98,7 @@ class NetworkWeights:
         return self._dense(f"{name}.out", x, TANH).reshape(len(children), -1)
 
     def _block(self, name: str, x: np.ndarray, mask: np.ndarray, *, first: bool = False) -> np.ndarray:
-        """Run attention and an MLP; ``first``: only for the first token."""
+        """Run attention and an MLP; with ``first`` only for the first token."""
         context = self._norm(f"{name}.before", x)
         x, query = (x[:, :1], context[:, :1]) if first else (x, context)
         x = self._attention(f"{name}.attention", query, context, mask, x)
@@ -113,7 +113,7 @@ class NetworkWeights:
     def _attention(
         self, name: str, query: np.ndarray, context: np.ndarray, mask: np.ndarray, residual: np.ndarray
     ) -> np.ndarray:
-        """Mix the values of ``context [b,n,w]`` for ``query [b,q,w]``, and add that to ``residual [b,q,w]``."""
+        """Attend from ``query [b,q,w]`` to ``context [b,n,w]``, and add the result to ``residual [b,q,w]``."""
         (sets, queries, width), heads = query.shape, self.options.heads
         query, pairs = self._dense(f"{name}.query", query), self._dense(f"{name}.pair", context)
         mixed = np.empty((sets, queries, heads * padded(width // heads)), np.float32)
@@ -145,12 +145,12 @@ class NetworkWeights:
 
     @cached_property
     def _layers(self) -> dict[str, Layer]:
-        """The linear layers as the library reads them, by name."""
+        """The linear layers in the form that the library takes, by name."""
         names = [name.removesuffix(".weight") for name, array in self.arrays.items() if array.ndim == 2]
         return {name: self._layer(name) for name in names}
 
     def _layer(self, name: str) -> Layer:
-        """Pack a linear layer; values of attention heads are padded in the layers that write and read them."""
+        """Pack a linear layer; the layers before and after attention get padded values for each head."""
         weight, bias = self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
         width, heads = self.options.width, self.options.heads
         size = width // heads

@@ -1,7 +1,8 @@
-"""Captures: scenes of a dataset as cameras and photos, without Gaussians.
+"""List captures, the scenes of a dataset, and read their cameras and photos; they have no Gaussians.
 
 A dataset is a folder with a folder for each scene (DL3DV: ``transforms.json``, also below ``nerfstudio/``; Mip-NeRF
-360: ``sparse/0`` and ``images_4/``), or one of pixelSplat's, with ``index.json`` and ``.torch`` chunks (RE10K, ACID).
+360: ``sparse/0`` and ``images_4/``). Or it is a dataset of pixelSplat, with ``index.json`` and ``.torch`` chunks
+(RE10K, ACID).
 """
 
 from __future__ import annotations
@@ -22,28 +23,28 @@ from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
 from gsmerge.scene.photos import stored_photos
 from gsmerge.types import StrPath, Views
 
-INDEX = "index.json"  # of chunks: the chunk of each scene
+INDEX = "index.json"  # lists the chunk of each scene
 CAMERA_PLACES = ("transforms.json", "nerfstudio/transforms.json", "sparse/0", "colmap/sparse/0", "cameras.json")
 PHOTO_PLACES = ("images_4", "images_8", "images_2", *IMAGE_PLACES)  # smaller ones first: models look at less
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A scene of a dataset: where its cameras and photos are. Nothing of it is in memory."""
+    """A scene of a dataset, as the paths of its cameras and photos; nothing of it is in memory."""
 
     name: str
-    path: Path  # of the cameras: a file, a COLMAP folder, or a chunk that has the photos as well
-    photos: Path | None  # their folder or chunk; None: where the cameras say
+    path: Path  # path of the cameras: a file, a COLMAP folder, or a chunk that has the photos as well
+    photos: Path | None  # folder or chunk of the photos; None: as the cameras name them
 
     def read_cameras(self) -> CameraFile:
-        """Read all cameras, in the order of their names; those of a chunk in its own."""
+        """Read all cameras, in the order of their names; cameras of a chunk in the order of the chunk."""
         cameras = read_cameras(self.path, scene=self.name)
         if self.path.suffix == CHUNK:
             return cameras
         return select_views(cameras, np.argsort(np.array(cameras.names), kind="stable").tolist())
 
     def read_views(self, cameras: CameraFile) -> Views:
-        """Read the photos of some of the cameras, undistorted; SceneError if one is missing."""
+        """Read the photos of ``cameras``, undistorted; SceneError if one is missing."""
         photos = stored_photos(SceneFiles(self.path.with_name("scene.ply"), self.path, self.photos), cameras)
         if not len(photos):
             raise SceneError(self.path, f"no photo found for {cameras.names[0]}")
@@ -52,7 +53,7 @@ class Capture:
 
 
 def list_captures(data: StrPath) -> list[Capture]:
-    """List the captures of a dataset, those of folders in the order of their names; SceneError if there is none."""
+    """List the captures of a dataset, folders in the order of their names; SceneError if there is none."""
     root, chunks = Path(data), _read_index(Path(data))
     names = chunks or sorted(path.name for path in root.glob("[!.]*") if path.is_dir())
     captures = [capture for capture in (_find(root, name, chunks) for name in names) if capture is not None]
@@ -62,7 +63,7 @@ def list_captures(data: StrPath) -> list[Capture]:
 
 
 def find_capture(data: StrPath, name: str) -> Capture:
-    """Find a capture of a dataset; SceneError says where it was expected."""
+    """Find a capture of a dataset; a SceneError states where it was expected."""
     capture = _find(Path(data), name, _read_index(Path(data)))
     if capture is None:
         raise _missing(Path(data), f"a scene {name} with")
@@ -70,7 +71,7 @@ def find_capture(data: StrPath, name: str) -> Capture:
 
 
 def _read_index(root: Path) -> Mapping[str, str]:
-    """Read the file of each scene's chunk; empty if the dataset has folders."""
+    """Read the name of each scene's chunk; empty if the dataset has folders."""
     path = root / INDEX
     if not path.is_file():
         return {}

@@ -1,7 +1,7 @@
-"""Stress test: compaction of a scene under bad conditions, with worse views, poses, photos or rows.
+"""Stress test: compact a scene under bad conditions, with worse views, poses, photos or rows.
 
-A case says how a scene is changed, which scenes it is for, and the property that must hold. Every change returns a new
-scene and applies to the views that results are compared with, too.
+A case defines how a scene is changed, which scenes it applies to, and the property that must hold. Every change returns
+a new scene, and also changes the views that results are compared with.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ SEED = 7  # of all random choices
 FAR_SHARE, FAR_FACTOR = 2.5e-5, 1000.0  # share of the Gaussians that are moved far away, and the factor
 LARGE_SHARE, LARGE_FACTOR = 0.01, 8.0  # share of the Gaussians that are enlarged, and the factor
 BROKEN_SHARE = 0.01  # share of the rows that become NaN
-MAX_WORSE = 0.1  # dB that a result may be below its input
-MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that a changed scene's result may be below the unchanged one's
-FIT_SLACK = 1.0  # dB more after a full fit, whose result rounding alone changes this much on thin structures
-SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference, and ratio, of counts
+MAX_WORSE = 0.1  # dB by which a result may be below its input
+MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB by which the result of a changed scene may be below that of the unchanged scene
+FIT_SLACK = 1.0  # dB of additional tolerance after a full fit, since rounding changes thin structures by as much
+SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference, and largest ratio, of counts
 _QUICK = EvaluateOptions(lpips=(), fog=False)
 _FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
@@ -132,10 +132,10 @@ class Case:
     """One bad condition to test compaction under."""
 
     name: str  # on the command line
-    words: str  # the change in words
-    check: Check  # which property must hold, see ``PROPERTIES``
+    words: str  # description of the change
+    check: Check  # name of the property that must hold, see ``PROPERTIES``
     needs: Needs = "anything"  # "pixels": one Gaussian per pixel; "photos": that and photos
-    # returns the changed scene; None: the scene stays, the run differs
+    # returns the changed scene; None: the scene does not change, but the run does
     change: Callable[[StressScene], StressScene] | None = None
     threads: int | None = None  # threads of the run; None: as in the options
 
@@ -179,8 +179,8 @@ class StressOutcome:
     case: str  # its name
     words: str  # how the scene was changed
     wanted: str  # the property that must hold
-    held: bool | None  # whether it does; None where the case does not apply to the scene
-    found: str  # the figures, or why the case does not apply
+    held: bool | None  # True if it holds; None if the case does not apply to the scene
+    found: str  # the figures, or the reason why the case does not apply
     seconds: float  # wall time
 
 
@@ -189,9 +189,9 @@ class _Result:
     """A compact result with its figures."""
 
     gaussians: Gaussians
-    count: int  # of the Gaussians, with those that no photo shows
-    before: float
-    after: float
+    count: int  # number of Gaussians, including those that no photo shows
+    before: float  # PSNR (dB) of the input
+    after: float  # PSNR (dB) of the result
 
 
 def stress(
@@ -204,8 +204,8 @@ def stress(
 ) -> tuple[StressOutcome, ...]:
     """Compact a scene under bad conditions, all ``CASES`` or the named ones, and check each result.
 
-    Results are compared on held-out views (``targets``), or on the input views with their photos, or with renders of
-    the input where there are none. ``progress`` is called with (case, done, total).
+    Results are scored on held-out views (``targets``) if there are any, otherwise on the photos of the input views, or
+    without photos on renders of the input. ``progress`` is called with (case, done, total).
 
     Raises:
         UsageError: If a case is unknown, or the scene has no views.
@@ -233,7 +233,7 @@ def stress(
 
 
 def _check_case(case: Case, setup: StressScene, base: _Result, options: CompactOptions) -> tuple[bool | None, str]:
-    """Check whether the property of a case holds; return the answer with the figures."""
+    """Check if the property of a case holds; return the answer and the figures."""
     if case.needs != "anything" and not setup.scene.has_own_pixels:
         return None, "needs a Gaussian for each pixel"
     if case.needs == "photos" and setup.scene.images is None:
@@ -257,7 +257,7 @@ def _run(setup: StressScene, options: CompactOptions) -> _Result:
 
 
 def _quality(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
-    """Measure the PSNR (dB) of the input and of a result on the views; infinite for an input that is the reference."""
+    """Measure the PSNR (dB) of the input and of a result on the views; infinite if the input is the reference."""
     evaluation = evaluate(setup.scene, {"result": gaussians}, setup.views, replace(_QUICK, context=setup.views is None))
     split = "context" if setup.views is None else "target"
     before, after = (result.mean(split)[1].psnr for result in evaluation.results)
@@ -285,7 +285,7 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
 
 
 def _check_again(setup: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
-    """Compact the result as a scene of its own to as many Gaussians as it has."""
+    """Compact the result as a new scene, to as many Gaussians as it has, and check that it does not get worse."""
     scene = setup.scene
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)
     once = replace(options, budget=BudgetOptions(budget=len(base.gaussians)), decode=replace(options.decode, k=1))
@@ -294,7 +294,7 @@ def _check_again(setup: StressScene, base: _Result, options: CompactOptions) -> 
 
 
 def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:
-    """Return a defect that no result may have; None if there is none."""
+    """Describe a defect of a result; None if it has none."""
     for name in _FIELDS:
         if not np.isfinite(getattr(gaussians, name)).all():
             return f"{name} are not finite"

@@ -1,10 +1,10 @@
-"""Pairwise greedy merging, the idea of NanoGS (2026) and of splat-transform's decimation.
+"""Merge pairs greedily, the idea of NanoGS (2026) and of splat-transform's decimation.
 
-Each round builds a graph of nearest neighbours, the cost of merging every two that are joined, disjoint pairs in the
-order of their cost, and replaces each pair by the Gaussian with its moments, as :mod:`gsmerge.stages.pair_merge` has
-them. Masses are opacity times the area of the ellipsoid, which adds up and so gives the opacity back in the end, at
-most 1 (as splat-transform has it). The cost is Runnalls' bound on the Kullback-Leibler divergence (2007), per unit of
-mass, plus the squared distance of the harmonics: it knows no size, a far pair costs what a near one does.
+Each round builds a graph of nearest neighbours and computes the cost of merging each connected pair. It selects
+disjoint pairs by cost, and replaces each pair by the Gaussian with its moments, see :mod:`gsmerge.stages.pair_merge`.
+Masses are opacity times the area of the ellipsoid. They add up, and the final opacity follows from them, at most 1 (as
+in splat-transform). The cost is Runnalls' bound on the Kullback-Leibler divergence (2007), per unit of mass, plus the
+squared distance of the harmonics. It does not depend on size, so a far pair costs as much as a near one.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from gsmerge.types import Gaussians
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-NEIGHBORS = 10  # 16 bring 0.03 dB on a real capture and take half as long again
-COLOR_WEIGHT = 1.0  # of squared distances of harmonics against nats
+NEIGHBORS = 10  # with 16 a real capture gains 0.03 dB, in 1.5 times the time
+COLOR_WEIGHT = 1.0  # weight of squared distances of harmonics against nats
 AREA_EXPONENT = 1.6075  # of Thomsen's formula for the area of an ellipsoid
 CHUNK = 65536  # Gaussians per piece of work
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -47,7 +47,7 @@ def log_determinants(covars: Floats) -> Floats:
 
 
 def pair_costs(cloud: Cloud, left: Ints, right: Ints) -> Floats:
-    """Compute the costs ``[m]`` of merging pairs: Runnalls' bound per weight plus the distance of harmonics."""
+    """Compute the costs ``[m]`` of merging pairs: Runnalls' bound per mass plus the squared distance of harmonics."""
     masses, covars = cloud.masses.astype(np.float64), cloud.covars.astype(np.float64)
     p = (masses[left] / (masses[left] + masses[right]))[:, None]
     apart = cloud.means[left] - cloud.means[right]
@@ -70,7 +70,7 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
         chunk = near[first : first + CHUNK]
         rows = np.repeat(np.arange(first, first + len(chunk)), chunk.shape[1])
         neighbors = chunk.reshape(-1).astype(np.int64)
-        candidates = (neighbors <= rows).nonzero()[0]  # itself, or a pair that the other one may list too
+        candidates = (neighbors <= rows).nonzero()[0]  # the row itself, or pairs that the other row may list too
         twice = (near[neighbors[candidates]] == rows[candidates, None]).any(1)
         keep = np.ones(len(rows), bool)
         keep[candidates[twice | (neighbors[candidates] == rows[candidates])]] = False
@@ -83,10 +83,11 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 
 
 def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Ints:
-    """Choose at most ``limit`` disjoint pairs greedily, by rising cost ``[m]``.
+    """Choose at most ``limit`` disjoint pairs greedily, by ascending cost ``[m]``.
 
-    A pair that is the cheapest of both its members is always taken, so all such pairs are taken at once, and again
-    among the rest. Of equal costs the first pair counts as cheaper. Returns indices of pairs, by rising cost.
+    A pair that is the cheapest of both its members is always chosen. So all such pairs are chosen at once, and then
+    again among the remaining pairs. Of equal costs the first pair counts as cheaper. Returns indices of pairs, by
+    ascending cost.
     """
     order = np.argsort(costs, kind="stable")
     left, right, ranks = left[order], right[order], np.arange(len(order))
@@ -94,7 +95,7 @@ def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Int
     taken, chosen = np.zeros(len(first), bool), np.empty(0, np.int64)
     while len(ranks):
         ends = np.stack([left[ranks], right[ranks]], 1)
-        first[ends[::-1].reshape(-1)] = np.repeat(ranks[::-1], 2)  # the last that is written is the cheapest
+        first[ends[::-1].reshape(-1)] = np.repeat(ranks[::-1], 2)  # the cheapest pair is written last
         best = ranks[(first[ends] == ranks[:, None]).all(1)]
         taken[left[best]] = taken[right[best]] = True
         chosen = np.sort(np.concatenate([chosen, best]))[:limit]
@@ -107,8 +108,9 @@ def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Int
 def reduce_to(cloud: Cloud, count: int) -> Cloud:
     """Merge pairs in rounds until at most ``count`` Gaussians are left.
 
-    A round takes as many pairs as possible. Taking fewer lets cheap regions grow while the rest stays unmerged, and
-    renders worse: on a real capture by 0.6 dB at a third of the Gaussians a round, by 1.6 dB at a sixth.
+    A round merges as many pairs as possible. With fewer pairs per round cheap regions grow while the rest remains
+    unmerged, and renders are worse: on a real capture by 0.6 dB with a third of the Gaussians per round, and by 1.6 dB
+    with a sixth.
     """
     while len(cloud) > max(count, 1):
         left, right, costs = neighbor_pairs(cloud)

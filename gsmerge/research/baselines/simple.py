@@ -1,4 +1,4 @@
-"""Baselines of a few lines: the input unmerged or fitted, pruned, merged over blocks, or by splat-transform."""
+"""Short baselines: the input unmerged or fitted, pruned, merged by superpixels, or merged by splat-transform."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from gsmerge.stages.encode import encode
 from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Cameras, Decoded, Gaussians, Groups
 
-MAX_TILED = 2_000_000  # Gaussians in the tiled views under way: each is as large as they are
+MAX_TILED = 2_000_000  # Gaussians in all tiled views in memory; a tiled view is as large as its Gaussians
 
 
 def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Return all Gaussians, whatever the count."""
+    """Return all Gaussians; ``count`` is ignored."""
     return prepared.scene.file_gaussians
 
 
 def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Run the full fit on the input without merging, with the steps or time of our own fit, for comparison.
+    """Run the full fit on the input without merging, with the steps or time of gsmerge's own fit, for comparison.
 
-    Gaussians that no photo shows are replaced by others, so the number of Gaussians stays, whatever the count.
+    Gaussians that no photo shows are replaced by new ones, so their number does not change; ``count`` is ignored.
     """
     gaussians = prepared.scene.file_gaussians
     start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")
@@ -44,9 +44,9 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def prune(importance: Callable[[Gaussians, Cameras], np.ndarray], prepared: Prepared, _: Plan, count: int) -> Gaussians:
-    """Keep the ``count`` Gaussians of the largest ``importance [n]``, unchanged, in order; among equal ones the first.
+    """Keep the ``count`` Gaussians with the largest ``importance [n]``, unchanged and in order; first ones if equal.
 
-    Importance is for instance opacity, or the contribution to the views (Mini-Splatting).
+    The importance is, for example, the opacity or the contribution to the views (Mini-Splatting).
     """
     gaussians = prepared.scene.file_gaussians
     with stage("reduce"):
@@ -71,7 +71,7 @@ def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
 
 def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Keep ``count`` random Gaussians, unchanged and in order; the seed decides which."""
+    """Keep ``count`` random Gaussians, chosen by the seed, unchanged and in order."""
     gaussians = prepared.scene.file_gaussians
     with stage("reduce"):
         rng = np.random.default_rng(plan.seed)
@@ -81,11 +81,11 @@ def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 def merge_superpixels(
     segmentation: str, rule: Literal["depth", "paper"], prepared: Prepared, plan: Plan, count: int
 ) -> Gaussians:
-    """Merge superpixels, equally many per view, into a Gaussian each, without matching across views.
+    """Merge each superpixel into one Gaussian, without matching across views; all views have equally many superpixels.
 
-    Empty superpixels are left out. By the ``rule`` "paper" Gaussians are those of its baseline without a network ("Mom.
-    Match."): opacity-weighted mean and the spread of the members' means (eq. teacher_mean, teacher_cov). The paper
-    states no opacity; the members' mean is taken.
+    Empty superpixels are left out. The ``rule`` "paper" is the paper's baseline without a network ("Mom. Match."): the
+    opacity-weighted mean and covariance of the members' means (eq. teacher_mean, teacher_cov). The paper states no
+    opacity, so the mean opacity of the members is used.
     """
     scene = prepared.scene
     each, more = divmod(count, len(scene))
@@ -101,10 +101,10 @@ def merge_superpixels(
 
 
 def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge by PlayCanvas' splat-transform, an installed program: ``-d COUNT`` on the CPU, with its own defaults.
+    """Merge with PlayCanvas' splat-transform, an installed program: ``-d COUNT`` on the CPU, with its own defaults.
 
-    The input is returned if it has at most ``count`` Gaussians. Nothing is downloaded. Only the run of the program
-    counts as time, start-up included, not the transfer of Gaussians.
+    The input is returned if it has at most ``count`` Gaussians. Nothing is downloaded. The measured time is that of the
+    program with its start-up, without the transfer of Gaussians.
     """
     gaussians = prepared.scene.file_gaussians
     if len(gaussians) <= count:

@@ -1,8 +1,8 @@
-"""AnySplat's rule (Jiang et al. 2025): one Gaussian for each voxel, a softmax-weighted mean of what lies in it.
+"""Merge by AnySplat's rule (Jiang et al. 2025): one Gaussian for each voxel, a softmax-weighted mean of its Gaussians.
 
-The means run over the parameters as a network puts them out: logarithms of scales, logits of opacities. AnySplat
-weighs with the softmax of a confidence that no file stores; opacity replaces it. Bisection gives the size of the
-voxels, so the count is met from below.
+The means are those of the parameters that a network outputs: logarithms of scales, and logits of opacities. AnySplat's
+weights are the softmax of a confidence that no file stores; it is replaced by the opacity. The size of the voxels is
+found by bisection, so that the count is met from below.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from gsmerge.plan import Plan
 from gsmerge.runtime.record import choose, stage
 from gsmerge.types import Gaussians
 
-BITS = 21  # of a voxel's number along each axis; what lies farther out is in the outermost ones
-FINEST = -17.0  # octaves of the canonical unit: there the outermost voxels lie 8 units away, farther for larger ones
+BITS = 21  # bits of a voxel's number along each axis; Gaussians farther out are in the outermost voxels
+FINEST = -17.0  # smallest size, octaves of the canonical unit; at this size the outermost voxels lie 8 units away
 PRECISION = 1e-4  # octaves
-MIN_OPACITY, MIN_SCALE = 1e-6, 1e-12  # least that logits and logarithms are taken of
+MIN_OPACITY, MIN_SCALE = 1e-6, 1e-12  # least values before logits and logarithms
 
 
 def voxel_keys(means: np.ndarray, size: float) -> np.ndarray:
-    """Number the voxels that means ``[n,3]`` round to, ``[n]`` int64; voxels are ``size`` wide."""
+    """Return the numbers ``[n]`` int64 of the voxels that means ``[n,3]`` round to; voxels are ``size`` wide."""
     half = 1 << (BITS - 1)
     index = np.clip(np.rint(means / size), -half, half - 1).astype(np.int64) + half
     return (index[:, 0] << 2 * BITS) | (index[:, 1] << BITS) | index[:, 2]
@@ -51,7 +51,7 @@ def voxel_size(means: np.ndarray, count: int) -> float:
 def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
     """Merge the Gaussians of each voxel into one, weighted by exp(opacity), in the order of the keys ``[n]``.
 
-    Rotations are averaged whatever the sign of their quaternions (Markley et al. 2007).
+    The average of rotations does not depend on the signs of their quaternions (Markley et al. 2007).
     """
     _, cells = np.unique(keys, return_inverse=True)
     means, quats, scales, opacities, sh0, shN = (

@@ -1,1 +1,1 @@
-"""Runs over a grid of settings as jobs of a batch, and figures and a page of their measurements."""
+"""Run a grid of settings as jobs of a batch, and make figures and a page of the measurements."""

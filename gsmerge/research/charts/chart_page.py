@@ -1,4 +1,4 @@
-"""One self-contained HTML file: tables, figures, pictures to compare, commands, environment."""
+"""Make a self-contained HTML file with tables, figures, pictures to compare, commands and environment."""
 
 from __future__ import annotations
 
@@ -8,22 +8,13 @@ from pathlib import Path
 from gsmerge.pages.page import PICTURES, data_uri, render_template
 from gsmerge.report import csv_text
 from gsmerge.research.charts.figures import Figure
-from gsmerge.research.charts.lines import (
-    METRICS,
-    MIN_SCENES,
-    PARTS,
-    Interval,
-    Results,
-    line_key,
-    ours_first,
-    size_label,
-)
-from gsmerge.research.charts.measure_run import INPUT, MAX_ERROR, SCORES, RunRecord, judging_notes, picture_path
+from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Results, line_key, own_first, size_label
+from gsmerge.research.charts.measure_run import INPUT, MAX_ERROR, SCORES, RunRecord, list_held_out_notes, picture_path
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.settings.compact import OURS
 
-MAX_SCENES = 6  # with pictures on the page
-MAX_RESULTS = 5  # pictures of a view in addition to the photo and the input
+MAX_SCENES = 6  # most scenes with pictures on the page
+MAX_RESULTS = 5  # most pictures of a view in addition to the photo and the input
 COSTS = ("Gaussians", "Kept", "File", "Seconds", "ms/view")
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows
 
@@ -31,23 +22,23 @@ Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows
 def make_page(
     records: Sequence[RunRecord], figures: Sequence[Figure], drawings: Mapping[str, bytes], folder: Path, command: str
 ) -> str:
-    """Make the HTML page of charts; it loads nothing from the network.
+    """Make the HTML page of charts, which loads nothing from the network.
 
-    ``drawings`` are the SVG of each figure by name; ``command`` is the command line that draws the page again.
+    ``drawings`` are the SVG of each figure by name. ``command`` is the command line that draws the page again.
     """
     results = Results(records)
     failed = [record for record in records if record.error is not None]
     scenes = list(dict.fromkeys(record.scene for record in records))
     names = ", ".join(scenes[:12]) + (", ..." if len(scenes) > 12 else "")
     words = f"{len(records)} runs on {len(scenes)} scene{'' if len(scenes) == 1 else 's'}: {names}"
-    words = "; ".join([words, *judging_notes(records)])
+    words = "; ".join([words, *list_held_out_notes(records)])
     return render_template(
         "charts.html",
         policy=PICTURES,
         names=names,
         words=words + (f"; {len(failed)} failed" if failed else ""),
         part=PARTS[results.part],
-        doubt=results.doubt,
+        doubt=results.caveat,
         results=_results(results),
         figures=[(figure, data_uri(drawings[figure.name], "image/svg+xml")) for figure in figures],
         views=_views(results, folder),
@@ -100,11 +91,11 @@ def _results(results: Results) -> Table:
 
 
 def _views(results: Results, folder: Path) -> list[tuple[str, list[tuple[str, str]], int]]:
-    """List views with their title, named pictures of input and results, and the number of our own pictures."""
+    """List views with their title, named pictures of input and results, and the number of gsmerge's own pictures."""
     views = []
     for scene in list(dict.fromkeys(record.scene for record in results.runs))[:MAX_SCENES]:
         records = [r for r in results.runs if r.scene == scene and r.views_asked == results.views and r.pictures]
-        typical = ours_first(r for r in records if results.is_typical(r))[:MAX_RESULTS]
+        typical = own_first(r for r in records if results.is_typical(r))[:MAX_RESULTS]
         chosen = [*(r for r in records if r.method == INPUT), *typical]
         for i, view in enumerate(chosen[0].pictures if chosen else ()):
             files = [("photo", picture_path(folder, f"{scene}/photo", i, "photo"))]

@@ -1,4 +1,4 @@
-"""Figures of runs, drawn in one style, with colours that the colour-blind tell apart."""
+"""Draw figures of runs in one style, with colours that colour-blind people can distinguish."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from gsmerge.io import atomic_output
 from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results
 from gsmerge.research.charts.measure_run import INPUT
 
-MAX_LINES = 12  # of a figure; of more, one for each method is drawn
+MAX_LINES = 12  # most lines of a figure; if there are more, one line for each method is drawn
 
 PANEL_WIDTH, SINGLE_WIDTH, HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
-KEY_WIDTH, KEY_LINE = 2.3, 0.135  # of the key: inches, inches per line
+KEY_WIDTH, KEY_LINE = 2.3, 0.135  # width of the legend, and height of its lines, inches
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7B4173", "#8C6D31")  # Okabe, Ito 2008
-MARKERS = "osD^vPX"  # as many as have no divisor in common with the colours
-DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # the next for every round through the colours
+MARKERS = "osD^vPX"  # their number is coprime to the number of colours
+DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # each cycle through the colours takes the next one
 RC: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.grid": True,
@@ -54,24 +54,24 @@ class Panel:
     """One pair of axes with lines."""
 
     y_label: str  # with unit
-    higher: bool  # whether higher is better
+    higher: bool  # True if higher is better
     lines: tuple[Line, ...]
-    reference: float | None = None  # the level of the input
+    reference: float | None = None  # value of the input
 
 
 @dataclass(frozen=True)
 class Figure:
     """A chart and its table: lines over a common x."""
 
-    name: str  # of its files
-    title: str  # of the section
+    name: str  # name of its files
+    title: str  # title of its section
     caption: str
     x_label: str  # with unit
-    head: tuple[str, ...]  # of the table of its numbers
-    rows: tuple[tuple[str, ...], ...]  # of the same
+    head: tuple[str, ...]  # head of the table of its numbers
+    rows: tuple[tuple[str, ...], ...]  # rows of this table
     panels: tuple[Panel, ...]  # side by side
-    log: bool  # whether x is logarithmic
-    labelled: bool = False  # whether the sizes stand at the points of our first line
+    log: bool  # True if x is logarithmic
+    labelled: bool = False  # True to write the sizes at the points of gsmerge's first line
 
 
 def make_figures(results: Results) -> list[Figure]:
@@ -112,7 +112,7 @@ def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[
 
 
 def _numbers(interval: Interval) -> list[str]:
-    """Write a mean and the ends of its interval, if there are enough scenes for one."""
+    """Write a mean, and the ends of its interval if there are enough scenes."""
     ends = [interval.low, interval.high] if interval.count >= MIN_SCENES else []
     return [f"{value:.5g}" for value in (interval.mean, *ends)] + [""] * (2 - len(ends))
 
@@ -128,7 +128,7 @@ def choose_lines(panel: Panel) -> set[str]:
 
 
 def _quality_panels(results: Results, lines_of: Callable[[str], list[Line]], *, level: bool) -> list[Panel]:
-    """Make a panel for each metric, with the level of the input at the typical number of views."""
+    """Make a panel for each metric, with the value of the input at the typical number of views."""
     panels = []
     for name in results.metrics:
         score, metric = f"{name}_{results.part}", METRICS[name]
@@ -140,19 +140,19 @@ def _quality_panels(results: Results, lines_of: Callable[[str], list[Line]], *, 
 
 
 def _against(results: Results, cost: str, name: str, words: tuple[str, str, str]) -> Figure | None:
-    """Plot quality against a cost; ``words``: its title, description and label."""
+    """Plot quality against a cost; ``words`` are its title, description and label."""
     title, described, label = words
     panels = _quality_panels(results, lambda score: results.by_size(cost, score), level=True)
-    caption = f"{results.doubt}Quality against {described}. Measured on {PARTS[results.part]}."
+    caption = f"{results.caveat}Quality against {described}. Measured on {PARTS[results.part]}."
     figure = _curves(name, title, caption, label, panels, log=True)
     return figure and replace(figure, labelled=cost == "seconds")
 
 
 def _over_views(results: Results) -> Figure | None:
     panels = _quality_panels(results, results.by_views, level=False)
-    panels = [panel for panel in panels if any(line.ours for line in panel.lines)]
+    panels = [panel for panel in panels if any(line.is_own for line in panel.lines)]
     caption = (
-        f"{results.doubt}Quality against the number of input views, evenly spread; held-out views lie midway between"
+        f"{results.caveat}Quality against the number of input views, evenly spread; held-out views lie midway between"
         f" them where their order is known. Measured on {PARTS[results.part]}. Size:"
         f" {results.size or 'the default superpixels'}."
     )
@@ -160,13 +160,13 @@ def _over_views(results: Results) -> Figure | None:
 
 
 def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, bytes]:
-    """Draw figures as ``NAME.png`` and ``NAME.svg``, the same numbers as the same bytes; return the SVG by name."""
+    """Draw figures as ``NAME.png`` and ``NAME.svg``; equal numbers give equal bytes. Return the SVG by name."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = dict.fromkeys((line.name, line.ours) for f in figures for panel in f.panels for line in panel.lines)
+    names = dict.fromkeys((line.name, line.is_own) for f in figures for panel in f.panels for line in panel.lines)
     drawn, styles = {}, line_styles(names)
     for figure in figures:
         with matplotlib.rc_context():
-            matplotlib.rcdefaults()  # independent of the user's own settings
+            matplotlib.rcdefaults()  # the user's own settings have no effect
             matplotlib.rcParams.update(RC)
             drawing = draw_curves(figure, styles)
             for suffix, unknown in (("png", ("Software",)), ("svg", ("Date", "Creator", "Format", "Type"))):
@@ -182,12 +182,12 @@ Style = dict[str, Any]  # arguments of a line
 
 
 def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
-    """Make a style for each line by name; our own lines are broader and in front."""
+    """Make a style for each line by name; gsmerge's own lines are broader and in front."""
     styles: dict[str, Style] = {INPUT: {"color": "#555555", "ls": (0, (2, 2)), "marker": "s", "lw": 1.0, "zorder": 2}}
-    for i, (name, ours) in enumerate(line for line in names if line[0] != INPUT):
+    for i, (name, is_own) in enumerate(line for line in names if line[0] != INPUT):
         dash = DASHES[i // len(COLORS) % len(DASHES)]
         look = {"color": COLORS[i % len(COLORS)], "ls": dash, "marker": MARKERS[i % len(MARKERS)]}
-        styles[name] = {**look, "lw": 1.5 if ours else 1.1, "zorder": 4 + ours}
+        styles[name] = {**look, "lw": 1.5 if is_own else 1.1, "zorder": 4 + is_own}
     return styles
 
 
@@ -224,8 +224,8 @@ def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
 
 
 def _label_sizes(axes: Axes, panel: Panel) -> None:
-    """Write the sizes at the points of our first line."""
-    for point in next((line.points for line in panel.lines if line.ours and len(line.points) > 1), ()):
+    """Write the sizes at the points of gsmerge's first line."""
+    for point in next((line.points for line in panel.lines if line.is_own and len(line.points) > 1), ()):
         axes.annotate(
             _plain(point.label), (point.x, point.y.mean), (0, -9), textcoords="offset points", ha="center", fontsize=6
         )

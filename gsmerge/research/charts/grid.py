@@ -1,4 +1,4 @@
-"""Grid of runs: lists of settings, whose product over scenes makes the jobs of a batch."""
+"""Make the jobs of a batch from a grid of settings: every combination of the listed values on every scene."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from gsmerge.settings.compact import OURS, RECIPES, CompactOptions
 from gsmerge.settings.setting import Settings, join_words, setting, settings_of
 
 ALL = "all"  # word for all views
-FITTED = {"unmerged-fit": ("effort",)}  # settings of ours that baselines have, too
+FITTED = {"unmerged-fit": ("effort",)}  # settings of gsmerge that also apply to a baseline
 NUMBERS = ("k", "budget", "superpixels", "views")  # lists whose values may be numbers
-SETTINGS = ("k", "segmentation", "fit", "effort", "match")  # whose lists are multiplied; SIZES stand side by side
-MAX_NAME = 100  # characters of a run in names of files
+SETTINGS = ("k", "segmentation", "fit", "effort", "match")  # lists that are combined; the lists of SIZES are joined
+MAX_NAME = 100  # most characters of a run in names of files
 
 
 @dataclass(frozen=True)
 class SettingsGrid(Settings):
-    """Lists of values for settings; every combination is run. What has no list is as usual, or as a recipe says."""
+    """Lists of values for settings; every combination is run. Other settings are those of the defaults or a recipe."""
 
     method: tuple[str, ...] = setting((OURS,), "Methods: gsmerge and baselines.", filled=True, unique=True)
     k: tuple[int, ...] = setting((), "Gaussians per superpixel: 1 to 8.", unique=True)
@@ -41,7 +41,7 @@ class SettingsGrid(Settings):
     superpixels: tuple[int | str, ...] = setting((), "Superpixels per view, such as 3000,4.4%, next to the budgets.",
         unique=True)  # fmt: skip
     segmentation: tuple[str, ...] = setting((), "Superpixel methods.", unique=True)
-    fit: tuple[str, ...] = setting((), "What is fitted: full, none.", unique=True)
+    fit: tuple[str, ...] = setting((), "Kind of fit: full, none.", unique=True)
     effort: tuple[str, ...] = setting((), "Amount of work: draft, fast, default, best.", unique=True)
     match: tuple[str, ...] = setting((), "Merging across views: overlap, aabb, none.", unique=True)
     views: tuple[int | Literal["all"], ...] = setting((ALL,), "Numbers of input views, evenly spread; all for all.",
@@ -56,7 +56,7 @@ class SettingsGrid(Settings):
 
 
 def parse_grid(pairs: Sequence[str], fixed: Mapping[str, Any] | None = None) -> SettingsGrid:
-    """Make a grid of pairs NAME=A,B, the names those of :class:`SettingsGrid`; UsageError for impossible values."""
+    """Make a grid from pairs NAME=A,B with names of :class:`SettingsGrid`; UsageError for impossible values."""
     values: dict[str, tuple[Any, ...]] = {}
     for pair in pairs:
         name, _, text = pair.partition("=")
@@ -78,17 +78,18 @@ def parse_grid(pairs: Sequence[str], fixed: Mapping[str, Any] | None = None) -> 
 def list_settings(grid: SettingsGrid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
     """List (method, settings) of every run on one scene, the unmerged input first; also notes on combinations left out.
 
-    Only settings that differ from the defaults are set; for ours these are a fixed recipe's, and the lists go before.
-    Baselines do not have most settings and run once per size, or once where they keep all Gaussians.
+    Only settings that differ from the defaults are listed. The defaults of gsmerge are those of a fixed recipe, if
+    there is one; lists take precedence over it. Baselines lack most settings. They run once per size, or once if they
+    keep all Gaussians.
     """
     sizes: list[dict[str, Any]] = [{name: size} for name in SIZES for size in getattr(grid, name)]
     lists, fixed = [getattr(grid, name) or (None,) for name in SETTINGS], grid.fixed
     defaults = CompactOptions().to_dict()
-    ours = {**defaults, **RECIPES.get(str(fixed.get("recipe")), {})}
+    defaults_of_gsmerge = {**defaults, **RECIPES.get(str(fixed.get("recipe")), {})}
     runs = {describe(INPUT, {}, None): (INPUT, dict[str, Any]())}
     repeated = 0
     for method, *values, size in product(grid.method, *lists, sizes or [{}]):
-        names, usual = (SETTINGS, ours) if method == OURS else (FITTED.get(method, ()), defaults)
+        names, usual = (SETTINGS, defaults_of_gsmerge) if method == OURS else (FITTED.get(method, ()), defaults)
         settings = {} if method in (INPUT, *ONE_SIZE) else dict(size)
         chosen = zip(SETTINGS, values, strict=True)
         settings |= {name: value for name, value in chosen if name in names and value not in (None, usual[name])}
@@ -101,7 +102,7 @@ def list_settings(grid: SettingsGrid) -> tuple[list[tuple[str, dict[str, Any]]],
 
 
 def _options_of(method: str, settings: Mapping[str, Any], seed: int) -> CompactOptions:
-    """Make the options of a run; a UsageError if the library does not take a setting, or a program is missing."""
+    """Make the options of a run; raise UsageError if a setting is invalid or a program is missing."""
     from gsmerge.compaction.methods import find_method
 
     choice = {} if method in (OURS, INPUT) else {"method": method}
@@ -117,12 +118,12 @@ def _options_of(method: str, settings: Mapping[str, Any], seed: int) -> CompactO
 class ChartScene:
     """A scene to run, before it is read."""
 
-    path: Path  # the ``.ply``, or the folder that it is in
-    name: str  # short name, different for every scene of a grid
+    path: Path  # the ``.ply``, or its folder
+    name: str  # short name, unique in a grid
     targets: Path | None  # cameras of held-out views
     target_images: Path | None  # folder of their photos; None: found by their cameras
-    num_views: int | None  # views of its camera file, an upper bound for those of the scene; None if unknown
-    sha256: str  # of everything that is read
+    num_views: int | None  # number of views in its camera file, an upper bound for the scene; None if unknown
+    sha256: str  # hash of all files that are read
 
 
 def find_sources(
@@ -130,9 +131,9 @@ def find_sources(
 ) -> list[ChartScene]:
     """Find scenes as ``gsmerge batch`` does, and hash all files of each.
 
-    ``targets``, cameras of held-out views, and ``target_images``, the folder of their photos, are one path for all or a
-    template with ``{scene}`` (as given), ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it. A
-    SceneError if a file is missing, a UsageError if a template holds another name.
+    ``targets`` are the cameras of held-out views, and ``target_images`` is the folder of their photos. Each is one path
+    for all scenes, or a template with ``{scene}`` (as given), ``{parent}`` (its folder) and ``{stem}`` (its name
+    without extension). Raises SceneError if a file is missing, and UsageError if a template has another name.
     """
     scenes = list({main_file(scene).resolve(): scene for scene in find_scenes(arguments, out)}.values())
     sources = []
@@ -143,7 +144,7 @@ def find_sources(
         if cameras is not None:
             if not cameras.exists():
                 raise SceneError(cameras, f"expected cameras of held-out views of {scene}, found nothing")
-            # other files of a folder of cameras, such as results, do not count
+            # other files in a folder of cameras, such as results, are ignored
             inside = find_cameras(cameras) if cameras.is_dir() and not is_colmap(cameras) else None
             read += [inside or cameras, *photos_of(cameras)]
         read += [] if photos is None else [photos]
@@ -155,7 +156,7 @@ def find_sources(
 
 
 def scene_names(scenes: Sequence[Path]) -> list[str]:
-    """Name each scene by its file or folder, with as many parent folders as make the names differ."""
+    """Name each scene by its file or folder, with as many parent folders as are needed to make the names unique."""
     parts = [(*scene.absolute().parent.parts[1:], stem_of(scene.absolute())) for scene in scenes]
     for depth in range(1, max(map(len, parts), default=0)):
         names = ["/".join(part[-depth:]) for part in parts]
@@ -169,7 +170,7 @@ def make_jobs(
 ) -> tuple[list[Job], list[str]]:
     """Make the jobs of a grid, scene by scene, and notes on combinations left out.
 
-    ``command``: the command line, for the records. A UsageError if the library does not take a setting.
+    ``command`` is the command line for the records. Raises UsageError if a setting is invalid.
     """
     combinations, notes = list_settings(grid)
     counts = [None if count == ALL else int(count) for count in grid.views]
@@ -180,7 +181,7 @@ def make_jobs(
     jobs: list[Job] = []
     for source in sources:
         most = source.num_views or math.inf
-        limit = most - 1 if None in counts else most  # as many as there are: the run of all
+        limit = most - 1 if None in counts else most  # the run with all views is listed already
         runs = [choice for choice in chosen if (choice[2] or 0) <= limit]
         if len(runs) < len(chosen):
             few = len(chosen) - len(runs)
@@ -188,7 +189,7 @@ def make_jobs(
         num_gaussians, num_rest = estimate_counts(scene_plys(source.path))
         for method, settings, views, options in runs:
             label = describe(method, settings, views)
-            name = re.sub(r"[^\w.%+=, -]", "_", label)[:MAX_NAME]  # which file systems and shells take
+            name = re.sub(r"[^\w.%+=, -]", "_", label)[:MAX_NAME]  # valid in file systems and shells
             name = name if name == label else f"{name} {digest({'label': label})[:6]}"
             output = f"{source.name}/{name}"
             record = RunRecord(source.name, label, output, source.sha256, method, settings, views, command)

@@ -1,4 +1,4 @@
-"""Lines over scenes from records: which runs belong together, and means with intervals."""
+"""Make lines of figures from records: group runs, and compute means over scenes with intervals."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from gsmerge.research.charts.measure_run import INPUT, RunRecord
 from gsmerge.settings.compact import OURS
 
 LEVEL = 0.95  # confidence of the intervals
-MIN_SCENES = 3  # scenes that an interval is shown of; that of two scenes is too wide to be of use
-MIN_SHARE = 0.5  # of the scenes that a point of a line must have
-MIN_SHARE_VIEWS = 0.4  # the same over the number of views: not all scenes have as many views
-TYPICAL_RATIO = 0.044  # share of the Gaussians: runs nearest it represent all sizes
-SIZES = ("budget", "superpixels")  # settings that say how many Gaussians there will be
+MIN_SCENES = 3  # least number of scenes of an interval; that of two scenes is too wide to be useful
+MIN_SHARE = 0.5  # share of the scenes that every point of a line must have
+MIN_SHARE_VIEWS = 0.4  # the same for figures over the number of views, since not all scenes have as many views
+TYPICAL_RATIO = 0.044  # typical share of the Gaussians; the runs nearest to it represent all sizes
+SIZES = ("budget", "superpixels")  # settings that define the number of Gaussians
 ONE_SIZE = ("unmerged", "unmerged-fit")  # methods that keep all Gaussians
-PARTS = {  # what scores are means over, the most meaningful first
+PARTS = {  # views and pixels that scores are means over, the most meaningful first
     "target_visible": "held-out views, pixels that the input views see",
     "target": "held-out views",
     "context_visible": "input views, pixels that they see",
@@ -37,8 +37,8 @@ class Metric:
     """Label, direction and decimals of a score."""
 
     label: str
-    higher: bool  # whether higher is better
-    digits: int  # decimals
+    higher: bool  # True if higher is better
+    digits: int  # number of decimals
 
 
 METRICS = {
@@ -54,9 +54,9 @@ class Interval:
     """A mean and its confidence interval."""
 
     mean: float  # over the scenes
-    low: float  # lower end of the interval; equal to the mean where there is only one scene
+    low: float  # lower end of the interval; equal to the mean if there is only one scene
     high: float  # upper end
-    count: int  # scenes
+    count: int  # number of scenes
 
 
 @dataclass(frozen=True)
@@ -73,15 +73,15 @@ class Point:
 class Line:
     """Points of one method with fixed settings, over sizes."""
 
-    name: str  # of the method and its settings
-    ours: bool  # whether it is ours, not a baseline's
+    name: str  # method and settings
+    is_own: bool  # True for gsmerge, False for a baseline
     points: tuple[Point, ...]  # by ascending size or number of views
 
 
 def mean_interval(values: Sequence[float]) -> Interval:
     """Compute the mean of at least one value with its two-sided t interval (Student 1908).
 
-    Few scenes make it wide: 12.7 standard errors for two.
+    With few scenes it is wide: 12.7 standard errors to each side for two.
     """
     if not len(values):
         raise ValueError("expected at least one value, got none")
@@ -96,8 +96,8 @@ def mean_interval(values: Sequence[float]) -> Interval:
 def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
     """Compute confidence intervals of the columns of ``values [scenes, conditions]``, with scene differences removed.
 
-    Scenes differ by several dB and conditions by tenths, so plain intervals would hide the conditions. Here every
-    scene's own mean is subtracted first (Cousineau 2005), with the correction for it (Morey 2008).
+    Scenes differ by several dB, but conditions by tenths, so plain intervals would hide the conditions. Here the mean
+    of every scene is subtracted first (Cousineau 2005), and the interval is corrected for that (Morey 2008).
     """
     num_scenes, num_conditions = values.shape
     if num_conditions == 1 or num_scenes == 1:
@@ -110,13 +110,13 @@ def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
 
 
 def line_key(record: RunRecord) -> LineKey:
-    """Return the key of a record's line: method, and settings other than the size."""
+    """Return the key of a record's line: the method, and all settings but the size."""
     settings = {name: value for name, value in record.settings.items() if name not in SIZES}
     return record.method, tuple(sorted(settings.items()))
 
 
 def size_label(record: RunRecord) -> str:
-    """Return the size that a run asked for as text; empty for the default."""
+    """Return the requested size of a run as text; empty for the default."""
     for name in SIZES:
         if name in record.settings:
             value = record.settings[name]
@@ -126,7 +126,7 @@ def size_label(record: RunRecord) -> str:
 
 
 def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
-    """Name every line by its method and the settings that tell the method's lines apart."""
+    """Name every line by its method and the settings in which the lines of the method differ."""
     names = {}
     for method, settings in keys:
         variants = [dict(other) for name, other in keys if name == method]
@@ -141,26 +141,26 @@ def _setting_label(name: str, value: Any) -> str:
     return {"k": f"K = {value}", "segmentation": str(value)}.get(name, f"{name} {value}")
 
 
-def ours_first(records: Iterable[RunRecord]) -> list[RunRecord]:
-    """Sort runs: our own first, then baselines, each by number of settings."""
+def own_first(records: Iterable[RunRecord]) -> list[RunRecord]:
+    """Sort runs: gsmerge's own first, then baselines, each by number of settings."""
     return sorted(records, key=lambda record: (record.method != OURS, len(line_key(record)[1])))
 
 
 class Results:
-    """Successful runs, with what tables and figures have in common.
+    """Successful runs, with values that tables and figures share.
 
     Attributes:
         runs: The runs.
         names: Name of each line; that of the input is its method.
-        part: What scores are means over: the most meaningful that nine of ten runs have.
-        metrics: Names of the metrics that were measured, of PSNR, SSIM and one LPIPS, VGG if possible.
-        views: Number of views asked for in figures over other quantities: all (None), or the largest.
-        size: Size in figures over other quantities: whose results are nearest the typical share of the input.
+        part: Key of ``PARTS``: views and pixels of the scores, the most meaningful ones that nine of ten runs have.
+        metrics: Names of the measured metrics: PSNR, SSIM and one LPIPS, VGG if possible.
+        views: Requested number of views in figures over other quantities: all (None), or the largest.
+        size: Size in figures over other quantities: the one nearest to the typical share of the input.
     """
 
     def __init__(self, records: Iterable[RunRecord]) -> None:
         self.runs = [record for record in records if record.error is None]
-        keys = dict.fromkeys(map(line_key, ours_first(self.runs)))
+        keys = dict.fromkeys(map(line_key, own_first(self.runs)))
         self.names = {key: INPUT for key in keys if key[0] == INPUT}
         self.names |= line_names([key for key in keys if key[0] != INPUT])
         counts = {part: sum(r.value(f"psnr_{part}") is not None for r in self.runs) for part in PARTS}
@@ -176,8 +176,8 @@ class Results:
         self.size = min(ratios, key=lambda size: (abs(float(np.mean(ratios[size]))), size), default="")
 
     @property
-    def doubt(self) -> str:
-        """Return what captions begin with where no view was held out; empty where some were."""
+    def caveat(self) -> str:
+        """Beginning of captions if no view was held out; empty otherwise."""
         return "" if self.part.startswith("target") else "No view was held out: fits have seen these. "
 
     def name(self, record: RunRecord) -> str:
@@ -185,7 +185,7 @@ class Results:
         return self.names[line_key(record)]
 
     def is_typical(self, record: RunRecord) -> bool:
-        """Return whether a run has the typical size, or its method only one size."""
+        """Return True if a run has the typical size, or if its method has only one size."""
         return record.method != INPUT and (size_label(record) == self.size or record.method in ONE_SIZE)
 
     def by_size(self, x: str, y: str) -> list[Line]:
@@ -215,9 +215,9 @@ def make_lines(
     y: str,
     min_share: float = MIN_SHARE,
 ) -> list[Line]:
-    """Make lines from records, with points that cover at least ``min_share`` of the scenes, all the same scenes.
+    """Make lines from records; all points cover the same scenes, at least ``min_share`` of all scenes.
 
-    ``order``, ``x`` and ``y`` are names of values of a record; costs x must be positive.
+    ``order``, ``x`` and ``y`` are names of values of a record. Costs x must be positive.
     """
     cells: dict[tuple[LineKey, str], dict[str, tuple[float, float]]] = {}
     for record in sorted(records, key=lambda record: record.value(order) or 0.0):
@@ -248,13 +248,13 @@ def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[s
 
 
 def _mean_cost(points: ByScene) -> float:
-    """Average positive costs geometrically, exactly where all are equal."""
+    """Compute the geometric mean of positive costs; it is exact if all are equal."""
     costs = [x for x, _ in points.values()]
     return costs[0] if min(costs) == max(costs) else float(np.exp(np.mean(np.log(costs))))
 
 
 def _intervals(columns: Sequence[ByScene]) -> list[Interval]:
-    """Compute an interval for each column, with scene differences removed; without a width if the scenes differ."""
+    """Compute an interval for each column, with scene differences removed; of width 0 if the columns' scenes differ."""
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
         return paired_intervals(np.array(values, np.float64))

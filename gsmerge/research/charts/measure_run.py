@@ -1,4 +1,4 @@
-"""One run of a grid: merge a scene, or keep it unmerged, measure the result, and keep pictures and a record."""
+"""Execute one run of a grid: merge a scene, or keep it unmerged, measure the result, and save pictures and a record."""
 
 from __future__ import annotations
 
@@ -42,46 +42,47 @@ from gsmerge.types import Gaussians, Scene, Views
 from gsmerge.version import __version__
 
 HELD_OUT = "without --targets no run sees these photos, by which all are judged"
-RECORD_VERSION = 2  # of what a run records; another version is run again
+RECORD_VERSION = 2  # version of the records; runs with other versions are run again
 SCORING = ("score", "input")  # stages of a run that only measure
 MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
 SCORES = tuple(map("".join, product(MEASURES, ("_context", "_target"), ("", "_visible"))))
 PACKAGES = ("torch", "numpy", "cv2")
-MAX_TIMED = 4  # views that are rendered for the time
-MAX_PICTURES, MAX_WIDTH, QUALITY = 2, 640, 88  # views of a run with pictures, their pixels, quality of the JPEG files
-MAX_ERROR = 0.25  # mean absolute error over the channels at the top of the error maps' scale
+MAX_TIMED = 4  # most views whose rendering is timed
+MAX_PICTURES, MAX_WIDTH, QUALITY = 2, 640, 88  # views of a run with pictures, their width in pixels, JPEG quality
+MAX_ERROR = 0.25  # mean absolute error over the channels at the top of the scale of error maps
 MAX_DB = 100.0  # PSNR of equal pictures, since JSON has no infinity
-_tried: set[tuple[Any, ...]] = set()  # kinds of runs that this process has done before
+_warm_kinds: set[tuple[Any, ...]] = set()  # kinds of runs that this process has executed before
 
 
 @dataclass(frozen=True)
 class RunRecord:
     """Record of one finished run, successful or not.
 
-    ``scores`` are means over the views of a split, by names such as ``psnr_target_visible``: ``context`` are the views
-    that the scene was made of, ``target`` held-out ones; ``_visible`` counts only pixels that the context views see.
+    ``scores`` are means over the views of a split, by names such as ``psnr_target_visible``. ``context`` are the views
+    that the scene was made of, and ``target`` are held-out views. ``_visible`` counts only pixels that the context
+    views see.
     """
 
     scene: str  # its name
     label: str  # method, settings and number of views in words
     output: str = ""  # name of its files in the folder
-    scene_sha256: str = ""  # hash of everything that was read
+    scene_sha256: str = ""  # hash of all files that were read
     method: str = ""  # gsmerge, the name of a baseline, or input (the scene as it is)
-    settings: Mapping[str, Any] = field(default_factory=dict)  # settings by flat name; the rest are defaults
-    views_asked: int | None = None  # number of views that was asked for; None: all
+    settings: Mapping[str, Any] = field(default_factory=dict)  # settings by flat name; others have defaults
+    views_asked: int | None = None  # requested number of views; None: all
     command: str = ""  # the command line of the run
     environment: Mapping[str, str] = field(default_factory=dict)  # processor, threads and versions
-    views: int | None = None  # views that went in
-    num_input: int | None = None  # Gaussians of those views
-    count: int | None = None  # Gaussians of the result
+    views: int | None = None  # number of input views
+    num_input: int | None = None  # number of Gaussians of those views
+    count: int | None = None  # number of Gaussians of the result
     bytes: int | None = None  # size of the result as a .ply
-    seconds: float | None = None  # wall time of the merge with everything but reading, writing and scoring
-    stages: Mapping[str, float] = field(default_factory=dict)  # the same by stage, scoring included
-    render_ms: float | None = None  # milliseconds that one view takes to render, the median
+    seconds: float | None = None  # wall time of the merge, without reading, writing and scoring
+    stages: Mapping[str, float] = field(default_factory=dict)  # wall time of each stage, including scoring
+    render_ms: float | None = None  # median time of rendering a view, milliseconds
     scores: Mapping[str, float] = field(default_factory=dict)
-    pictures: tuple[str, ...] = ()  # names of the views whose pictures were kept
-    notes: tuple[str, ...] = ()  # of the reader and of the run
-    error: str | None = None  # why the run failed, in one line; None if it did not
+    pictures: tuple[str, ...] = ()  # names of the views whose pictures were saved
+    notes: tuple[str, ...] = ()  # notes of the reader and of the run
+    error: str | None = None  # reason of a failure, in one line; None if the run succeeded
     record_version: int = RECORD_VERSION
 
     @property
@@ -91,7 +92,7 @@ class RunRecord:
 
     @property
     def percent(self) -> float | None:
-        """Share of the input's Gaussians that the result keeps, in per cent."""
+        """Percentage of the input's Gaussians that the result keeps."""
         return None if self.ratio is None else 100 * self.ratio
 
     def value(self, name: str) -> float | None:
@@ -107,8 +108,8 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-def _is_sound(name: str, value: Any) -> bool:
-    """Return whether a value read from JSON is of the kind of its field."""
+def _is_valid(name: str, value: Any) -> bool:
+    """Return True if a value from JSON has the type of its field."""
     default = getattr(BLANK, name)
     if isinstance(default, Mapping):
         words = () if name in ("stages", "scores") else (str, bool, NoneType)
@@ -124,7 +125,7 @@ BLANK = RunRecord("", "")
 def read_runs(folder: Path) -> tuple[list[RunRecord], list[str]]:
     """Read the newest record of each run in a folder; also return notes on records left out.
 
-    Skip records of other versions, and of scenes whose files have changed since.
+    Records of other versions, and of scenes whose files have changed since, are skipped.
     """
     newest: dict[str, RunRecord | None] = {}
     for _, line in each_line(folder / RECORDS):
@@ -142,13 +143,13 @@ def read_runs(folder: Path) -> tuple[list[RunRecord], list[str]]:
 
 
 def _read_record(record: Mapping[str, Any]) -> RunRecord | None:
-    """Read a run from the record of a batch; None if it is of another version or kind."""
+    """Read a run from the record of a batch; None for other versions or kinds of records."""
     scene, _, label = record["output"].rpartition("/")
     if record.get("status") == FAILED:
         return RunRecord(scene, label, error=str(record.get("error") or "unknown"))
     report, names = record.get("report"), [f.name for f in fields(RunRecord)]
     run = report.get("run") if isinstance(report, dict) and record.get("status") == DONE else None
-    if not isinstance(run, dict) or not all(name in run and _is_sound(name, run[name]) for name in names):
+    if not isinstance(run, dict) or not all(name in run and _is_valid(name, run[name]) for name in names):
         return None
     if run["record_version"] != RECORD_VERSION or run["error"] is not None:
         return None
@@ -157,7 +158,7 @@ def _read_record(record: Mapping[str, Any]) -> RunRecord | None:
 
 
 def picture_path(folder: Path, output: str, view: int, kind: str) -> Path:
-    """Return the path of a picture of a run or, with the output ``SCENE/photo``, of a scene; ``kind``: its type."""
+    """Return the path of a picture of a run or, with the output ``SCENE/photo``, of a scene; ``kind`` is its type."""
     return folder / f"{output}.{view}.{kind}.{'png' if kind == 'error' else 'jpg'}"
 
 
@@ -171,14 +172,14 @@ def describe(method: str, settings: Mapping[str, Any], views: int | None) -> str
 class ChartRun:
     """Run and measurement of one grid point on one scene; see :class:`gsmerge.batch.jobs.SceneCall`."""
 
-    record: RunRecord  # what is known beforehand
+    record: RunRecord  # values that are known before the run
     settings: CompactOptions  # all settings
-    measured: EvaluateOptions  # what is measured
+    measured: EvaluateOptions  # settings of the measurements
     targets: Path | None = None  # cameras of held-out views
     target_images: Path | None = None  # folder of their photos; None: found by their cameras
 
     def key(self, files: SceneFiles) -> str:
-        """Return a digest of everything that the measurements depend on; the record has the hash of the files."""
+        """Return a hash of everything that the measurements depend on; the record has the hash of the files."""
         run = asdict(replace(self.record, command=""))
         how = {"measured": asdict(self.measured), "seed": self.settings.seed, "tool_version": __version__}
         return digest({"run": run, **how})
@@ -204,9 +205,9 @@ class ChartRun:
         if method != INPUT:
             settings = replace(self.settings, threads=threads)
             kind = (method, *(self.record.settings.get(name) for name in ("fit", "segmentation", "k")))
-            if kind not in _tried:  # on two views, so that loading kernels does not count as time of the first run
+            if kind not in _warm_kinds:  # a run on two views, so that the measured time excludes the loading of kernels
                 compact(choose_views(scene, None, 2)[0], settings)
-                _tried.add(kind)
+                _warm_kinds.add(kind)
             done = compact(part, settings)
             gaussians, seconds = done.gaussians, done.report.seconds
             merge = sum(value for name, value in seconds.items() if name not in SCORING)
@@ -232,7 +233,7 @@ class ChartRun:
 def _load(
     files: SceneFiles, targets: Path | None, target_images: Path | None, sha256: str
 ) -> tuple[Scene, HeldOutViews | None, tuple[str, ...]]:
-    """Read a scene with its held-out views, once for several runs in a row; ``sha256`` is that of the files."""
+    """Read a scene with its held-out views, once for consecutive runs; ``sha256`` is the hash of the files."""
     load = load_files(files)
     if targets is not None:
         return load.scene, read_held_out(load, targets, target_images), tuple(load.notes)
@@ -243,14 +244,14 @@ def _load(
     return scene, held_out, (*load.notes, f"{HELD_OUT}: {names}")
 
 
-def judging_notes(records: Iterable[RunRecord]) -> list[str]:
-    """List the photos that judge the runs on each scene without targets, once a scene."""
+def list_held_out_notes(records: Iterable[RunRecord]) -> list[str]:
+    """List a note on the held-out photos of each scene without targets, which its runs are scored on."""
     notes = (f"{record.scene}: {note}" for record in records for note in record.notes if note.startswith(HELD_OUT))
     return list(dict.fromkeys(notes))
 
 
 def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:
-    """Take some photos out of a scene to judge its results by; of fewer than four none."""
+    """Hold out some photos of a scene to score its results on; none of fewer than four photos."""
     photos = scene.photo_views
     if len(photos) < LEAST_VIEWS or scene.images is None:
         return scene, None
@@ -262,9 +263,10 @@ def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:
 
 
 def choose_views(scene: Scene, held_out: HeldOutViews | None, count: int | None) -> tuple[Scene, Views | None]:
-    """Choose ``count`` evenly spread views of the scene, and the held-out views nearest to the middle between these.
+    """Choose ``count`` evenly spread views of the scene, and the held-out views nearest to the middle between them.
 
-    Without ``count`` all views are kept. All held-out views are kept if their order along the trajectory is unknown.
+    Without ``count`` all views are chosen. All held-out views are chosen if their order along the trajectory is
+    unknown.
     """
     if count is None or count >= len(scene):
         return scene, held_out
@@ -280,7 +282,7 @@ def measure(
 ) -> dict[str, float]:
     """Measure mean scores by name (``psnr_target_visible``, ...); names without a measurement are left out.
 
-    Without ``gaussians`` the scene's own are measured.
+    Without ``gaussians`` those of the scene are measured.
     """
     results = {} if gaussians is None else {"result": gaussians}
     evaluation = evaluate(scene, results, targets, replace(options, own=gaussians is None, fog=False))
@@ -300,8 +302,8 @@ def keep_pictures(
     """Write renders and error maps of a few views, and the photos.
 
     Returns the paths of renders and error maps, and the names of the views. The views are held-out views or, without
-    any, the scene's. ``scene`` and ``held_out`` have all views, so that all runs of a scene have pictures of the same
-    views.
+    any, views of the scene. ``scene`` and ``held_out`` have all views, so that all runs of a scene have pictures of the
+    same views.
     """
     views = scene if held_out is None else held_out
     photos, names = views.images, views.names

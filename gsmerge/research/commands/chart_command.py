@@ -1,4 +1,4 @@
-"""``gsmerge lab chart``: a grid of runs, charts of them and a page."""
+"""``gsmerge lab chart``: run a grid of settings, and make charts and a page of the results."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class ChartOptions(Settings):
     "dry_run",
 )  # fmt: skip
 def chart(args: opt.Args) -> None:
-    """Run settings over scenes, and draw charts and a page of all results; a second call goes on where one ended."""
+    """Run settings over scenes, and draw charts and a page of all results; a repeated call resumes the runs."""
     scenes, out = args.scenes or [], args.output
     if os.path.lexists(out) and not out.is_dir():
         raise UsageError(f"--output: expected a folder, found the file {out}")
@@ -98,9 +98,9 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
     with opt.usage_errors():
         measured = EvaluateOptions(nets, own.lpips_views, photo_side=own.photo_side)
         settings = CompactOptions().with_settings(run)
-        options = BatchOptions(settings, jobs=1, overwrite=own.rerun)  # so that no run slows another
+        options = BatchOptions(settings, jobs=1, overwrite=own.rerun)  # one job, so that no run slows another one
     sources = find_sources(scenes, args.output, args.targets, own.target_images)
-    words = ["gsmerge", "lab", "chart", *scenes, "--output", str(args.output)]  # the command line that does the same
+    words = ["gsmerge", "lab", "chart", *scenes, "--output", str(args.output)]  # the equivalent command line
     for name, value in args.given(("grid", "set", "targets")).items():
         for element in value if isinstance(value, list) else [value]:
             words += [f"--{name}", element]
@@ -114,13 +114,13 @@ def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     from gsmerge.research.charts.chart_page import make_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures
     from gsmerge.research.charts.lines import Results
-    from gsmerge.research.charts.measure_run import judging_notes, read_runs
+    from gsmerge.research.charts.measure_run import list_held_out_notes, read_runs
 
     out = args.output
     records, more = read_runs(out)
     if not records:
         raise UsageError(f"{out}: expected finished runs, found none; name scenes to run")
-    say_notes([*more, *judging_notes(records)], quiet=args.silent)
+    say_notes([*more, *list_held_out_notes(records)], quiet=args.silent)
     figures = make_figures(Results(records))
     drawings = draw_figures(figures, out / CHARTS)
     command = shlex.join(["gsmerge", "lab", "chart", "--output", str(out)])

@@ -1,4 +1,4 @@
-"""``gsmerge lab generate``: synthetic scenes."""
+"""``gsmerge lab generate``: make synthetic scenes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``gsmerge lab stress``: a user's own scene under bad conditions."""
+"""``gsmerge lab stress``: test a user's own scene under bad conditions."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ class StressFiles(Settings):
     opt.settings_option(CompactOptions, StressFiles, example="targets=FILE"),
 )
 def stress(args: opt.Args) -> None:
-    """Compact a scene under bad conditions, and say of each whether the result holds."""
+    """Compact a scene under bad conditions, and report for each if the required property holds."""
     from gsmerge.report import document_head
     from gsmerge.research.stress import stress as stress_scene
 
     settings, places = args.make(CompactOptions, StressFiles)
-    found = {name: None if path is None else Path(path) for name, path in vars(places).items()}
+    paths = {name: None if path is None else Path(path) for name, path in vars(places).items()}
     args.cameras, args.images = (None if p is None else opt.named_or_none(p) for p in (places.cameras, places.images))
     args.hint = None
     load = args.load(args.files(args.scene))
     require_views(load)
-    _, held_out, adapted = held_out_views(load, found["targets"], found["target_images"], None)
+    _, held_out, adapted = held_out_views(load, paths["targets"], paths["target_images"], None)
     notes = [*load.notes, *adapted]
     say_notes(notes, quiet=args.silent)
     names = None if args.cases is None else [name.strip() for name in args.cases.split(",")]

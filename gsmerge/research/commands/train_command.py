@@ -1,4 +1,4 @@
-"""``gsmerge lab train``: networks from scenes."""
+"""``gsmerge lab train``: train networks on scenes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OPTIONS = LazyFunction("gsmerge.research.training", "TrainOptions")
 
 @dataclass(frozen=True)
 class RunOptions(Settings):
-    """Settings of a run that say nothing of its networks."""
+    """Settings of a run that do not affect its networks."""
 
     cache: str | None = setting(None, "Folder for the prepared examples, which several runs may share; by default in "
         "the output.")  # fmt: skip
@@ -43,7 +43,7 @@ class RunOptions(Settings):
     opt.output("Folder of the checkpoints. A run in it is continued.", default=opt.REQUIRED),
 )  # fmt: skip
 def train(args: opt.Args) -> None:
-    """Train networks on scenes and their photos; after an interruption the same call goes on."""
+    """Train networks on scenes and their photos; after an interruption the same call resumes the run."""
     from gsmerge.report import document_head
     from gsmerge.research.training import TrainOptions, choose_device, prepare_shards, preset_options
     from gsmerge.research.training import train as train_networks
@@ -76,8 +76,8 @@ def train(args: opt.Args) -> None:
 def find_training_scenes(paths: Sequence[Path], out: Path, apart: Collection[Path] = ()) -> list[Path]:
     """Find the scenes in files and folders, each once; skip the output folder ``out``.
 
-    Scenes of ``apart``, for validation, are left out where a folder holds them, and kept where they are named.
-    SceneError if a path does not exist or has no scene, UsageError if no scene is left.
+    Scenes of ``apart``, for validation, are left out if a folder contains them, but not if they are named. Raises
+    SceneError if a path does not exist or has no scene, and UsageError if no scene is left.
     """
     from gsmerge.batch.find import find_scenes
     from gsmerge.errors import UsageError

@@ -1,4 +1,4 @@
-"""Synthetic scenes from random numbers alone, as a feed-forward network would export them, for training and tests."""
+"""Make synthetic scenes from random numbers, as a feed-forward network would export them, for training and tests."""
 
 from gsmerge.research.generate.folders import SceneFolder as SceneFolder
 from gsmerge.research.generate.folders import generate as generate

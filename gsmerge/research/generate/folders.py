@@ -1,4 +1,4 @@
-"""Folders of synthetic scenes, each complete or absent; existing scenes are not made again."""
+"""Write folders of synthetic scenes, each complete or absent; existing scenes are not made again."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class SceneFolder:
 def generate_scene(folder: Path, options: GenerateOptions | None = None, *, seed: int = 0, index: int = 0) -> Path:
     """Generate scene ``index`` of the series of ``seed`` into a folder, and return the folder.
 
-    A folder that holds the same scene stays. A UsageError if it holds something else, a SceneError if it cannot be
-    written.
+    A folder with the same scene is not changed. Raises UsageError if the folder has other contents, and SceneError if
+    it cannot be written.
     """
     options = options or GenerateOptions()
     key = scene_key(seed, index, options)
@@ -67,13 +67,13 @@ def generate(
     """Generate scenes ``out/scene_0000`` and so on, all different; the same arguments give the same bytes.
 
     Every folder gets ``scene.ply``, ``transforms.json``, ``images/``, held-out views in ``targets/``, and
-    ``generated.json`` with the random settings. A folder that holds the same scene already is left as it is, so an
-    interrupted call can be repeated, and a call with a larger ``count`` adds scenes. Random numbers depend only on
-    ``seed`` and the scene's number; ``progress`` is called with scenes done and scenes in all.
+    ``generated.json`` with the random settings. A folder with the same scene is not changed. So an interrupted call can
+    be repeated, and a call with a larger ``count`` adds scenes. Random numbers depend only on ``seed`` and the scene's
+    number. ``progress`` is called with the number of finished scenes and of all scenes.
 
     Raises:
         ValueError: If ``count`` or ``seed`` is out of range.
-        UsageError: If a folder holds something else.
+        UsageError: If a folder has other contents.
         SceneError: If a folder cannot be written.
     """
     options = options or GenerateOptions()
@@ -97,7 +97,7 @@ def generate(
 
 
 RECORD = "generated.json"
-RECORD_VERSION = 3  # increases when the same seed and options give other scenes
+RECORD_VERSION = 3  # increases if the same seed and options give other scenes than before
 
 
 def scene_key(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:
@@ -106,7 +106,7 @@ def scene_key(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]
 
 
 def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
-    """Return whether a folder holds the scene with this key, complete; a UsageError if it holds anything else."""
+    """Return True if a folder has the complete scene with this key; UsageError if it has other contents."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):

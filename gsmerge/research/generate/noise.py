@@ -1,4 +1,4 @@
-"""Output of a simulated feed-forward network for a view: depth, confidence, and one Gaussian for each pixel."""
+"""Simulate the output of a feed-forward network for a view: depth, confidence, and one Gaussian for each pixel."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from gsmerge.research.generate.textures import enlarge
 from gsmerge.types import SH_C0, Gaussians
 
 Range = tuple[float, float]
-ERRORS = (  # ranges that the setting noise scales; the others are habits of the exporter
+ERRORS = (  # ranges that the setting ``noise`` scales; the other ranges are habits of the exporter
     *("view_bias", "drift", "patches", "patch_error", "grain", "bleed", "floaters", "turn", "shift"),
     *("exposure", "tint", "oversized", "tilt"),
 )
-SPREAD = ("view_bias", "drift", "grain", "turn", "shift", "unit")  # drawn uniformly in their logarithm
+SPREAD = ("view_bias", "drift", "grain", "turn", "shift", "unit")  # values whose logarithms are drawn uniformly
 POSITIVE = (*SPREAD, "far", "scale", "bleed_width", "flatness", "blur")
 
 
@@ -29,8 +29,8 @@ POSITIVE = (*SPREAD, "far", "scale", "bleed_width", "flatness", "blur")
 class NoiseOptions:
     """Ranges of an exporter's errors and habits; each scene draws its values from them.
 
-    Depth errors are deviations of the logarithm of depth, so about parts of the depth. docs/internals/lab.md
-    compares them with real exports. A ValueError if a range is empty or impossible.
+    Depth errors are standard deviations of the logarithm of depth, which are about relative errors of the depth.
+    docs/internals/lab.md compares them with real exports. Raises ValueError if a range is empty or impossible.
     """
 
     view_bias: Range = (0.0002, 0.02)  # scale error of a view
@@ -40,31 +40,31 @@ class NoiseOptions:
     grain: Range = (0.0007, 0.003)  # independent error of each pixel
     blank: Range = (0.0, 3.0)  # factor of additional errors where the photo has no texture
     bleed: Range = (0.1, 1.0)  # blend towards a smoothed inverse depth at edges, 0 to 1
-    bleed_width: Range = (0.6, 1.8)  # deviation of that smoothing, pixels
+    bleed_width: Range = (0.6, 1.8)  # standard deviation of that smoothing, pixels
     far: Range = (4.0, 12.0)  # largest depth that the network predicts, in medians of the depth
-    # share of the pixels that float in front of their surface; eleven times as many at edges
+    # share of the pixels that float in front of their surface; it is eleven times as large at edges
     floaters: Range = (0.0, 0.004)
     turn: Range = (0.005, 0.3)  # rotation error of a pose, degrees
     shift: Range = (0.0001, 0.004)  # translation error of a pose, in median depths
-    exposure: Range = (0.0, 0.12)  # deviation of the logarithm of a photo's brightness
+    exposure: Range = (0.0, 0.12)  # standard deviation of the logarithm of a photo's brightness
     tint: Range = (0.0, 0.03)  # the same for each colour
-    blur: Range = (0.3, 0.75)  # deviation of the lens's blur, pixels
+    blur: Range = (0.3, 0.75)  # standard deviation of the lens's blur, pixels
     offset: Range = (0.0, 0.3)  # largest distance of a mean from its pixel's centre, pixels
     scale: Range = (0.5, 1.5)  # scale of a Gaussian across its normal, in footprints of its pixel
-    scale_jitter: Range = (0.05, 0.35)  # deviation of the scales' logarithms
+    scale_jitter: Range = (0.05, 0.35)  # standard deviation of the scales' logarithms
     flatness: Range = (0.15, 1.0)  # thickness along the normal, relative to the other axes
     tilt: Range = (0.02, 0.4)  # error of the normals, radians
     oversized: Range = (0.0, 0.006)  # share of the Gaussians that are far too large
     oversize: Range = (3.0, 12.0)  # largest factor of their size, at least 2
     trust: Range = (0.25, 1.0)  # confidence of pixels without errors
-    constant_opacity: float = 0.2  # chance that all opacities are the same
-    opacity_low: Range = (0.05, 0.4)  # opacity where the confidence is 0
-    opacity_high: Range = (0.75, 0.99)  # opacity where the confidence is 1
-    opacity_grain: Range = (0.0, 0.08)  # independent deviation of each opacity
+    constant_opacity: float = 0.2  # probability that all opacities are equal
+    opacity_low: Range = (0.05, 0.4)  # opacity at a confidence of 0
+    opacity_high: Range = (0.75, 0.99)  # opacity at a confidence of 1
+    opacity_grain: Range = (0.0, 0.08)  # independent error of each opacity
     color_grain: Range = (0.0, 0.02)  # error of each colour
-    color_blur: Range = (0.0, 0.6)  # deviation of the smoothing of colours, pixels; below 0.2: none
-    sh_degrees: tuple[int, ...] = (0, 0, 0, 1, 2)  # degrees of the spherical harmonics, drawn with equal chances
-    harmonics: Range = (0.0, 0.06)  # deviation of the higher coefficients
+    color_blur: Range = (0.0, 0.6)  # standard deviation of the smoothing of colours, pixels; below 0.2: none
+    sh_degrees: tuple[int, ...] = (0, 0, 0, 1, 2)  # degrees of the spherical harmonics, drawn with equal probability
+    harmonics: Range = (0.0, 0.06)  # standard deviation of the higher coefficients
     unit: Range = (0.2, 5.0)  # world units per metre
 
     def __post_init__(self) -> None:
@@ -84,12 +84,12 @@ class NoiseOptions:
 RANGES = [f.name for f in fields(NoiseOptions) if f.name not in ("constant_opacity", "sh_degrees")]
 if TYPE_CHECKING:
     Noise: TypeAlias = Any
-else:  # the values that one scene drew, under the names of their ranges
+else:  # the values that were drawn for one scene, under the names of their ranges
     Noise = make_dataclass("Noise", [*RANGES, "sh_degree"], frozen=True)
 
 
 def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
-    """Draw one scene's values; ``factor`` multiplies errors, not habits. Shares and ``bleed`` are at most 1."""
+    """Draw the values of one scene; ``factor`` multiplies errors, not habits. Shares and ``bleed`` are at most 1."""
     drawn: dict[str, float] = {}
     for name in RANGES:
         low, high = getattr(options, name)
@@ -123,7 +123,7 @@ def smooth_noise(rng: np.random.Generator, height: int, width: int, cells: int) 
 
 
 def edge_mask(depth: Array) -> Float:
-    """Rate pixels ``[h,w]`` by depth edges: 0 on smooth surfaces, 1 where neighbours differ by a tenth or more."""
+    """Rate pixels ``[h,w]`` by depth edges: 0 on smooth surfaces, 1 if neighbours differ by a tenth or more."""
     inverse = (1 / depth).astype(np.float32)
     square = np.ones((3, 3), np.uint8)
     jump = log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
@@ -136,7 +136,7 @@ FLAT = np.full(7, 1 / 7, np.float32)  # a filter: the mean of 7 pixels
 
 
 def texture_mask(image: Float) -> Float:
-    """Rate pixels ``[h,w]`` by texture: 0 in flat areas of a photo, 1 where it has detail."""
+    """Rate pixels ``[h,w]`` by texture: 0 in flat areas of a photo, 1 in detailed areas."""
     grey = image.mean(2)
     mean, square = (convolve(one, FLAT, FLAT) for one in (grey, grey * grey))
     deviation = np.sqrt(np.maximum(square - mean * mean, 0))
@@ -146,9 +146,9 @@ def texture_mask(image: Float) -> Float:
 def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
     """Simulate a network's depth ``[h,w]`` and its confidence ``[h,w]`` in [0, 1].
 
-    Errors are of the logarithm of depth: a bias of the view, a slow drift, wrong patches, and fine grain, all larger
-    where the photo has no texture; inverse depth bleeds over edges; depth is limited; and some pixels float in front
-    of their surface.
+    Errors of the logarithm of depth are a bias of the view, a slow drift, wrong patches and fine grain. All of them are
+    larger in areas without texture. Inverse depth bleeds over edges, depth has a maximum, and some pixels float in
+    front of their surface.
     """
     height, width = seen.depth.shape
     far = noise.far * float(np.median(seen.depth))
@@ -168,8 +168,8 @@ def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tup
     out = bled * exp(noise.view_bias * rng.normal() + worse * (drift + grain) + wrong)
     floating = rng.random(depth.shape) < noise.floaters * (1 + 10 * edge)
     out = np.where(floating, out * rng.uniform(0.4, 0.95, depth.shape), out)
-    doubt = 0.8 * near_edge + 0.5 * blank * noise.blank / 3 + 0.7 * patch * rng.uniform(0, 1) + 0.6 * beyond
-    trust = noise.trust * np.clip(1 - doubt, 0, 1) + 0.06 * smooth_noise(rng, height, width, 9)
+    distrust = 0.8 * near_edge + 0.5 * blank * noise.blank / 3 + 0.7 * patch * rng.uniform(0, 1) + 0.6 * beyond
+    trust = noise.trust * np.clip(1 - distrust, 0, 1) + 0.06 * smooth_noise(rng, height, width, 9)
     return out.astype(np.float32), np.clip(np.where(floating, 0.5 * trust, trust), 0, 1).astype(np.float32)
 
 
@@ -184,7 +184,7 @@ def _harmonics(colors: Float, means: Float, eye: Array, noise: Noise, rng: np.ra
     """Compute sh0 ``[n,1,3]`` and shN ``[n,k-1,3]`` that give Gaussians their colours in their own view."""
     n, num = len(colors), (noise.sh_degree + 1) ** 2 - 1
     sh0 = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)
-    common = rng.normal(0, 1, (1, num, 3))  # highlights of a view are on one side
+    common = rng.normal(0, 1, (1, num, 3))  # the same for all Gaussians, since highlights of a view are on one side
     shN = (noise.harmonics * (0.7 * common + 0.7 * rng.normal(0, 1, (n, num, 3)))).astype(np.float32)
     if num:
         raised = np.full_like(sh0, 10 / SH_C0)  # colours are clamped at 0

@@ -1,4 +1,4 @@
-"""Objects of a room, each standing at the origin, and the room itself; y points down. Sizes are in metres."""
+"""Build the objects of a room, each standing at the origin, and the room itself; y points down, sizes are in metres."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def random_rotation(rng: np.random.Generator) -> Array:
     y = second - (x * second).sum() * x
     y /= norm(y)
     z = np.cross(x, y)
-    sign = 1.0 if (z * third).sum() > 0 else -1.0  # a left-handed set is turned over
+    sign = 1.0 if (z * third).sum() > 0 else -1.0  # an axis of a left-handed set is reversed
     return np.stack([sign * x, sign * y, z], 1)
 
 
@@ -211,12 +211,12 @@ SMALL: tuple[Callable[[Palette], Shapes], ...] = (carton, carton, can, bottle, b
 
 
 def small_object(pal: Palette) -> Shapes:
-    """Build a random small object of the kind that stands on tables."""
+    """Build a random small object, as found on tables."""
     return SMALL[pal.rng.integers(len(SMALL))](pal)
 
 
 def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) -> Shapes:
-    """Spread small objects over a rectangle without contact, with papers and cables between them."""
+    """Spread small objects over a rectangle so that they do not touch, with papers and cables between them."""
     rng, out = pal.rng, []
     taken: list[Array] = []
     for _ in range(count * 4):

@@ -1,4 +1,4 @@
-"""Photos and exact depth of a stage: rays, textures, light with shadows, exposure."""
+"""Render photos and exact depth of a stage: rays, textures, light with shadows, exposure."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsmerge.research.generate.textures import Picture, pyramid
 FAR = 1e6  # depth of pixels without a surface
 NEAR_PLANE = 1e-3
 SAMPLE_RAYS = 2  # rays per pixel and axis for the colours; depth is that of the pixel's centre
-KEY_MAPS, KEY_SIZE = 5, 640  # shadow maps of the direct light, several for soft shadows, and their side, pixels
+KEY_MAPS, KEY_SIZE = 5, 640  # number of shadow maps of the direct light, for soft shadows, and their side in pixels
 AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # the same for the light from all sides
 BEHIND = 1000.0  # distance of a shadow map's camera in radii, so that its rays are nearly parallel
 GLOW = 0.7  # brightness of glowing shapes, relative to a white wall in full light
@@ -69,7 +69,7 @@ class Hits:
     """First hits of a view's rays, h x w samples."""
 
     depth: Array  # [h,w] along the camera's z
-    ids: NDArray[np.int32]  # [h,w] shape, -1 where there is none
+    ids: NDArray[np.int32]  # [h,w] shape, -1 without any
     points: Float  # [h,w,3] in the shape's frame
     normals: Float  # [h,w,3] world, towards the camera
 
@@ -80,13 +80,13 @@ class LitStage:
 
     stage: Stage
     shapes: ShapeArrays
-    mips: tuple[list[Picture], ...]  # every texture with its halves
-    axes: Array  # [k,3,3] of the lights, direct ones first
-    middle: Array  # [3] of the shadow maps
-    radius: float  # of the shadow maps
+    mips: tuple[list[Picture], ...]  # mipmaps of every texture
+    axes: Array  # [k,3,3] axes of the lights, direct ones first
+    middle: Array  # [3] middle of the shadow maps
+    radius: float  # half side of the shadow maps
     key: Float  # shadow maps of the direct light
     ambient: Float  # shadow maps of the light from all sides
-    weights: Array  # [k] of the ambient maps
+    weights: Array  # [k] weights of the ambient maps
 
 
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
@@ -97,7 +97,7 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -
     local = matmul(corners - c2w[:3, 3], c2w[:3, :3])
     edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
     a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
-    with np.errstate(divide="ignore", invalid="ignore"):  # where an edge passes the near plane
+    with np.errstate(divide="ignore", invalid="ignore"):  # for edges that cross the near plane
         crossing = a + (b - a) * ((NEAR_PLANE - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))
     crosses = (a[..., 2] < NEAR_PLANE) != (b[..., 2] < NEAR_PLANE)
     points = np.concatenate([local, np.where(crosses[..., None], crossing, 0.0)], 1)
@@ -189,7 +189,7 @@ def coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> t
 
 
 def paint(view: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
-    """Look up texture colours ``[n,3]``, sRGB; ``spread``: size of a sample on the surface, world units."""
+    """Look up texture colours ``[n,3]``, sRGB; ``spread`` is the size of a sample on the surface, world units."""
     uv, repeat = coordinates(view.shapes, ids, points)
     textures = np.array([s.material.texture for s in view.shapes.shapes])[ids]
     size = len(view.mips[0][0])
@@ -206,7 +206,7 @@ def paint(view: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) 
 
 
 def _lookup(texture: Picture, uv: Float) -> Float:
-    """Sample a texture that repeats, bilinearly; y of the texture is down."""
+    """Sample a repeating texture bilinearly; y of the texture points down."""
     width = 4096  # cv2.remap takes at most 32767 columns
     size = len(texture)
     rows = -(-len(uv) // width)
@@ -232,7 +232,7 @@ def radiance(view: LitStage, c2w: Array, lens: Pinhole, samples: int) -> Float:
 def _reflect(
     view: LitStage, ids: NDArray[np.int32], hits: Hits, seen: Array, c2w: Array, lens: Pinhole, samples: int
 ) -> Float:
-    """Compute the linear light ``[n,3]`` that comes from the samples that see a stage's shapes."""
+    """Compute the linear light ``[n,3]`` of the samples that hit a shape of the stage."""
     points, normals = hits.points.reshape(-1, 3)[seen], hits.normals.reshape(-1, 3)[seen]
     depth = hits.depth.reshape(-1)[seen]
     y, x = np.divmod(np.flatnonzero(seen), hits.depth.shape[1])
@@ -273,7 +273,7 @@ def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, 
 
 
 def find_exposure(pictures: Sequence[Float], brightness: float) -> float:
-    """Find the exposure factor with which the mean of the pictures is about ``brightness``, sRGB."""
+    """Find the exposure factor that makes the mean of the pictures about ``brightness``, sRGB."""
     values = np.concatenate([p.reshape(-1) for p in pictures])
     low, high = 1e-3, 1e3
     for _ in range(30):

@@ -1,4 +1,4 @@
-"""Shapes of a synthetic scene: frames, sizes and materials. x to the right, y down, z away; the ground is y = 0."""
+"""Make the shapes of a synthetic scene; x points to the right, y down and z away, and the ground is y = 0."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Shape:
-    """One shape, see :mod:`gsmerge.kernels.cast` for the kinds."""
+    """One shape; see :mod:`gsmerge.kernels.cast` for the kinds."""
 
     kind: int
     size: tuple[float, float, float, float]  # half sizes along its axes, and the taper of a cone
@@ -41,7 +41,7 @@ class Shape:
     rotation: Array = field(default_factory=lambda: np.eye(3))  # [3,3] local to world
     waves: Array = field(default_factory=lambda: NO_WAVES)  # [4,5] relief
     shell: bool = False  # encloses the scene and casts no shadow
-    glow: bool = False  # as bright as its texture, whatever the light (sky, screens, lamps)
+    glow: bool = False  # as bright as its texture, independent of the light (sky, screens, lamps)
 
 
 def norm(vector: Array) -> float:
@@ -71,7 +71,7 @@ def axis_rotation(axis: int, angle: float) -> Array:
     return out
 
 
-UPRIGHT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # of quads and leaves: facing -z, facing up
+UPRIGHT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # rotations of quads and leaves that face -z, and up
 
 
 def box(low: Vector, high: Vector, material: Material) -> Shape:

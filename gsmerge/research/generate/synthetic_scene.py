@@ -1,4 +1,4 @@
-"""One synthetic scene in memory: a room, its photos, and the Gaussians that a network would predict from them."""
+"""Make a synthetic scene in memory: a room, its photos, and the Gaussians that a network would predict from them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.types import Cameras, Gaussians
 
-PATH_TRIES, STAGE_TRIES = 6, 6  # paths per stage, and stages, until all views are usable
+PATH_TRIES, STAGE_TRIES = 6, 6  # most paths per stage, and most stages, that are tried until all views are usable
 SMALL = 8  # views are checked, and exposures computed, at this fraction of the size
 FOCAL = 0.58, 1.75  # range of the focal length, in the longer sides of the photo
 MIN_NEAR = 0.22  # first percentile of the depths, as a share of their median
@@ -48,7 +48,7 @@ Pose = Callable[[float], Array]  # camera to world at 0, the start of a path, to
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
-    """Compute camera to world ``[4,4]``, OpenCV axes, upright (y down) but for ``roll`` radians."""
+    """Compute a camera-to-world matrix ``[4,4]``, OpenCV axes, upright (y down) except for ``roll`` radians."""
     forward = (target - eye) / norm(target - eye)
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= norm(right)
@@ -79,7 +79,7 @@ def draw_path(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
 
 
 def is_usable(hits: Hits) -> bool:
-    """Return whether a view is outside all shapes and not too close to one."""
+    """Return True if a view is outside all shapes and not too close to any."""
     depth = hits.depth[hits.depth < FAR]
     if depth.size < 0.6 * hits.depth.size:
         return False
@@ -111,9 +111,9 @@ class SyntheticScene:
 
     gaussians: Gaussians  # one for each pixel, view-major and row-major
     cameras: Cameras  # as the network estimates them
-    images: tuple[Float, ...]  # the photos, [h,w,3] sRGB in [0, 1] each; larger than the views with a photo_scale
-    targets: Cameras  # true cameras half-way between neighbouring views, of the photos' size
-    target_images: tuple[Float, ...]  # their photos
+    images: tuple[Float, ...]  # photos [h,w,3], sRGB in [0, 1]; larger than the views by ``photo_scale``
+    targets: Cameras  # true cameras half-way between neighbouring views, at the size of the photos
+    target_images: tuple[Float, ...]  # photos of these cameras
     noise: Noise
 
 
@@ -125,21 +125,21 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     focal = max(options.width, options.height) * rng.uniform(*FOCAL)
     lens = Pinhole(options.width, options.height, focal)
     scale = options.photo_scale
-    large = Pinhole(scale * lens.width, scale * lens.height, scale * lens.focal)  # of the photos
+    large = Pinhole(scale * lens.width, scale * lens.height, scale * lens.focal)  # camera of the photos
     scene, pose = _find_stage(rng, large, num_views)
     places = np.linspace(0, 1, 2 * num_views - 1)
     poses = [pose(s) for s in places]
     gain = find_exposure([radiance(scene, p, _shrink(lens), 1) for p in poses[::2]], rng.uniform(0.22, 0.62))
     seeds = rng.integers(0, 2**63, len(poses))
-    world = invert(poses[0]) if rng.random() < 0.5 else np.eye(4)  # that of many exporters is the first camera
-    moved = [matmul(world, pose) for pose in poses]  # in the world of the exporter, and its units
+    world = invert(poses[0]) if rng.random() < 0.5 else np.eye(4)  # many exporters use the frame of the first camera
+    moved = [matmul(world, pose) for pose in poses]  # in the world and the units of the exporter
     for estimate in moved:
         estimate[:3, 3] *= noise.unit
     views = range(0, len(poses), 2)
     errors = {i: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for i in views}
 
     def take(i: int) -> tuple[Float, Array, Gaussians | None]:
-        """Take the photo at one place; at the place of a view, also estimate its pose and predict Gaussians."""
+        """Take the photo at one place of the path; at the place of a view also estimate its pose and Gaussians."""
         image = _photo(scene, poses[i], large, noise, gain, seeds[i])
         if i not in errors:
             return image, moved[i], None
@@ -168,8 +168,8 @@ def _shrink(lens: Pinhole) -> Pinhole:
 
 
 def _find_stage(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitStage, Pose]:
-    """Draw a room and a path through it on which all views are usable; after too many tries, return the last."""
-    side = 1 << min(max(int(1.6 * max(lens.width, lens.height)).bit_length() - 1, 7), 10)  # of the textures, pixels
+    """Draw a room and a path on which all views are usable; after too many tries, return the last ones."""
+    side = 1 << min(max(int(1.6 * max(lens.width, lens.height)).bit_length() - 1, 7), 10)  # side of textures, pixels
     for _ in range(STAGE_TRIES):
         scene = light_stage(room(Palette(rng, side)))
         for _ in range(PATH_TRIES):
@@ -194,7 +194,7 @@ def _photo(scene: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: floa
 
 
 def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
-    """Add the network's error to a pose; ``deviation [2,3]``: of rotation and position, in units of their strengths."""
+    """Add the network's error to a pose; ``deviation [2,3]`` is of rotation and position, in units of their errors."""
     turn = np.deg2rad(noise.turn) * deviation[0] / 3**0.5
     angle = np.sqrt((turn * turn).sum())
     quat = np.array([cos(angle / 2), *(sin(angle / 2) / max(angle, 1e-12) * turn)])

@@ -1,6 +1,6 @@
-"""Textures: square colour pictures that repeat without a seam, from random numbers alone.
+"""Draw textures from random numbers: square colour pictures that repeat without a seam.
 
-Every function of ``KINDS`` is ``(rng, size) -> [size,size,3]`` float32 sRGB in [0, 1].
+Every function of ``KINDS`` is ``(rng, size) -> [size,size,3]`` float32, sRGB in [0, 1].
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def noise(
 ) -> Grey:
     """Draw noise as a sum of octaves, each ``fade`` times as strong as the one before: 0.3 gives clouds, 0.9 grit.
 
-    ``first`` is the number of cells of the coarsest octave along a side, ``stretch`` the ratio of their length to their
-    height; ``ridged`` gives sharp crests, as of rock and bark.
+    ``first`` is the number of cells of the coarsest octave along a side, and ``stretch`` the ratio of their length to
+    their height. ``ridged`` gives sharp crests, as in rock and bark.
     """
     out, strength, cells = np.zeros((size, size), np.float32), 1.0, min(first, size // 2)
     while cells <= size // 2:
@@ -56,7 +56,7 @@ def courses(
 ) -> tuple[Grey, Grey]:
     """Draw ``rows`` courses of ``columns`` bricks or tiles; return a random tone per brick, and a mask of the joints.
 
-    ``joint`` is the width of the joints as a share of a stone's height; ``offset`` is the shift of every second course
+    ``joint`` is the width of the joints as a share of a stone's height, and ``offset`` the shift of every second course
     as a share of a stone's width.
     """
     x, y = grid(size)
@@ -70,7 +70,7 @@ def courses(
 
 
 def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
-    """Draw pebbles; return a random tone for each of ``count``² cells, and each pixel's distance to its cell's edge."""
+    """Draw ``count``² pebbles; return the random tone and the distance to the edge of each pixel's pebble."""
     at = (np.stack(np.meshgrid(np.arange(count), np.arange(count)), -1) + rng.uniform(0, 1, (count, count, 2))) / count
     tones = rng.uniform(0, 1, (count, count)).astype(np.float32)
     x, y = grid(size)
@@ -256,7 +256,7 @@ def foliage(rng: np.random.Generator, size: int) -> Picture:
 
 
 def crown(rng: np.random.Generator, size: int) -> Picture:
-    """Draw leaves from afar, as behind a window."""
+    """Draw distant leaves, as seen through a window."""
     tone, edge = cells(rng, size, int(rng.integers(24, 56)))
     base = color(rng, hue=(0.18, 0.36), strength=(0.35, 0.8), light=(0.25, 0.55))
     low, high = shades(rng, base, 0.6)
@@ -355,7 +355,7 @@ def pyramid(texture: Picture) -> list[Picture]:
     return out
 
 
-MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4}  # in a scene; other kinds 3
+MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4}  # per scene; of other kinds 3
 
 
 @dataclass
@@ -368,9 +368,10 @@ class Palette:
     by_kind: dict[str, list[int]] = field(default_factory=dict)  # their indices
 
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
-        """Make a material of one of the kinds, with a new texture, or an old one if the kind has enough.
+        """Make a material of one of the kinds, with a new texture, or an existing one if the kind has enough.
 
-        ``repeat`` is in repeats per world unit, 0: once over every face. ``gloss`` None: random, usually zero.
+        ``repeat`` is the number of repeats per world unit; 0: once over every face. ``gloss`` is by default random, and
+        usually zero.
         """
         kind = kinds[self.rng.integers(len(kinds))]
         ids = self.by_kind.setdefault(kind, [])

@@ -1,4 +1,4 @@
-"""Training of the networks on renders compared with photos."""
+"""Train the networks by comparing renders with photos."""
 
 from gsmerge.research.training.examples import Example as Example
 from gsmerge.research.training.examples import make_example as make_example

@@ -1,4 +1,4 @@
-"""Examples of captures, which have no Gaussians: a backbone predicts them for every subset of views that is drawn."""
+"""Make examples from captures, which have no Gaussians: a backbone predicts them for each drawn subset of views."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ from gsmerge.types import Cameras, Gaussians, Scene, Views
 Other = TypeVar("Other")
 # Photos [v,h,w,3] sRGB in [0, 1] float32, and their cameras -> v h w Gaussians, view by view, in the cameras' world
 Backbone = Callable[[np.ndarray, Cameras], Gaussians]
-NOVEL_PHOTOS = 4  # other photos that an example has, drawn from all others: there may be hundreds
+NOVEL_PHOTOS = 4  # photos of novel views in an example, drawn from all other photos, since there may be hundreds
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedCapture:
-    """A capture that gives another example at every draw: other views, predicted from them alone."""
+    """A capture that makes a new example at every draw: other views, with Gaussians predicted from only these views."""
 
     capture: Capture
     backbone: Backbone
 
     @property
     def scene(self) -> str:
-        """Name of the scene, as a file may have it."""
+        """Name of the scene, valid as a file name."""
         return self.capture.name.replace("/", "-")
 
     @property
     def sha256(self) -> str:
-        """Hash by which a run knows the capture again: of its name, since photos may be terabytes."""
+        """Hash that identifies the capture when a run is resumed; it is of the name, since photos may be terabytes."""
         return digest({"capture": self.capture.name})
 
     def draw(self, options: TrainOptions, rng: np.random.Generator) -> Example:
         """Draw views and a density, predict the Gaussians of these views, and make the example.
 
-        SceneError if the capture cannot be read, or the Gaussians do not lie in their pixels; ValueError for another
-        number of them.
+        Raises SceneError if the capture cannot be read, or if the Gaussians do not lie in their pixels, and ValueError
+        for a wrong number of Gaussians.
         """
         cameras = self.capture.read_cameras()
         if options.random_views:
@@ -81,7 +81,7 @@ class PredictedCapture:
 def bind_backbone(examples: Sequence[Other | Capture], backbone: Backbone | None) -> list[Other | PredictedCapture]:
     """Give the captures among examples their backbone, which is called by one thread at a time, without gradients.
 
-    ValueError if there are captures without a backbone.
+    Raises ValueError if there are captures but no backbone.
     """
     lock = Lock()
 

@@ -1,7 +1,7 @@
-"""Examples to learn from: scenes cut into superpixels and encoded without networks, with their photos.
+"""Make training examples: scenes cut into superpixels and encoded without networks, with their photos.
 
-The networks get some of the scene's views; the photos of the others, and held-out photos, are novel views. Which
-views these are is fixed, or drawn anew for every window (:func:`select_views`).
+The networks get some of the scene's views. The photos of all other views, and held-out photos, are novel views. The
+choice of views is fixed, or drawn again for every window (:func:`select_views`).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Pixels
 
 @dataclass(frozen=True)
 class ColorMap:
-    """A linear change of colours, applied alike to a scene and its photos."""
+    """A linear change of colours that is applied to a scene and its photos."""
 
-    order: tuple[int, ...] = (0, 1, 2)  # channel that each channel takes
-    gain: float = 1.0  # below 0: the negative
+    order: tuple[int, ...] = (0, 1, 2)  # source channel of each channel
+    gain: float = 1.0  # below 0: negative colours
     offset: float = 0.0  # sRGB in [0, 1]
 
     def change(self, colors: np.ndarray) -> np.ndarray:
@@ -50,36 +50,36 @@ class ColorMap:
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A scene to learn from, or a subset of its views."""
+    """A scene for training, or a subset of its views."""
 
-    name: str  # of the scene
-    unit: float  # median depth of the Feature Gaussians: the scene's unit of length, in canonical units
+    name: str  # name of the scene
+    unit: float  # unit of length of the scene, the median depth of the Feature Gaussians, in canonical units
     members: Members  # the Gaussians of v views
     cameras: Cameras  # these views
     features: FeatureGaussians  # g analytic Feature Gaussians before merging
-    base: Gaussians  # g Gaussians, one for each of them
-    photos: Photos  # p photos without colours: those of the views first, then novel ones
-    images: np.ndarray  # [p,h,w,3] uint8, their colours, sRGB
-    covers: np.ndarray  # [v,p,h,w] uint8: what the Gaussians of each view cover, see scenes.coverage
-    colors: ColorMap = ColorMap()  # of the photos, whose bytes stay as they are
-    drawn: bool = False  # whether its views are a random subset already, predicted from them alone
+    base: Gaussians  # g Gaussians, one for each Feature Gaussian
+    photos: Photos  # p photos without colours: first those of the views, then those of novel views
+    images: np.ndarray  # [p,h,w,3] uint8, colours of the photos, sRGB
+    covers: np.ndarray  # [v,p,h,w] uint8: coverage of photos by the Gaussians of each view, see scenes.coverage
+    colors: ColorMap = ColorMap()  # change of the photos' colours; ``images`` are unchanged
+    drawn: bool = False  # True if its views are a random subset already, with Gaussians predicted from only them
 
     def mask(self, photo: int) -> np.ndarray:
-        """Return a mask ``[h,w]`` of a photo's pixels that the views cover."""
+        """Return the mask ``[h,w]`` of a photo's pixels that the views cover."""
         return covered_pixels(self.covers[:, photo])
 
     def photo_ids(self, *, novel: bool) -> list[int]:
-        """List the photos that the views cover in part: the views' own photos, or those of ``novel`` views."""
+        """List the photos of the views, or of ``novel`` views, that the views cover at least in part."""
         span = range(len(self.cameras), len(self.photos)) if novel else range(len(self.cameras))
         return [photo for photo in span if self.mask(photo).any()]
 
 
 def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, Callable[[], Example]]]:
-    """Yield (name, maker) of each example of a scene; see :func:`make_example`.
+    """Yield name and maker of each example of a scene; see :func:`make_example`.
 
-    There is one for each number of views and every density of the ``options``. Photos of a folder ``targets`` next to
-    the ``.ply``, with their cameras, are novel views. A SceneError if the scene cannot be read, is not one Gaussian per
-    pixel, or has no photos.
+    There is an example for each number of views and each density in ``options``. Photos with cameras in a folder
+    ``targets`` next to the ``.ply`` are novel views. Raises SceneError if the scene cannot be read, does not have one
+    Gaussian per pixel, or has no photos.
     """
     load = load_scene(path)
     scene, ply = load.scene, load.files.ply
@@ -98,7 +98,7 @@ def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, Call
 
 
 def scene_name(path: Path) -> str:
-    """Name a scene after its folder, and its file if the path is a file."""
+    """Name a scene by its folder, and by its file as well if the path is a file."""
     path = path.absolute()
     return f"{path.parent.name}-{path.stem}" if path.is_file() else path.name
 
@@ -111,7 +111,7 @@ def make_example(training: TrainingScene, options: TrainOptions, density: float,
     level = options.photo_level(scene.cameras.width, scene.cameras.height)
     images = (training.photos(level).images.clip(0, 1) * 255).round().astype(np.uint8)
     focals = np.sqrt(np.abs(scene.cameras.Ks[:, 0, 0] * scene.cameras.Ks[:, 1, 1]))
-    # a footprint is a pixel in a Feature Gaussian's own view
+    # a footprint is the size of a pixel in the own view of a Feature Gaussian
     unit = float(lower_median(features.footprints * focals.astype(np.float64)[features.views]))
     return Example(
         name, unit, members, scene.cameras, features, feature_to_gaussians(features),
@@ -120,7 +120,7 @@ def make_example(training: TrainingScene, options: TrainOptions, density: float,
 
 
 def select_views(example: Example, ids: Sequence[int]) -> Example:
-    """Keep the views ``ids`` (ascending) of an example; photos of other views become novel ones."""
+    """Keep the views ``ids`` (ascending) of an example; photos of other views become novel views."""
     views, own = len(example.cameras), example.members
     if len(ids) == views:
         return example
@@ -147,14 +147,14 @@ def select_views(example: Example, ids: Sequence[int]) -> Example:
 
 
 def draw_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
-    """Draw a random subset of an example's views, as ``options.random_views`` says (paper supplement C)."""
+    """Draw a random subset of an example's views by ``options.random_views`` (paper supplement C)."""
     if example.drawn or not options.random_views:
         return example
     return select_views(example, draw_ids(len(example.cameras), options, rng))
 
 
 def draw_ids(num_views: int, options: TrainOptions, rng: np.random.Generator) -> list[int]:
-    """Draw the ascending ids of a random subset of views, as many as ``options.random_views`` says."""
+    """Draw the ascending ids of a random subset of views, with a size in the range ``options.random_views``."""
     least, most = (min(count, num_views) for count in options.random_views)
     count = int(rng.integers(least, most + 1))
     return sorted(rng.choice(num_views, count, replace=False).tolist())

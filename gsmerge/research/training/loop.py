@@ -1,9 +1,9 @@
-"""The training run: AdamW on windows of photos, validation, checkpoints; an interrupted run can be resumed.
+"""Train with AdamW on windows of photos, with validation and checkpoints; an interrupted run can be resumed.
 
-Validation is on fixed windows and whole photos of the validation examples, read one after the other.
+Validation uses fixed windows and whole photos of the validation examples, which are read one after another.
 
-Random numbers depend only on seed and step, and the gradients of crops are added in order. So an interrupted run ends
-with the same bytes as one that was not, on any number of threads.
+Random numbers depend only on seed and step, and the gradients of crops are added in order. So a resumed run ends with
+the same bytes as an uninterrupted run, on any number of threads.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Window, sample_window, whole_photo
 from gsmerge.runtime.threads import parallel_map, use_threads
 
-VALIDATION = 2**32  # takes the place of the step in the seed of validation's random numbers
-Row = dict[str, float]  # of the table of losses
-Scores = list[tuple[float, float, float]]  # of each window: PSNR (dB) without and with networks, share merged
+VALIDATION = 2**32  # replaces the step in the seed of the random numbers of validation
+Row = dict[str, float]  # a row of the table of losses
+Scores = list[tuple[float, float, float]]  # for each window: PSNR (dB) without and with networks, share merged
 Progress = Callable[[int, int, float], None]  # step, steps, loss
 FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
@@ -49,7 +49,7 @@ REMEDY = "choose another --output, or remove it to start again"
 def validate(networks: Networks, shards: Sequence[TrainingSource], options: TrainOptions, out: Path) -> Row:
     """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians.
 
-    For each scene ``validation-NAME.png`` shows a photo, its analytic and its learned render.
+    For each scene ``validation-NAME.png`` shows a photo, its render without networks, and its render with networks.
     """
     scores = [window for i in range(len(shards)) for window in _score(networks, shards, i, options, out)]
     analytic, learned, matched = np.mean(scores, 0).tolist()
@@ -59,7 +59,7 @@ def validate(networks: Networks, shards: Sequence[TrainingSource], options: Trai
 def _score(
     networks: Networks, shards: Sequence[TrainingSource], number: int, options: TrainOptions, out: Path
 ) -> Scores:
-    """Score one of the shards, and write its picture if it is the first of its scene."""
+    """Score a shard, and write a picture if it is the first shard of its scene."""
     rng = np.random.default_rng([options.seed, VALIDATION, number])
     example = read_example(shards[number], options, rng)
     windows = [
@@ -78,7 +78,7 @@ def _score(
 
 
 def _write_picture(path: Path, networks: Networks, example: Example, options: TrainOptions) -> None:
-    """Draw a photo, novel if there is one, its analytic render and its learned render side by side."""
+    """Draw side by side a photo, of a novel view if there is one, and its renders without and with networks."""
     ids = [*example.photo_ids(novel=True), *example.photo_ids(novel=False), 0]
     window = whole_photo(example, ids[0], min(options.levels))
     renders = [render_window(window, chosen, options)[0] for chosen in (None, networks)]
@@ -88,14 +88,14 @@ def _write_picture(path: Path, networks: Networks, example: Example, options: Tr
 
 @dataclass(frozen=True, eq=False)
 class TrainingState:
-    """State that a training step changes: networks, running means of their weights, and the optimiser's moments."""
+    """State of a training run: networks, running means of their weights, and moments of the optimiser."""
 
     networks: Networks
     smooth: Networks
     optimizer: torch.optim.Optimizer
 
     def pairs(self) -> Iterator[tuple[str, Parameter, Parameter]]:
-        """Yield name, parameter, and its running mean."""
+        """Yield the name, the parameter, and its running mean, for all parameters."""
         for (name, parameter), mean in zip(self.networks.named_parameters(), self.smooth.parameters(), strict=True):
             yield name, parameter, mean
 
@@ -104,14 +104,14 @@ class TrainingState:
 class TrainResult:
     """Files and figures of a training run."""
 
-    best: Path  # checkpoint with the highest PSNR of validation
+    best: Path  # checkpoint with the highest PSNR in validation
     last: Path  # checkpoint of the last step
     losses: Path  # CSV, one row for each validation
-    step: int  # steps done
-    loss: float  # the last training loss
-    psnr_analytic: float  # PSNR (dB) of the windows of validation without networks
-    psnr_learned: float  # the best PSNR with networks
-    resumed: int  # step from which the run was resumed; 0 for a new one
+    step: int  # number of steps done
+    loss: float  # last training loss
+    psnr_analytic: float  # PSNR (dB) of the validation windows without networks
+    psnr_learned: float  # best PSNR (dB) with networks
+    resumed: int  # step from which the run was resumed; 0 for a new run
 
 
 def train(
@@ -128,24 +128,23 @@ def train(
     """Train networks, or continue the run in the folder.
 
     Args:
-        shards: Examples to learn from, at least one, or captures, whose examples are drawn and predicted as needed.
-        validation: Examples that choose the best checkpoint; empty: other windows of the first ones.
+        shards: At least one example, or captures, whose examples are drawn and predicted as needed.
+        validation: Examples by which the best checkpoint is chosen; empty: other windows of ``shards``.
         out: Folder for ``best.safetensors``, ``last.safetensors``, ``losses.csv``, ``state.safetensors`` and a picture
             of each validation scene.
         options: Settings.
-        backbone: Predicts the Gaussians of captures: called with photos ``[v,h,w,3]``, sRGB in [0, 1], at most
-            ``photo_side`` pixels wide or high, and their cameras; returns ``v·h·w`` Gaussians, view by view, in the
-            cameras' world. What it returns must depend on these alone, or a run cannot be repeated.
-        threads: Threads to use; None: all processors. The result does not depend on it.
-        device: Where the networks run, see :func:`choose_device`. Windows are rendered on the CPU. On CUDA a run
+        backbone: Predicts the Gaussians of captures. It is called with photos ``[v,h,w,3]``, sRGB in [0, 1], at most
+            ``photo_side`` pixels wide or high, and their cameras. It returns ``v·h·w`` Gaussians, view by view, in the
+            cameras' world. Its result must depend only on these arguments, or a run cannot be repeated.
+        threads: Number of threads; None: all processors. The result does not depend on it.
+        device: Device of the networks, see :func:`choose_device`. Windows are rendered on the CPU. On CUDA a run
             repeats up to rounding, not to the bit.
         progress: Called with (step, steps, loss) after every step.
 
     Raises:
-        ValueError: If there are no examples, captures have no backbone, or torch finds no CUDA device and ``device``
-            asks for it.
-        GsmergeError: If LPIPS has a weight, and its weights are not installed.
-        SceneError: If a shard is damaged, or the folder holds another run or cannot be written.
+        ValueError: If there are no examples, captures have no backbone, or ``device`` is CUDA and torch finds none.
+        GsmergeError: If LPIPS has a weight in the loss, and its network weights are not installed.
+        SceneError: If a shard is damaged, or the folder has another run or cannot be written.
     """
     options = options or TrainOptions()
     if not shards:
@@ -163,7 +162,7 @@ def train(
 def choose_device(name: str) -> str:
     """Choose the torch device for ``"cpu"``, ``"cuda"`` or ``"auto"`` (CUDA if torch finds it).
 
-    A ValueError if the name is unknown, or is "cuda" and torch finds no CUDA device.
+    Raises ValueError if the name is unknown, or if it is "cuda" and torch finds no CUDA device.
     """
     if name not in ("cpu", "cuda", "auto"):
         raise ValueError(f'device: expected "cpu", "cuda" or "auto", got {name!r}')
@@ -227,7 +226,7 @@ def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[st
 
 
 def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[Row]]:
-    """Read step and table of losses of the run in the folder; those of a new run if there is none."""
+    """Read the step and the table of losses of the run in the folder; those of a new run if there is none."""
     path = out / "state.safetensors"
     if not path.exists():
         return 0, []
@@ -239,7 +238,7 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
 
 
 def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, step: int) -> Tensor:
-    """Do one step; return its loss."""
+    """Take one step; return its loss."""
     parameters = list(state.networks.parameters())
     streams.move_to(step)
 
@@ -255,7 +254,7 @@ def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, 
             parts = [torch.zeros_like(parameter) for parameter in parameters]
             if loss.requires_grad:
                 parts = list(torch.autograd.grad(loss, parameters, materialize_grads=True))
-        return torch.cat([*(part.flatten() for part in parts), loss.detach().to(parts[0])[None]])  # maybe on a GPU
+        return torch.cat([*(part.flatten() for part in parts), loss.detach().to(parts[0])[None]])  # on their device
 
     mean = torch.stack(parallel_map(work, range(options.crops))).sum(0) / options.crops
     sizes = [parameter.numel() for parameter in parameters]
@@ -287,7 +286,7 @@ def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> No
 def load_state(path: Path, state: TrainingState) -> dict[str, Any]:
     """Read weights, running means and moments into ``state``; return the facts about the run.
 
-    A SceneError if the file is damaged or of other networks.
+    Raises SceneError if the file is damaged or has other networks.
     """
     try:
         with safe_open(path, "pt") as file:

@@ -1,9 +1,9 @@
-"""Losses: renders compared with photos, and regularizers.
+"""Compute losses: renders compared with photos, and regularizers.
 
 A window of a photo is rendered from all Feature Gaussians that reach into it, each run through all networks (paper
 section 4.6). Pixels that the scene does not cover have no loss, so that networks need not guess them. LPIPS is that of
-:mod:`gsmerge.measure.lpips`, differentiable by torch. Regularizers hold early training near the moments of the groups,
-which are the paper's teacher, and siblings apart.
+:mod:`gsmerge.measure.lpips`, differentiable by torch. In early training regularizers hold Gaussians near the moments of
+the groups, which are the paper's teacher, and keep siblings apart.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from gsmerge.types import SH_C0, Gaussians
 def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg") -> Tensor:
     """Measure LPIPS, differentiable in ``image [h,w,3]`` float32 on the CPU; the reference has no gradient.
 
-    Pixels outside of ``mask [h,w]`` are taken from the reference; 0 where the images are too small
-    for the network or no pixel counts.
+    Pixels outside of ``mask [h,w]`` are taken from the reference. Returns 0 if the images are too small for the network
+    or the mask is empty.
     """
     if min(image.shape[:2]) < min_size(net) or not bool(mask.any()):
         return image.new_zeros(())
@@ -57,7 +57,7 @@ def _kernels(net: str) -> list[Tensor]:
 
 
 def _unit_features(image: Tensor, layers: tuple[Layer, ...], kernels: list[Tensor]) -> Iterator[Tensor]:
-    """Compute features ``[c,h,w]`` of unit length at every pixel, of each layer that is compared."""
+    """Yield the features ``[c,h,w]`` of each compared layer, with unit length at every pixel."""
     values = (2 * image[None] - 1 - torch.from_numpy(SHIFT)) / torch.from_numpy(SCALE)
     features = values.permute(0, 3, 1, 2)
     for layer, kernel in zip(layers, kernels, strict=True):
@@ -76,8 +76,8 @@ def window_loss(
 ) -> Tensor:
     """Compute the loss of a window: its renders on a random background against the photo, plus regularizers.
 
-    It is the mean over all levels if they are trained jointly. The diversification is a share of the photometric loss:
-    its own scale is that of volumes, which say nothing of how much it may weigh.
+    It is the mean over all levels if they are trained jointly. The weight of the diversification is relative to the
+    photometric loss, since its own scale, that of volumes, has no meaning for the weight.
     """
     crop, background = window.crop, rng.random(3, dtype=np.float32)
     levels = options.levels if options.joint else (crop.k,)
@@ -129,9 +129,9 @@ def photometric_loss(image: Tensor, window: Window, options: TrainOptions, step:
 
 
 def render_window(window: Window, networks: Networks | None, options: TrainOptions) -> tuple[Tensor, float]:
-    """Render a window ``[h,w,3]`` on black, clipped to [0, 1]; also return the share of Feature Gaussians merged.
+    """Render a window ``[h,w,3]`` on black, clipped to [0, 1]; also return the share of merged Feature Gaussians.
 
-    Without networks the analytic stages alone are used, and the share is 0.
+    Without networks only the analytic stages are used, and the share is 0.
     """
     with torch.no_grad():
         if networks is None:
@@ -152,10 +152,10 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     """Compute the distance of Gaussians from the moments of their groups (paper section 4.6).
 
     The teacher of a group is one Gaussian with the opacity-weighted mean and covariance of its members' means (eq.
-    teacher_mean, teacher_cov), their mean colour, and the opacity that keeps their optical depth. The loss is the angle
-    between the rotations, and the L1 distance of the means, in sizes of the teacher, of the logarithms of the scales,
-    of the opacities and of the base colours. A Gaussian has 24 equal pairs of rotation and scales; the one nearest to
-    the prediction counts.
+    teacher_mean, teacher_cov), their mean colour, and the opacity that conserves their optical depth. The loss is the
+    angle between the rotations plus L1 distances: of the means in sizes of the teacher, of the logarithms of the
+    scales, of the opacities and of the base colours. A Gaussian has 24 equivalent pairs of rotation and scales; the
+    pair nearest to the prediction is used.
     """
     g, merged = prediction.gaussians, prediction.merged
     if len(g) == 0:
@@ -165,19 +165,20 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     scales, quats = teacher.scales, teacher.quats
     orders = nearest_axes(quats, g.quats)
     scales = (scales[:, None] @ orders.abs())[:, 0]
-    turns = _turn_angles(quat_to_rotmat(g.quats).transpose(1, 2) @ quat_to_rotmat(quats) @ orders)
+    angles = _rotation_angles(quat_to_rotmat(g.quats).transpose(1, 2) @ quat_to_rotmat(quats) @ orders)
     sizes = gaussian_sizes(scales)
     distances = (g.means - teacher.means).abs() / sizes[:, None]
     stretches = (torch.log(g.scales) - torch.log(scales)).abs()
     colors = SH_C0 * (g.sh0 - teacher.sh0).abs()
-    parts = (turns, distances, stretches, (g.opacities - teacher.opacities).abs(), colors)
+    parts = (angles, distances, stretches, (g.opacities - teacher.opacities).abs(), colors)
     return torch.stack([part.mean() for part in parts]).sum()
 
 
 def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
-    """Return the axis permutations with signs ``[n,3,3]`` that bring ``quats [n,4]`` nearest to a reference.
+    """Return the signed axis permutations ``[n,3,3]`` that bring ``quats [n,4]`` nearest to a reference.
 
-    A Gaussian has 24 equal pairs of rotation and scales: rotations times the result, and scales in that order.
+    A Gaussian has 24 equivalent pairs of rotation and scales: the rotation times a permutation, and the scales in its
+    order.
     """
     signed = torch.stack([torch.diag(torch.tensor(signs)) for signs in product((1.0, -1.0), repeat=3)])
     orders = torch.stack([torch.eye(3)[list(order)] for order in permutations(range(3))])
@@ -188,22 +189,22 @@ def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
         return proper[torch.einsum("nij,pji->np", between, proper).argmax(1)]
 
 
-def _turn_angles(turns: Tensor) -> Tensor:
-    """Compute the angles ``[n]`` of rotations ``[n,3,3]``, with a gradient at no angle, too."""
-    cosines = (turns.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
-    return torch.atan2((skew_vectors(turns).square().sum(1) + 1e-12).sqrt(), cosines)
+def _rotation_angles(rotations: Tensor) -> Tensor:
+    """Compute the angles ``[n]`` of rotations ``[n,3,3]``, with a finite gradient at an angle of 0, too."""
+    cosines = (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    return torch.atan2((skew_vectors(rotations).square().sum(1) + 1e-12).sqrt(), cosines)
 
 
-GOAL = 0.5  # overlap of the boxes of two children that has no loss
+GOAL = 0.5  # overlap of the boxes of two children at which the loss is 0
 GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversification
 
 
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tensor:
     """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D); 0 to 1.
 
-    ``parents [n]`` of the children are ascending. It is a mean over pairs, weighted by their volumes in units of the
-    ``sizes [n]`` of their groups, without a gradient, since small siblings are no goal. In the paper's world units the
-    weights of a million small Gaussians leave nothing of the loss.
+    ``parents [n]`` of the children are ascending. The result is a mean over pairs, weighted by their volumes in units
+    of the ``sizes [n]`` of their groups. The weights have no gradient, since it would make siblings small. With volumes
+    in world units, as in the paper, the loss of a million small Gaussians would be almost 0.
     """
     left, right = sibling_pairs(parents)
     if len(left) == 0:
@@ -227,9 +228,9 @@ def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor:
-    """Compute the paper's U-shaped overlap penalty of pairs ``[p]``: 0 where their boxes overlap by half.
+    """Compute the paper's U-shaped overlap penalty of pairs ``[p]``, which is 0 for boxes that overlap by half.
 
-    Boxes are those of one standard deviation along the world's axes, as in matching.
+    The boxes have one standard deviation along the world's axes, as in matching.
     """
     axes = quat_to_rotmat(gaussians.quats) * gaussians.scales[:, None]
     halves = axes.norm(dim=2)

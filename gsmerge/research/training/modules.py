@@ -1,10 +1,10 @@
-"""Encoder, decoder heads, merger and refiner as modules of torch, for training (paper sections 4.2 to 4.5).
+"""Encoder, decoder heads, merger and refiner as torch modules, for training (paper sections 4.2 to 4.5).
 
 All of them take tokens and return raw corrections of the results of the analytic stages (fig. architecture). The last
 layers start at zero, so untrained networks change nothing.
 
-They are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded; ``mask`` is True where a token
-is one of the set's own. Padded tokens are never attended to.
+They are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded; ``mask`` is True for tokens of
+the set and False for padding. Padded tokens are never attended to.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def zero_init(layer: nn.Linear) -> nn.Linear:
 
 
 def small_init(layer: nn.Linear) -> nn.Linear:
-    """Make a layer's first outputs small, but different: siblings that begin alike stay alike."""
+    """Make a layer's initial outputs small but different, since siblings with equal outputs would stay equal."""
     with torch.no_grad():
         for values in layer.parameters():
             values.mul_(0.1)
@@ -63,7 +63,7 @@ class Attention(nn.Module):
 class AttentionBlock(nn.Module):
     """Attention and an MLP, both residual with normalised inputs (paper fig. architecture: SAB).
 
-    ``first``: computes only the first token, ``[b,1,w]``.
+    With ``first`` only the first token is computed, ``[b,1,w]``.
     """
 
     def __init__(self, width: int, heads: int, *, first: bool = False) -> None:
@@ -98,7 +98,7 @@ class Pooling(nn.Module):
 
 
 class SetNetwork(nn.Module):
-    """Part that encoder and merger share: MLP of tokens, attention blocks, pooling, MLP with the group's numbers."""
+    """Shared part of encoder and merger: MLP of tokens, attention blocks, pooling, MLP with the group's numbers."""
 
     def __init__(self, token: int, out: int, options: NetworkOptions) -> None:
         super().__init__()
@@ -194,7 +194,7 @@ class Networks(nn.Module):
         self.refiner = Refiner(chosen) if chosen.refiner else None
         self.heads = nn.ModuleDict({str(slots): Head(slots, chosen) for slots in SLOTS})
 
-    in_parallel = False  # gradients of one group after the other
+    in_parallel = False  # tables run one after another, for gradients
 
     def run(self, name: str, *inputs: Array) -> Tensor:
         """Run a module as :meth:`NetworkWeights.run` does, on its own device, with gradients."""

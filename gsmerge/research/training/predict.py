@@ -1,9 +1,9 @@
-"""Predictions of all networks for crops of examples, with gradients through every stage.
+"""Predict with all networks for crops of examples, with gradients through every stage.
 
-The geometry of the stages is done on tensors here, so that gradients pass from a stage's results to what earlier ones
-made of them. The formulas are those of the kernels that the stages use (:mod:`gsmerge.networks.tokens`,
+The geometry of the stages is computed on tensors here, so that gradients pass from the results of a stage to the
+results of earlier stages. The formulas are those of the kernels that the stages use (:mod:`gsmerge.networks.tokens`,
 :mod:`gsmerge.pooling`, :mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours, clusters,
-order of axes, views and what these say of a group.
+order of axes, views, and the agreement of a group with other views.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
 
 TINY = 1e-12  # world units
-MIN_GAP = 1e-3  # least difference of two squared scales that turns axes, as a share of the largest
+MIN_GAP = 1e-3  # least difference of two squared scales in the gradient of axes, over the largest squared scale
 
 
 def features_to_tensors(features: FeatureGaussians) -> FeatureGaussians:
-    """Convert the columns of Feature Gaussians that networks change to tensors."""
+    """Convert those columns of Feature Gaussians to tensors that networks change."""
     columns: dict[str, Array] = {name: as_tensor(getattr(features, name)) for name in CORRECTED}
     return replace(features, **columns)
 
@@ -59,7 +59,7 @@ def groups_to_arrays(groups: GroupFeatures) -> GroupFeatures:
 
 
 def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute scales ``[g,3]`` (rising) and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
+    """Compute scales ``[g,3]``, ascending, and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
 
     Values are those of :func:`gsmerge.pooling.principal_axes`; gradients follow from first-order perturbation theory.
     Axes of nearly equal scales have no clear direction, so the gradient of their rotation is damped.
@@ -70,7 +70,7 @@ def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     axes = quat_to_rotmat(quats)
     change = axes.transpose(1, 2) @ (covars - covars.detach()) @ axes  # zero, with a gradient
     squares = scales.square()
-    gaps = squares[:, None] - squares[:, :, None]  # [i,j]: square of j less that of i
+    gaps = squares[:, None] - squares[:, :, None]  # [i,j]: square of j minus that of i
     least = (MIN_GAP * squares[:, 2])[:, None, None]
     spins = change * gaps / (gaps.square() + least.square()).clamp_min(1e-37)
     grown = scales + change.diagonal(dim1=1, dim2=2) / (2 * scales)
@@ -86,7 +86,7 @@ def differentiate_base(features: FeatureGaussians) -> Gaussians:
 
 
 def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
-    """Compute the networks' inputs for groups, differentiable, given the same inputs as arrays (``inputs``)."""
+    """Compute the networks' inputs for groups, differentiable; ``inputs`` are the same as arrays."""
     chosen = torch.from_numpy(viewmats[inputs.views]).float()
     base, frames = differentiate_base(features), _differentiate_frames(features.means, chosen, inputs.frames)
     sizes = gaussian_sizes(base.scales).clamp_min(TINY)
@@ -108,7 +108,7 @@ def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, view
 
 
 def _differentiate_frames(means: Tensor, viewmats: Tensor, values: np.ndarray) -> Tensor:
-    """Compute the frames of points in views ``[g,4,4]``, differentiable where the ray is not the image's right."""
+    """Compute the frames of points in views ``[g,4,4]``, differentiable unless the ray is the image's right axis."""
     frames = torch.from_numpy(values)
     if not means.requires_grad:
         return frames
@@ -155,10 +155,10 @@ def _log_ratio(values: Tensor, units: Tensor) -> Tensor:
 def move_feature_tensors(group_features: GroupFeatures, residuals: Tensor) -> FeatureGaussians:
     """Apply corrections ``[g,14]`` like :func:`gsmerge.networks.corrections.move_features`, differentiable."""
     g, f = group_features, group_features.features
-    turns = _rotations(rotate_vectors(g.frames, residuals[:, ROTATION]))
+    rotations = _rotations(rotate_vectors(g.frames, residuals[:, ROTATION]))
     axes, logs = quat_to_rotmat(g.base.quats), residuals[:, SIZE]
     stretches = torch.eye(3) + (axes * torch.expm1(logs)[:, None]) @ axes.transpose(1, 2)
-    changes = turns @ stretches
+    changes = rotations @ stretches
     covars = changes @ f.covars @ changes.transpose(1, 2)
     discs = logs[:, 1] + logs[:, 2]
     return replace(
@@ -172,7 +172,7 @@ def move_feature_tensors(group_features: GroupFeatures, residuals: Tensor) -> Fe
 
 
 def _rotations(vectors: Tensor) -> Tensor:
-    """Compute the rotations ``[n,3,3]`` of rotation vectors ``[n,3]`` (Rodrigues), differentiable at zero, too."""
+    """Compute the rotations ``[n,3,3]`` of rotation vectors ``[n,3]`` (Rodrigues), also differentiable at zero."""
     x, y, z = vectors.unbind(1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
@@ -204,15 +204,15 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
 def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, children: Gaussians) -> Gaussians:
     """Make the round Gaussians that absolute heads correct; see :func:`gsmerge.networks.apply.prepare_children`.
 
-    ``children``: the same ``n`` Gaussians as arrays.
+    ``children`` are the same n Gaussians as arrays.
     """
     parent_ids, base, same = torch.from_numpy(parents), group_features.base, children.to("cpu")
     frames = group_features.frames[parent_ids]
-    turns = (frames - frames.detach()) @ frames.detach().transpose(1, 2)  # zero, with a gradient
+    rotations = (frames - frames.detach()) @ frames.detach().transpose(1, 2)  # zero, with a gradient
     return replace(
         same,
         means=base.means[parent_ids],
-        quats=rotate_quats(skew_vectors(turns), same.quats),
+        quats=rotate_quats(skew_vectors(rotations), same.quats),
         scales=group_features.sizes[parent_ids, None].expand(-1, 3),
         sh0=base.sh0[parent_ids],
     )
@@ -251,7 +251,7 @@ class TrainingContext(NetworkContext):
     def correct_children(
         self, children: Gaussians | None, parents: np.ndarray, group_features: GroupFeatures
     ) -> Gaussians:
-        """Run the heads on children (None: of nothing); return the corrected ones."""
+        """Run the heads on children, or without analytic children if None; return the corrected children."""
         if children is None:
             arrays = groups_to_arrays(group_features)
             round_ones = prepare_children(arrays.base[parents], parents, arrays, self.options)
@@ -265,15 +265,15 @@ class Prediction:
     """The children of a crop, corrected by the networks."""
 
     gaussians: Gaussians  # n corrected children, tensors with gradients
-    parents: Tensor  # [n] int64, the merged Feature Gaussian of each, ascending
-    merged: FeatureGaussians  # the crop's, merged and refined, without gradients
-    sizes: Tensor  # [n] size of each one's group, world units
+    parents: Tensor  # [n] int64 merged Feature Gaussian of each child, ascending
+    merged: FeatureGaussians  # Feature Gaussians of the crop, merged and refined, without gradients
+    sizes: Tensor  # [n] size of each child's group, world units
     matched: float  # share of the crop's Feature Gaussians that were merged with others
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedCrop:
-    """The Feature Gaussians of a crop after all stages before the heads, which every K shares."""
+    """The Feature Gaussians of a crop after all stages before the heads, which are the same for every K."""
 
     context: TrainingContext
     described: GroupFeatures  # merged and refined, tensors with gradients
@@ -281,7 +281,7 @@ class RefinedCrop:
 
 
 def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> RefinedCrop:
-    """Run a crop through encoder, merger and refiner with gradients; each stage reads the results of those before."""
+    """Run a crop through encoder, merger and refiner with gradients; each stage takes the results of earlier stages."""
     example = crop.example
     context = TrainingContext(networks, example.members, example.cameras, seed)
     encoded = context.encode(features_to_tensors(take(example.features, crop.rows)))
@@ -294,8 +294,8 @@ def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int
 def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
     """Run the heads for ``k`` children of every Feature Gaussian of a crop, with gradients.
 
-    Analytic children of residual heads are pooled again from the members for K > 1, so gradients reach earlier stages
-    only through the inputs of these heads.
+    For K > 1 the analytic children of residual heads are pooled from the members again. So gradients reach earlier
+    stages only through the inputs of these heads.
     """
     described, context = refined.described, refined.context
     arrays = features_to_arrays(described.features)
@@ -323,7 +323,7 @@ def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext
 def _make_children(
     crop: Crop, arrays: FeatureGaussians, described: GroupFeatures, context: TrainingContext, k: int
 ) -> tuple[Gaussians | None, np.ndarray]:
-    """Make the Gaussians that the heads correct, tensors, and the rising row ``[n]`` of the group of each."""
+    """Make the Gaussians of tensors that the heads correct, and the row ``[n]`` of the group of each, ascending."""
     if context.makes_children:
         return None, np.repeat(np.arange(len(arrays)), k)
     if k == 1:

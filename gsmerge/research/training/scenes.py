@@ -1,4 +1,4 @@
-"""Scenes with all their photos, and some views that the networks get."""
+"""Prepare scenes for training: all photos of a scene, and some of its views for the networks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmerge.raster.photos import NEAR_PLANE, Photos, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene, Views
 
-OPAQUE = 0.5  # alpha from which the Gaussians cover a pixel
+OPAQUE = 0.5  # least alpha of a pixel that the Gaussians cover
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +25,9 @@ class TrainingScene:
     """The chosen views of a scene, in the canonical frame, with all photos of the scene."""
 
     scene: Scene  # the chosen views
-    members: Members  # its Gaussians
-    cameras: Cameras  # of all photos, those of the chosen views first
-    images: np.ndarray  # [p,h,w,3] float32, at the size of the scene's own
+    members: Members  # the Gaussians of these views
+    cameras: Cameras  # cameras of all photos, those of the chosen views first
+    images: np.ndarray  # [p,h,w,3] float32 photos, at the size of the scene's own
 
     def photos(self, level: float = 1) -> Photos:
         """Return all photos with sides divided by ``level``."""
@@ -35,7 +35,7 @@ class TrainingScene:
 
 
 def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:
-    """Choose evenly spread views for each of the ``counts`` (0 or too many: all), without repeated selections."""
+    """Choose evenly spread views for each of ``counts`` (0 or too many: all), without repeated selections."""
     chosen = [even_views(num_views, count if 0 < count < num_views else num_views) for count in counts]
     return [ids for i, ids in enumerate(chosen) if ids not in chosen[:i]]
 
@@ -43,7 +43,7 @@ def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:
 def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None = None) -> TrainingScene:
     """Prepare the views ``ids`` of an aligned scene for training, with all photos of the scene.
 
-    Photos of ``held_out`` views are added, resized to the scene's own.
+    Photos of ``held_out`` views are added, resized to the size of the scene's own.
     """
     assert scene.images is not None
     part = subset(scene, ids)
@@ -63,7 +63,8 @@ def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
     """Measure the share of each photo's pixels that each chosen view covers, ``[v,p,h,w]`` uint8.
 
     Values are the opacity of the view's Gaussians times 255, and 0 on surfaces that the view does not see. The
-    transmittances of views multiply, so this tells what any subset of them covers. ``level`` divides the photos' sides.
+    transmittances of views multiply, so the coverage of any subset of views follows. ``level`` divides the photos'
+    sides.
     """
     scene, photos = training.scene, training.photos(level)
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
@@ -81,7 +82,7 @@ def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
 
 
 def covered_pixels(covers: np.ndarray) -> np.ndarray:
-    """Return a mask of the pixels that the views cover together, given ``covers [v,...]`` of :func:`coverage`."""
+    """Return the mask of pixels that the views together cover, from ``covers [v,...]`` of :func:`coverage`."""
     left = np.ones(covers.shape[1:], np.float32)
     for cover in covers:
         left *= 1 - cover.astype(np.float32) / 255

@@ -1,14 +1,14 @@
-"""Examples in files: written once, hashed, and read in random order, with few in memory at a time.
+"""Store examples in files: they are written once, hashed, and read in random order, with few in memory at a time.
 
-A shard is a safetensors file with one example. A scene's shards are named in a record, a JSON file that is written
-when all of them are; its name is a hash of the scene's files and of the settings. So a call that was interrupted goes
-on with the first example that is missing, and what is complete is not made again.
+A shard is a safetensors file with one example. The shards of a scene are listed in a record, a JSON file that is
+written after all of them. Its name is a hash of the scene's files and of the settings. So an interrupted call continues
+with the first missing example, and complete examples are not made again.
 
-Threads read ahead. Every crop of a step has a stream of its own: every ``crops``-th of the shards, in an order that is
-shuffled anew for each pass over them. A stream holds ``buffer`` examples, from which the crop draws one at random;
-every ``refresh`` steps the next in the order takes the place of the oldest. A capture takes the place of a shard: what
-its backbone predicts is another example at every place in the order. Which examples these are depends on seed and step
-alone. So a run that is resumed goes on as if it had not stopped.
+Threads read ahead. Every crop of a step has its own stream: every ``crops``-th shard, in an order that is shuffled
+again for each pass. A stream has ``buffer`` examples in memory, and the crop draws one of them at random. Every
+``refresh`` steps the next example in the order replaces the oldest one. A capture can replace a shard; its backbone
+predicts a new example at every place in the order. All of this depends only on seed and step. So a resumed run
+continues as if it had not been interrupted.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from gsmerge.scene.files import find_scene_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.version import __version__
 
-Report = Callable[[str, int, int], None]  # what is done, step, steps
-LAYOUT = 7  # version of the files and of what is in them
+Report = Callable[[str, int, int], None]  # description of the work, step, steps
+LAYOUT = 7  # version of the files and their contents
 FORMAT = "gsmerge-example"
 REMEDY = "remove it; the next call makes it again"
 # Settings that an example depends on
 SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
 PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}
-# Each takes the place of the step in the seed of random numbers: of the order, and of what a capture draws
+# Each replaces the step in a seed of random numbers: of the order, and of the draws of a capture
 ORDER, DRAWN = 2**32 + 1, 2**32 + 2
 
 
@@ -57,16 +57,16 @@ class Shard:
 
     path: Path
     scene: str  # name of the scene
-    sha256: str  # of the arrays
+    sha256: str  # hash of the arrays
 
 
 def prepare_shards(
     scenes: Sequence[Path], options: TrainOptions, folder: Path, report: Report | None = None
 ) -> list[Shard]:
-    """Return the shards of all scenes in order; missing ones are made.
+    """Return the shards of all scenes in order; missing shards are made.
 
-    ``scenes`` are folders or ``.ply`` files; ``report`` is called with (words, step, steps). A SceneError if a scene
-    cannot be used, or the folder cannot be written.
+    ``scenes`` are folders or ``.ply`` files. ``report`` is called with (words, step, steps). Raises SceneError if a
+    scene cannot be used, or if the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -106,7 +106,7 @@ def scene_key(scene: Path, options: TrainOptions) -> str:
     head |= {name: getattr(options, name) for name in SETTINGS}
     files = find_scene_files(scene)
     targets = files.ply.parent / "targets"
-    held_out = content_hash([targets]) if targets.is_dir() else None  # apart: names are relative to their folders
+    held_out = content_hash([targets]) if targets.is_dir() else None  # separate, since names are relative to folders
     return digest({**head, "content": content_hash(read_files(files)), "held_out": held_out})
 
 
@@ -159,9 +159,9 @@ def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def read_shard(shard: Shard, *, check: bool = True) -> Example:
-    """Read the example of a shard; ``check``: compare the arrays with their hash.
+    """Read the example of a shard; with ``check`` compare the arrays with their hash.
 
-    A SceneError if the file is missing, damaged, or another than when the run began.
+    Raises SceneError if the file is missing, damaged, or has changed since the run began.
     """
     arrays, facts = _read(shard.path)
     if facts["sha256"] != shard.sha256 or (check and hash_arrays(arrays) != shard.sha256):
@@ -186,7 +186,7 @@ def read_shard(shard: Shard, *, check: bool = True) -> Example:
 
 
 def _read(path: Path, prefix: str = "") -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read arrays whose name begins with ``prefix``, and the header's facts."""
+    """Read the arrays whose names begin with ``prefix``, and the facts in the header."""
     try:
         with safe_open(path, "np") as file:
             facts = json.loads((file.metadata() or {})[FORMAT])
@@ -201,7 +201,7 @@ TrainingSource = Shard | PredictedCapture
 def read_example(
     source: TrainingSource, options: TrainOptions, rng: np.random.Generator, *, check: bool = True
 ) -> Example:
-    """Read the example of a shard as :func:`read_shard`, or draw one of a capture."""
+    """Read the example of a shard as :func:`read_shard` does, or draw an example of a capture."""
     if isinstance(source, Shard):
         return read_shard(source, check=check)
     return source.draw(options, rng)
@@ -213,12 +213,12 @@ class ExampleStreams:
     def __init__(self, shards: Sequence[TrainingSource], options: TrainOptions) -> None:
         self.shards, self.options = shards, options
         self.pool = ThreadPoolExecutor(options.workers, "gsmerge-read", initializer=work_alone)
-        # Those in memory, or being read, by number of the shard; of a capture also by place in the order, else 0
+        # Examples in memory, or being read, by number of the shard and, for a capture, place in the order (else 0)
         self.examples: dict[tuple[int, int], Future[Example]] = {}
         self.checked: set[int] = set()
 
     def move_to(self, step: int) -> None:
-        """Load the shards that ``step`` may draw from and the next ones; forget all others."""
+        """Load the shards that ``step`` may draw from and the next ones; release all others."""
         ahead = self.options.buffer + 1
         keys = [self._key(step, crop, slot) for slot in range(ahead) for crop in range(self.options.crops)]
         for key in self.examples.keys() - set(keys):
@@ -253,7 +253,7 @@ class ExampleStreams:
 
 @contextmanager
 def open_streams(shards: Sequence[TrainingSource], options: TrainOptions) -> Iterator[ExampleStreams]:
-    """Open streams of examples; their threads end with the block."""
+    """Open streams of examples; their threads end at the end of the block."""
     streams = ExampleStreams(shards, options)
     try:
         yield streams

@@ -1,4 +1,4 @@
-"""Settings of a training run, each with a default, and settings under a name."""
+"""Define the settings of a training run, each with a default, and named presets."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ class TrainOptions(Settings):
 
     network: NetworkOptions = setting(NetworkOptions(), "Sizes of the networks.")
     views: tuple[int, ...] = setting((3, 6, 0), "Numbers of views, evenly spread; 0 means all.",
-        "A scene gives an example for each. The photos of the other views are novel views.", least=0, most=10**6,
-        filled=True)  # fmt: skip
-    random_views: tuple[int, ...] = setting((), "Least and most views of a subset that is drawn anew for every window, "
-        "as `[1, 12]` in the paper, in place of `views`; empty: those.", least=1, most=10**6)  # fmt: skip
-    recolor: bool = setting(False, "Whether every window has colours of its own: channels in any order, less contrast, "
+        "A scene gives an example for each number. The photos of the other views are novel views.", least=0,
+        most=10**6, filled=True)  # fmt: skip
+    random_views: tuple[int, ...] = setting((), "Least and most views of a subset that is drawn for every window, such "
+        "as `[1, 12]` in the paper; it replaces `views`. Empty: not used.", least=1, most=10**6)  # fmt: skip
+    recolor: bool = setting(False, "Change the colours of every window at random: order of channels, contrast, "
         "negatives.",
-        "Few scenes have few colours, and networks learn these.")  # fmt: skip
+        "Few scenes have few colours, and networks would learn these.")  # fmt: skip
     densities: tuple[float, ...] = setting((0.025, 0.044), "Superpixels per pixel; a scene gives an example for each.",
-        "Two by default, since a full fit starts with 57 % of the usual number.", least=1e-6, most=1,
+        "There are two by default, since a full fit starts with 57 % of the usual number.", least=1e-6, most=1,
         filled=True)  # fmt: skip
     segmentation: str = setting("rdseg", "Superpixel method.", choices=SEGMENTATIONS)
     match: MatchMethod = setting("overlap", "Merging across views.",
-        "What the networks make of a window is matched in every step.")  # fmt: skip
+        "The networks' results for a window are matched in every step.")  # fmt: skip
     overlap: float = setting(0.7, "Least overlap of a match by `overlap`.", **PART)
     iou: float = setting(0.2, "Least intersection over union of the boxes of a match by `aabb`.", **PART)
     similarity: float = setting(0.8, "Least cosine of the latents of a match by `aabb`.", least=-1, most=1)
     levels: tuple[int, ...] = setting(SLOTS, "Numbers of children K whose heads are trained.", choices=SLOTS,
         filled=True, unique=True)  # fmt: skip
-    joint: bool = setting(False, "Whether every window trains the heads of all levels, as in the paper, or that of a "
-        "level drawn at random.")  # fmt: skip
-    buffer: int = setting(4, "Examples in memory for each window of a step, which draws one of them.", **COUNT)
-    refresh: int = setting(4, "Steps after which the next example takes the place of the oldest of these.", **COUNT)
+    joint: bool = setting(False, "Train the heads of all levels on every window, as in the paper; otherwise that of "
+        "a random level.")  # fmt: skip
+    buffer: int = setting(4, "Examples in memory for each window of a step; the window is of one of them.", **COUNT)
+    refresh: int = setting(4, "Steps after which the next example replaces the oldest one in memory.", **COUNT)
     workers: int = setting(1, "Threads that read examples ahead.", **COUNT)
     steps: int = setting(6000, "Steps of the training.", **COUNT)
     warmup: int = setting(200, "Steps over which the learning rate increases.", **FROM_0)
@@ -58,11 +58,11 @@ class TrainOptions(Settings):
     clip: float = setting(1.0, "Largest norm of the gradient.", **RATE)
     average: float = setting(0.998, "Weight of the previous mean in the running mean of the weights, which is "
         "validated and saved; less in the first steps.", **PART)  # fmt: skip
-    crops: int = setting(2, "Windows per step, worked on in parallel.", **COUNT)
+    crops: int = setting(2, "Windows per step, computed in parallel.", **COUNT)
     novel: float = setting(0.75, "Share of the windows in novel views, if there are any.", **PART)
     photo_scale: int = setting(2, "Factor by which the sides of the photos are divided.", **COUNT)
-    photo_side: int = setting(0, "Longer side of the photos in pixels, where they are larger, in place of "
-        "`photo_scale`; 476 in the paper; 0: not used.", **FROM_0)  # fmt: skip
+    photo_side: int = setting(0, "Longer side in pixels to which larger photos are reduced; it replaces `photo_scale`. "
+        "476 in the paper; 0: not used.", **FROM_0)  # fmt: skip
     window: int = setting(96, "Side of a window of a photo that is rendered, pixels.", least=LOSS_WINDOW, most=10**9)
     most: int = setting(4000, "Feature Gaussians that may reach into a window; a window with more is halved.", **COUNT)
     photo_loss: str = setting("l1", "Colour loss: `l1` or `mse` (as in the paper).", choices=("l1", "mse"))
@@ -73,16 +73,16 @@ class TrainOptions(Settings):
     lpips_start: float = setting(0.0, "Share of the steps after which LPIPS has its weight.", **PART)
     teacher_weight: float = setting(0.0, "Weight of the distance from the moments of the groups (paper eq. "
         "teacher_mean, teacher_cov).", **WEIGHT)  # fmt: skip
-    teacher_steps: int = setting(2000, "Steps over which it falls to 0.", **COUNT)
-    diversity_weight: float = setting(0.0, "Weight of the diversification of several children, as a share of the "
-        "photometric loss: it is at most that loss times this.", **WEIGHT)  # fmt: skip
-    diversity_steps: int = setting(50_000, "Steps over which it falls to 0.", **COUNT)
-    opacity_shift: float = setting(0.0, "Added to the raw correction of the opacity by the heads of the checkpoints.",
+    teacher_steps: int = setting(2000, "Steps over which `teacher_weight` falls to 0.", **COUNT)
+    diversity_weight: float = setting(0.0, "Weight of the diversification of several children, relative to the "
+        "photometric loss: the term is at most this times that loss.", **WEIGHT)  # fmt: skip
+    diversity_steps: int = setting(50_000, "Steps over which `diversity_weight` falls to 0.", **COUNT)
+    opacity_shift: float = setting(0.0, "Added to the raw correction of the opacity in the heads of the checkpoints.",
         "New captures have holes that scenes in training lack.", least=-8, most=8)  # fmt: skip
     save_every: int = setting(200, "Steps between checkpoints, validation and lines of the table.", **COUNT)
     validation_examples: int = setting(24, "Most examples for validation, spread evenly over all examples.",
         **COUNT)  # fmt: skip
-    validation_windows: int = setting(4, "Windows of each of them, always the same.", **COUNT)
+    validation_windows: int = setting(4, "Windows of each validation example, the same in every validation.", **COUNT)
     seed: int = setting(0, "Seed of all random numbers.", **FROM_0)
 
     def __post_init__(self) -> None:
@@ -132,8 +132,8 @@ class TrainOptions(Settings):
         return asdict(self) | {name: list(getattr(self, name)) for name in LISTS}
 
 
-# Table of hyperparameters, sections 4.1, 4.4 and 5.1 of the paper; settings that it does not give are the defaults, but
-# for the densities.
+# Table of hyperparameters, sections 4.1, 4.4 and 5.1 of the paper. Settings that the paper does not state have their
+# defaults, except for the densities.
 PAPER: Mapping[str, Any] = {
     "outputs": "absolute",
     "merger_start": "first",
@@ -164,8 +164,8 @@ PAPER: Mapping[str, Any] = {
     "diversity_weight": 1.0,
     "diversity_steps": 50_000,
 }
-# What the package ships is trained with. Encoder and merger gained nothing that validation showed; colour corrections
-# learnt the exposure of the training photos. docs/internals/networks.md has the figures.
+# Settings of the shipped networks. Encoder and merger gained nothing in validation, and colour corrections learnt the
+# exposure of the training photos; docs/internals/networks.md has the figures.
 SHIPPED: Mapping[str, Any] = {
     "encoder": False,
     "merger": False,
@@ -181,7 +181,7 @@ SHIPPED: Mapping[str, Any] = {
     "save_every": 100,
     "validation_windows": 6,
 }
-# The paper's training, shortened to what two processor cores do in an hour and a half.
+# The paper's training, shortened to one and a half hours on two processor cores.
 PAPER_SHIPPED: Mapping[str, Any] = {
     **PAPER,
     "recolor": True,

@@ -1,4 +1,4 @@
-"""Parts of examples that a step works on: windows of photos, and the Feature Gaussians in them."""
+"""Sample the parts of examples that a step uses: windows of photos, and the Feature Gaussians in them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from gsmerge.raster.photos import NEAR_PLANE, Photos
 from gsmerge.research.training.examples import Example
 from gsmerge.types import Cameras
 
-MIN_SIDE = 16  # pixels; sides are not halved to less
-BORDER = 4  # pixels around a window, from which corrections may move Gaussians into it
+MIN_SIDE = 16  # least side of a halved window, pixels
+BORDER = 4  # pixels around a window from which corrections may move Gaussians into it
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +23,8 @@ class Crop:
     """A subset of an example's Feature Gaussians, with K children each."""
 
     example: Example
-    k: int  # Gaussians that each becomes
-    rows: np.ndarray  # [r] ascending rows of its Feature Gaussians
+    k: int  # number of children of each
+    rows: np.ndarray  # [r] rows of the example's Feature Gaussians, ascending
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ class Box:
 class Window:
     """A rectangle of a photo, with the Feature Gaussians that are rendered and compared with it."""
 
-    photo: int  # which of the example's photos
-    box: Box  # which part of it
+    photo: int  # number of the photo in the example
+    box: Box  # the rectangle
     crop: Crop  # all Feature Gaussians that reach into it
 
     @property
     def camera(self) -> Cameras:
-        """Camera whose image is the window."""
+        """Camera that sees only the window."""
         c = box_camera(self.crop.example.photos, self.photo, self.box)
         return Cameras(c["viewmat"][None], c["K"][None], c["width"], c["height"])
 
@@ -80,8 +80,9 @@ def sample_window(
 ) -> Window:
     """Sample a window around a random pixel that the example's views cover.
 
-    K is drawn from ``levels``. The window is ``side`` pixels wide, or as wide as the photo, and is halved while more
-    than ``most`` Feature Gaussians reach into it. ``novel`` is the share of windows in novel views, if there are any.
+    K is drawn from ``levels``. The window has ``side`` pixels per side, or less in smaller photos. It is halved while
+    more than ``most`` Feature Gaussians reach into it. ``novel`` is the share of windows in novel views, if there are
+    any.
     """
     k = levels[int(rng.integers(len(levels)))]
     num_views = len(example.cameras)
@@ -96,7 +97,7 @@ def sample_window(
     height, width = example.images.shape[1:3]
     w, h = min(side, width), min(side, height)
     left, top = (max(0, at - part // 2) for at, part in ((pixel % width, w), (pixel // width, h)))
-    box = Box(min(left, width - w), min(top, height - h), w, h)  # moved into the photo
+    box = Box(min(left, width - w), min(top, height - h), w, h)  # moved inside the photo
     rows = _rows(example, photo, box)
     while len(rows) > most and box.halved() != box:
         box = box.halved()

@@ -100,7 +100,7 @@ def test_of_many_lines_one_for_each_method_is_drawn() -> None:
 
 def axes_of(figure: Figure) -> Axes:
     with matplotlib.rc_context(RC):
-        drawing = draw_curves(figure, line_styles((line.name, line.ours) for line in figure.panels[0].lines))
+        drawing = draw_curves(figure, line_styles((line.name, line.is_own) for line in figure.panels[0].lines))
         drawing.draw_without_rendering()
     return drawing.axes[0]
 

@@ -18,7 +18,7 @@ PSNR = "psnr_target_visible"
 def test_lines_are_methods_with_their_settings() -> None:
     lines = Results(make_grid()).by_size("ratio", PSNR)
     assert [line.name for line in lines] == ["gsmerge", "gsmerge, no fit", "voxel", "random"]
-    assert [line.ours for line in lines] == [True, True, False, False]
+    assert [line.is_own for line in lines] == [True, True, False, False]
     assert [p.label for p in lines[0].points] == ["1%", "4.4%", "20%"]
     point = lines[0].points[1]
     assert point.x == pytest.approx(0.044)
