@@ -54,6 +54,6 @@ def allow(change: Change, **settings: Any) -> Damage:
     return Damage(change, (READ, REFUSED), **settings)
 
 
-def leave_to_sweep(damages: dict[str, Damage]) -> dict[str, Damage]:
+def leave_to_sweep(damages: dict[Any, Damage]) -> dict[Any, Damage]:
     """Return the same damages for the sweep alone."""
     return {name: replace(damage, slow=True) for name, damage in damages.items()}

@@ -56,8 +56,10 @@ OWN = {"a zip": (".sog", ".npz"), "a gzip": (".spz",), "a PLY file": (".ply", ".
 def _pieces(kind: str) -> dict[str, Damage]:
     """Damages of a file as bytes."""
     outcome = allow if kind == "ply, text" or PurePath(SOUNDS[kind].name).suffix in PARTS_MAY_BE_SOUND else refuse
-    damages = {f"the first {share:.2%}": outcome(cut(share)) for share in (0.0001, 0.05, 0.3, 0.5, 0.9)}
-    damages |= {
+    shares = {share: outcome(cut(share)) for share in (0.3, 0.9)}
+    shares |= leave_to_sweep({share: outcome(cut(share)) for share in (0.0001, 0.05, 0.5)})
+    return {
+        **{f"the first {share:.2%}": damage for share, damage in shares.items()},
         "all but the end": allow(cut(0.999)),
         "empty": refuse(write(b"")),
         **({} if SOUNDS[kind].scene else {"missing": refuse(Path.unlink, "no such file")}),
@@ -68,7 +70,6 @@ def _pieces(kind: str) -> dict[str, Damage]:
         "1 TB of zeros": refuse(fill_with_zeros(TERABYTE)),
         "1 TB of zeros behind it": allow(fill_with_zeros(TERABYTE, None)),
     }
-    return damages
 
 
 def _other_content(kind: str, suffix: str) -> dict[str, Damage]:
@@ -108,7 +109,8 @@ def _archives() -> dict[str, Damage]:
 
 def _all(kind: str) -> dict[str, Damage]:
     suffix = PurePath(SOUNDS[kind].name).suffix
-    damages = _pieces(kind) | _other_content(kind, suffix)
+    other, first = _other_content(kind, suffix), next(k for k in FILES if SOUNDS[k].name.endswith(suffix))
+    damages = _pieces(kind) | (other if kind == first else leave_to_sweep(other))
     damages |= _json() if suffix in WITH_JSON else {}
     damages |= _archives() if suffix in ZIPPED else {}
     if kind in ASKED:

@@ -26,7 +26,7 @@ def edit_frames(change: Callable[[dict[str, Any]], object]) -> Change:
     return edit_json(each)
 
 
-def repeat_first_row(times: int, key: str = "") -> Change:
+def repeat_cameras(times: int, key: str = "") -> Change:
     """As many times the cameras, or one list of them."""
 
     def change(data: Any) -> None:
@@ -85,9 +85,9 @@ def of_transforms() -> dict[str, Damage]:
         "a pose of 1e200": refuse(set_json("frames", 0, "transform_matrix", value=[[1e200] * 4] * 4)),
         "path with line breaks and no pose": refuse(set_json("frames", 0, value={"file_path": "a\nb\r\n\x1b[2Jc"})),
         "a nested pose": refuse(write_json(nested)),
-        "300 frames": allow(repeat_first_row(100, "frames")),
-        "9,999 frames": allow(repeat_first_row(3333, "frames"), slow=True),
-        "20,001 frames": refuse(repeat_first_row(6667, "frames"), slow=True),
+        "300 frames": allow(repeat_cameras(100, "frames")),
+        "9,999 frames": allow(repeat_cameras(3333, "frames"), slow=True),
+        "20,001 frames": refuse(repeat_cameras(6667, "frames"), slow=True),
         "a path of 20,000 folders": accept(set_json("frames", 0, "file_path", value=deep), slow=True),
         **_large(),
     }
@@ -104,7 +104,7 @@ def rename_stray(change: Change) -> Change:
     return lambda path: change(path.rename(path.with_name("stray.json")))
 
 
-MANY = repeat_first_row(2 * MOST // 3 + 1)
+MANY = repeat_cameras(2 * MOST // 3 + 1)
 DAMAGES = {
     "transforms": of_transforms(),
     "Blender": {
@@ -113,7 +113,7 @@ DAMAGES = {
     },
     "INRIA": {"a huge width": allow(set_json(0, "width", value=10**400)), "20,001 cameras": refuse(MANY, slow=True)},
     "WorldMirror": {
-        **{f"20,001 {key}": refuse(repeat_first_row(2 * MOST // 3 + 1, key)) for key in ("extrinsics", "intrinsics")},
+        **{f"20,001 {key}": refuse(repeat_cameras(2 * MOST // 3 + 1, key)) for key in ("extrinsics", "intrinsics")},
         "camera_id of 5,000 digits": allow(edit_json(lengthen_ids)),
         "camera_id of 5,000 digits in a stray file": allow(rename_stray(edit_json(lengthen_ids))),
     },

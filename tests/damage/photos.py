@@ -192,7 +192,12 @@ def of_other_formats() -> dict[str, Damage]:
         **{f".tiff {word}": refuse(recode(".tiff", change), place=ALL) for word, change in tiffs.items()},
         **{
             f".tiff masks of a tile of 26000 x 26000, {order}": refuse(
-                write_masks(with_tile(26_000, order)), "view_000.tiff", "26000 x 26000", place="masks", compacts=True
+                write_masks(with_tile(26_000, order)),
+                "view_000.tiff",
+                "26000 x 26000",
+                place="masks",
+                compacts=True,
+                slow=True,
             )
             for order in "<>"
         },

@@ -138,7 +138,7 @@ def of_things() -> dict[str, Damage]:
     for thing, make in {"loop": link_to_itself, "pipe": make_pipe}.items():
         damages |= {
             f"scene.ply as a {thing}": refuse(replace_with("scene.ply", make), place="scene.ply"),
-            f"transforms.json as a {thing}": allow(replace_with("transforms.json", make)),
+            f"transforms.json as a {thing}": allow(replace_with("transforms.json", make), slow=thing == "loop"),
             f"images as a {thing}": allow(replace_with("images", make)),
             f"an image as a {thing}": refuse(replace_with("images/view_000.png", make), place="view_000.png"),
         }
@@ -152,8 +152,8 @@ def of_things() -> dict[str, Damage]:
         change = add_arguments("-o", "{}/out.ply", make=lambda folder, make=make: make(folder / "out.ply"))
         damages[f"the output a {thing}"] = Damage(change, (READ, USAGE, REFUSED))
     for name in ("scene.ply", "transforms.json", "images", "images/view_000.png"):
-        damages[f"{name} as a ring"] = allow(replace_with(name, link_in_ring))
-        damages[f"{name} as a folder"] = allow(replace_with(name, os.mkdir))
+        damages[f"{name} as a ring"] = allow(replace_with(name, link_in_ring), slow=name == "transforms.json")
+        damages[f"{name} as a folder"] = allow(replace_with(name, os.mkdir), slow=name == "transforms.json")
     return damages
 
 
@@ -167,7 +167,7 @@ def of_arguments() -> dict[str, Damage]:
             add_arguments(make=lambda folder: make_endless(folder / "images" / "more"))
         ),
         "a path of 2000 letters": accept(move_deep),
-        "500 empty images": accept(add_arguments(make=add_images)),
+        "500 empty images": accept(add_arguments(make=add_images), slow=True),
         "nothing where the scene was": refuse(
             add_arguments(make=lambda folder: remove(folder / "scene.ply")), place="scene", other_kind=True
         ),

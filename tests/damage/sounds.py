@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ from gsmerge.states.compactor import Compactor
 from gsmerge.states.state_file import load_state
 from gsmerge.types import Gaussians
 
-from .changes import glb_bytes
+from .changes import glb_bytes, pack_members
 
 SPLATTING = "KHR_gaussian_splatting"
 SPZ_IN_GLB = f"{SPLATTING}_compression_spz_2"
@@ -94,20 +94,23 @@ class Sound:
     rare: bool = False
     fuzzed: bool = True
 
+    @cached_property
+    def files(self) -> dict[str, bytes]:
+        """The file and those that belong to it, by their paths in the folder."""
+        return files_of(self.make)
+
     def put(self, folder: Path) -> Path:
         """Write everything into a new folder; return the path of the file."""
         folder.mkdir()
-        if self.scene:
-            self.scene(folder)
-        self.make(folder)
+        others = files_of(self.scene) if self.scene else {}
+        for name, data in (others | self.files).items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(data)
         return folder / self.name
 
     def content(self) -> bytes:
         """Return the file, or an archive of the folder, of which changed ones are made."""
-        with tempfile.TemporaryDirectory() as place:
-            folder = Path(place)
-            self.make(folder)
-            return pack(folder) if self.packed else (folder / self.name).read_bytes()
+        return pack_members(self.files) if self.packed else self.files[self.name]
 
     def attempt(self, data: bytes, folder: Path) -> bool:
         """Read such content in an empty folder -> whether it is sound.
@@ -131,13 +134,13 @@ class Sound:
         return False
 
 
-def pack(folder: Path) -> bytes:
-    """Return the files of a folder as an archive."""
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as file:
-        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-            file.writestr(str(path.relative_to(folder)), path.read_bytes())
-    return packed.getvalue()
+@cache
+def files_of(make: Make) -> dict[str, bytes]:
+    """Return what a function writes into a folder, by path; each writes once in a run, as disks take their time."""
+    with tempfile.TemporaryDirectory() as place:
+        make(Path(place))
+        paths = sorted(path for path in Path(place).rglob("*") if path.is_file())
+        return {path.relative_to(place).as_posix(): path.read_bytes() for path in paths}
 
 
 def unpack(data: bytes, folder: Path) -> bool:

@@ -19,7 +19,7 @@ import cv2
 import pytest
 from damage import DAMAGES, SOUNDS
 from damage.arrays import MARKER
-from damage.sounds import COMPACT, OF_CAMERAS, TINY
+from damage.sounds import COMPACT, INSPECT, OF_CAMERAS, TINY
 from forked_commands import FAILED, CommandServer, Limits, Outcome, refused_by_inspect, run_forked
 from messages import ERROR, names, says
 from sweeps import sweep
@@ -166,7 +166,7 @@ def test_damaged_files_are_read_within_a_budget(name: str, tmp_path: Path, serve
     damage, (path, words) = DAMAGES[name][1], spoil(name, tmp_path)
     before, num_bytes = listing(tmp_path), size_of(tmp_path)
     outcome = server.run(words, limits(num_bytes))
-    within_budget(outcome, num_bytes)
+    within_budget(outcome, num_bytes, describes=words[0] == INSPECT[0])
     check(outcome, name, path)
     assert not list(tmp_path.rglob(MARKER))
     if damage.compacts and outcome.code == 0:
