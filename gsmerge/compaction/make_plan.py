@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.plan import (
-    Plan,
     FilledOptions,
+    Plan,
     check_networks,
     check_pictures,
     choose_networks,
     count_unseen,
     cuts_views,
     decide,
-    heads_alone,
     fill_options,
+    heads_alone,
 )
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
