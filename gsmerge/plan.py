@@ -50,18 +50,15 @@ USUAL_VIEWS = 12  # views up to which the steps of an effort are enough
 FIDELITY_PSNR = 32.5
 # By default, results with photos but without pixels show the photos at most so many dB worse than the input
 FIDELITY_LOSS = 0.3
-# A scene without views gets one step for every PER_STEP of its Gaussians, of a larger result for every PER_STEP plus
-# one for each PER_DRAWN Gaussians of the result; at most the steps of the effort
+# A scene without views gets one step of the fit for every PER_STEP + count / PER_DRAWN of its Gaussians, where count is
+# the number in the result; at most the steps of the effort
 PER_STEP, PER_DRAWN = 700, 40
 RENDERS_STEPS = 0.35  # step sizes of a fit to renders instead of photos, relative to the usual: it begins near to them
 PLACED_STEPS = 0.2  # the same for placed views, which say less about other views
-NO_FIT = "without cameras there is no fit to placed views unless --effort best, or the default effort with a --budget"
+NO_FIT = "there is no fit without cameras: it needs --effort best, or the default effort with a --budget"
 BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic
 WHOLE_GAUSSIANS = 20_000_000  # Gaussians up to which a scene is compacted in one piece, unless it has many views
-BLOCK_VIEWS, WHOLE_VIEWS = (
-    42,
-    168,
-)  # the same two limits in views, if views of different blocks see little of each other
+BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same two limits in views, if blocks see little of each other
 LONE_K = 4  # K if all views have one camera, because no other view adds Gaussians of its own to a surface
 
 
@@ -257,9 +254,7 @@ def count_unseen(prepared: Prepared, filled: FilledOptions) -> int:
 class SceneChoices:
     """Decisions about a whole scene that need no computation; a run, its estimate and its blocks share them."""
 
-    blocks: (
-        int  # Blocks in which the scene is compacted; at most so many, if they follow from the number of views alone
-    )
+    blocks: int  # Blocks in which the scene is compacted; at most so many, if they follow from the views alone
     decode: DecodeOptions  # Gaussians per group
     limits: CountLimits  # Limits of the number of Gaussians
     match: MatchMethod  # How Gaussians are merged across views

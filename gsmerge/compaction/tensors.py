@@ -269,7 +269,7 @@ def _check_values(out: dict[str, np.ndarray], valid: np.ndarray) -> None:
 
 
 def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
-    """Raise SceneError for colours more than ``slack`` outside [0, 1]; the message names their apparent range."""
+    """Raise SceneError for colours more than ``slack`` outside [0, 1]; the message guesses their range."""
     low, high = float(values.min(initial=0)), float(values.max(initial=0))
     if -slack <= low and high <= 1 + slack:
         return

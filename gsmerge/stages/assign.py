@@ -1,4 +1,4 @@
-"""Groups and Gaussians -> members: the pixel that each Gaussian belongs to. Those that no view sees are marked."""
+"""Groups and Gaussians -> members: the pixel that each Gaussian belongs to; Gaussians that no view sees have none."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from gsmerge.types import Gaussians, Groups, Pixels, Scene
 
 @stage("members")
 def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Members:
-    """Return all Gaussians of a canonical scene with pixels as members; UsageError if no view sees any.
+    """Return all Gaussians of a canonical scene with pixels as members; UsageError if no view sees any Gaussian.
 
-    A Gaussian belongs to the superpixel of its pixel. ``by_contribution``: to the one, of all views, that gets most of
-    its blending weights (paper, supplement "Compaction of Non-Pixel-Aligned FF Backbones"), where views have no
-    Gaussians of their own; every view is drawn for that.
+    A Gaussian belongs to the superpixel of its pixel. ``by_contribution``: if views have no Gaussians of their own, it
+    belongs to the superpixel, of all views, that gets most of its blending weights (paper, supplement "Compaction of
+    Non-Pixel-Aligned FF Backbones"). Every view is drawn for that.
     """
     members = scene_members(scene)
     if by_contribution and not scene.has_own_pixels:
@@ -41,7 +41,7 @@ def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Me
 
 
 def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
-    """Merge n Gaussians that no view sees into ``count``, by runs along Morton's curve."""
+    """Merge n Gaussians that no view sees into ``count`` Gaussians, by runs along Morton's curve."""
     order = np.argsort(morton_codes(gaussians.means.astype(np.float64)), kind="stable")
     fronts = np.full((len(scene), scene.cameras.height, scene.cameras.width), -1, np.int32)
     nowhere = Pixels(np.full(len(gaussians), -1), fronts, own=False)
@@ -55,25 +55,25 @@ def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
 class Owners:
     """The superpixel to which each of n Gaussians contributes most."""
 
-    values: np.ndarray  # [n] float32 blending weights summed over the superpixel, pixels; or 0
-    views: np.ndarray  # [n] int32, -1 if unseen
-    labels: np.ndarray  # [n] int32 superpixel within the view, -1 if unseen
+    values: np.ndarray  # [n] float32, blending weights summed over the superpixel, in pixels; 0 if unseen
+    views: np.ndarray  # [n] int32, view of the superpixel; -1 if unseen
+    labels: np.ndarray  # [n] int32, superpixel within the view; -1 if unseen
 
 
 def find_owners(scene: Scene, groups: Groups) -> Owners:
-    """Find the superpixel to which each Gaussian contributes most, over all views; in ties the first view counts."""
+    """Find the superpixel, of all views, to which each Gaussian contributes most; of equals, that of the first view."""
     count, lock = len(scene.gaussians), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
-    def one_view(view: int, tiled: TiledView) -> None:
+    def update_best(view: int, tiled: TiledView) -> None:
         values, labels = view_owners(tiled, groups.labels[view], groups.counts[view])
         with lock:
-            old, first = best.values[tiled.ids], best.views[tiled.ids]
-            better = (values > old) | ((values == old) & (labels >= 0) & (view < first))
-            ids = tiled.ids[better]
-            best.values[ids], best.views[ids], best.labels[ids] = values[better], view, labels[better]
+            best_values, best_views = best.values[tiled.ids], best.views[tiled.ids]
+            is_better = (values > best_values) | ((values == best_values) & (labels >= 0) & (view < best_views))
+            ids = tiled.ids[is_better]
+            best.values[ids], best.views[ids], best.labels[ids] = values[is_better], view, labels[is_better]
 
-    tile_views(scene, one_view)
+    tile_views(scene, update_best)
     return best
 
 
@@ -88,10 +88,10 @@ def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
     counts = np.asarray(groups.counts)
     size, first = groups.labels[0].size, np.cumsum(counts) - counts
 
-    def one_view(view: int) -> np.ndarray:
+    def view_middles(view: int) -> np.ndarray:
         return middle_pixels(groups.labels[view], groups.counts[view]) + view * size
 
-    middles = np.concatenate(parallel_map(one_view, range(len(counts))))
+    middles = np.concatenate(parallel_map(view_middles, range(len(counts))))
     return np.where(owners.labels >= 0, middles[first[owners.views] + owners.labels], -1)
 
 
@@ -102,9 +102,9 @@ def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
     y, x = np.divmod(np.arange(height * width), width)
     sizes = np.maximum(np.bincount(flat, minlength=count), 1)
     dy, dx = (axis - (np.bincount(flat, axis, count) / sizes)[flat] for axis in (y, x))
-    away, least = dx * dx + dy * dy, np.full(count, np.inf)
-    np.minimum.at(least, flat, away)
-    nearest = np.flatnonzero(away == least[flat])[::-1]  # the first pixel of equal ones is written last
+    squares, least = dx * dx + dy * dy, np.full(count, np.inf)
+    np.minimum.at(least, flat, squares)
+    nearest = np.flatnonzero(squares == least[flat])[::-1]  # of equally near pixels the first is written last
     middles = np.zeros(count, np.int64)
     middles[flat[nearest]] = nearest
     return middles

@@ -1,4 +1,4 @@
-"""Fitted Gaussians -> wanted Gaussians: cropped to a box or a sphere, without floaters, sky or what no view shows."""
+"""Fitted Gaussians -> wanted Gaussians: cropped to a box or a sphere, without floaters, sky and unseen Gaussians."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
 
-BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
-OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
-NEIGHBORS = 8  # nearest Gaussians, of which a floater touches none
+BOX_QUANTILES = (1, 99)  # percentiles of the positions along each axis that bound the scene's box
+OUTLIER_BOX = 10.0  # Gaussians outside of a box so many times as large are far from the scene
+NEIGHBORS = 8  # a floater touches none of so many nearest Gaussians
 ROWS = 1 << 14  # Gaussians per task
-TOUCH = 3.0  # Gaussians touch within so many of their largest scales together
-APART = 3.0  # times the median distance of nearest Gaussians: a floater's own is larger
-# Second and largest scale, as shares of half the diagonal of the scene's box, from which on a Gaussian hangs across the
-# scene if it is also so many times as large as the median one. Exports, and results without a fit, have none
+TOUCH = 3.0  # two Gaussians touch if their distance is at most so many times the sum of their largest scales
+APART = 3.0  # the nearest Gaussian of a floater is more than so many times the median distance away
+# A Gaussian hangs across the scene if its second or its largest scale is at least such a share of half the diagonal of
+# the scene's box, and WIDER times that of the median Gaussian. Exports, and results without a fit, have none of these
 CURTAIN, WIDER = (0.1, 0.33), 8.0
 MAX_SAMPLE_GAUSSIANS = 200_000  # Gaussians that a share is estimated from
 
@@ -32,9 +32,10 @@ Counts = dict[str, int]
 
 
 def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
-    """Return a mask ``[n]`` of centres ``[n,3]`` outside ten times the box of the scene.
+    """Return a mask ``[n]`` of centres ``[n,3]`` outside of a box ten times as large as that of the scene.
 
-    The box contains 1 % to 99 % of the ``samples``, or of the centres themselves, along each axis.
+    The scene's box reaches from the 1st to the 99th percentile of the ``samples``, or else of the centres, along each
+    axis.
     """
     low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
     half = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
@@ -44,9 +45,9 @@ def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.nda
 def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
     """Return a mask ``[n]`` of finite Gaussians that are isolated, far beyond the scene, or hang across it.
 
-    A Gaussian is isolated if none of its eight nearest neighbours is within three times the largest scales of both, and
-    the nearest is more than three times as far away as for the median Gaussian. For the others see :func:`beyond_scene`
-    and :func:`curtains`. ``rows [m]``: test only these.
+    A Gaussian is isolated if none of its eight nearest neighbours is within three times the sum of their largest
+    scales, and the nearest is more than three times as far away as that of the median Gaussian. See
+    :func:`beyond_scene` and :func:`curtains` for the other two. ``rows [m]``: test only these, and return ``[m]``.
     """
     rows = np.arange(len(gaussians)) if rows is None else rows
     means, sizes = gaussians.means.astype(np.float64), gaussians.scales.max(1).astype(np.float64)
@@ -57,12 +58,12 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     order = np.concatenate([rows, np.flatnonzero(untested)])
     points, sizes, ids = means[order], sizes[order], np.empty((len(means), NEIGHBORS), np.int64)
     tree, axes, splits = make_tree(points)
-    nobody = np.full(len(means), -1)  # every point is of another view than all others
+    views = np.full(len(means), -1)  # -1: each point has a view of its own, so all others may be neighbours
     touched, nearest = np.empty(len(rows), bool), np.empty(len(rows))
 
     def measure(first: int) -> None:
         span = slice(first, min(first + ROWS, len(rows)))
-        nearest_of_others(points, nobody, tree, axes, splits, span.start, span.stop, len(means), ids)
+        nearest_of_others(points, views, tree, axes, splits, span.start, span.stop, len(means), ids)
         distances = np.sqrt(((points[ids[span]] - points[span, None]) ** 2).sum(2))
         touched[span] = (distances <= TOUCH * (sizes[span, None] + sizes[ids[span]])).any(1)
         nearest[span] = distances[:, 0]
@@ -74,7 +75,7 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
 
 
 def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
-    """Return a mask ``[m]`` of the Gaussians ``rows [m]`` that hang across the scene: huge, unlike their neighbours."""
+    """Return a mask ``[m]`` of the Gaussians ``rows [m]`` that hang across the scene: far larger than the median."""
     low, high = np.percentile(gaussians.means.astype(np.float64), BOX_QUANTILES, axis=0)
     radius = np.sqrt(((high - low) ** 2).sum()) / 2
     scales = np.sort(gaussians.scales, axis=1)[:, 1:]
@@ -83,7 +84,7 @@ def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
 
 
 def floater_share(gaussians: Gaussians) -> float:
-    """Estimate the share of finite Gaussians that are :func:`floaters`; 0 without any."""
+    """Estimate the share of finite Gaussians that are :func:`floaters`; 0 without Gaussians."""
     rows = np.arange(0, len(gaussians), max(1, -(-len(gaussians) // MAX_SAMPLE_GAUSSIANS)))
     return float(floaters(gaussians, rows).mean()) if len(rows) else 0.0
 
@@ -91,10 +92,11 @@ def floater_share(gaussians: Gaussians) -> float:
 def clean(
     gaussians: Gaussians, options: CleanOptions, cameras: Cameras | None, photos: np.ndarray | None, to_world: ToWorld
 ) -> tuple[np.ndarray, Counts]:
-    """Choose wanted Gaussians; return their rows, and the numbers of others: ``cropped``, and one for each of ``drop``.
+    """Choose wanted Gaussians; return their rows, and the number of dropped ones by reason.
 
-    Gaussians and ``cameras`` are canonical; ``to_world`` maps to the frame of the crop. The sky is found in the
-    ``photos [v,h,w,3]``; without cameras, what no placed camera shows is unseen.
+    The reasons are ``cropped`` and those that ``options`` drop. Gaussians and ``cameras`` are canonical; ``to_world``
+    maps to the frame of the crop. The sky is found in the ``photos [v,h,w,3]``. Without cameras, a Gaussian is unseen
+    if none of several placed cameras shows it.
     """
     rows, counts = np.arange(len(gaussians)), Counts()
 
@@ -103,25 +105,25 @@ def clean(
         rows, counts[name] = rows[~unwanted], int(unwanted.sum())
         return gaussians[rows]
 
-    left = gaussians
-    if "unseen" in options.drops:  # before others go that hide it
-        placed = place_viewpoints(left) if cameras is None and len(left) else cameras
-        left = remove("unseen", np.ones(0, bool) if placed is None else count_views(left, placed) == 0)
+    remaining = gaussians
+    if "unseen" in options.drops:  # first, because Gaussians that are dropped later may hide others now
+        placed = place_viewpoints(remaining) if cameras is None and len(remaining) else cameras
+        remaining = remove("unseen", np.ones(0, bool) if placed is None else count_views(remaining, placed) == 0)
     if options.crop is not None:
-        left = remove("cropped", ~inside_crop(to_world(left).means, options.crop))
+        remaining = remove("cropped", ~inside_crop(to_world(remaining).means, options.crop))
     if "transparent" in options.drops:
-        left = remove("transparent", left.opacities < LEAST_OPACITY)
+        remaining = remove("transparent", remaining.opacities < LEAST_OPACITY)
     if "sky" in options.drops:
         assert cameras is not None, "sky is dropped where there are photos"
         assert photos is not None, "sky is dropped where there are photos"
-        left = remove("sky", sky(left, cameras, photos))
+        remaining = remove("sky", sky(remaining, cameras, photos))
     if "floaters" in options.drops:
-        remove("floaters", floaters(left))
+        remove("floaters", floaters(remaining))
     return rows, counts
 
 
 def describe_counts(counts: Counts, *, placed: bool) -> str:
-    """Say how many Gaussians :func:`clean` removed for each reason; ``placed``: no camera of the scene is known."""
+    """Say how many Gaussians :func:`clean` dropped for each reason; ``placed``: no camera of the scene is known."""
     words = {
         "cropped": "outside of the crop",
         "sky": "sky",

@@ -1,4 +1,4 @@
-"""Feature Gaussians -> Gaussians: K children of every group, analytic, corrected by networks if any."""
+"""Feature Gaussians -> Gaussians: K children of every group by closed formulas, corrected by networks if any."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.types import Decoded, FeatureGaussians, Gaussians, PicturedScene, Scene
 
 GROUPS_PER_TASK = 8192
-REFILLS = 3  # times that Gaussians too faint to be seen are replaced by others, of which a few are faint again
-PLANE_WEIGHT = 1 / 16  # of squared distances from a group's plane; the unit is that of the children's features
+REFILLS = 3  # rounds in which Gaussians too faint to be seen are replaced by others; a few of these are faint again
+PLANE_WEIGHT = 1 / 16  # weight of squared distances from a group's plane, in the unit of the children's features
 
 
 def decode(
@@ -30,11 +30,12 @@ def decode(
     counts: np.ndarray | None = None,
     networks: Corrector = ANALYTIC,
 ) -> Gaussians:
-    """Decode each Feature Gaussian into K Gaussians, fewer if its members are alike.
+    """Decode each Feature Gaussian into K Gaussians, or fewer if its members are equal.
 
-    Children are found by halving the members repeatedly across their widest direction in colour and position, so the
-    children of K = 2 are unions of those of K = 4; heads with absolute outputs make exactly K of every group.
-    ``counts [g]``, from 1 on, sets K for each group and is required for mixed K. Gaussians of one group are adjacent.
+    The members are halved repeatedly across their widest direction in colour and position, and each part becomes a
+    child. So the children of K = 2 are unions of those of K = 4. Heads with absolute outputs make exactly K children of
+    every group instead. ``counts [g]``, at least 1, sets K for each group and is required for mixed K. Gaussians of one
+    group are adjacent.
     """
     if counts is None:
         counts = np.full(len(features), options.max_k)
@@ -46,7 +47,7 @@ def decode(
 
 
 def keep_all(scene: Scene, count: int | None) -> Decoded | None:
-    """Return all Gaussians of a scene if at least as many are asked for; otherwise None."""
+    """Return all Gaussians of a scene unchanged if at least that number is asked for; otherwise None."""
     if count is None or count < len(scene.gaussians):
         return None
     return Decoded(scene.gaussians, len(scene.gaussians), exact=True, is_input=True)
@@ -54,19 +55,22 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
 
 @stage("decode")
 def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOptions, *, grows: bool) -> Decoded:
-    """Decode merged views into the exact count, unless the fit ``grows`` to it, or into K Gaussians per group."""
-    asked = merged.segmentation
-    if asked.exact and not grows:
-        gaussians = _decode_exactly(merged, asked.count, options)
+    """Decode merged views into the Gaussians that a fit starts from.
+
+    Their number is the exact count that is asked for, unless the fit ``grows`` to it; otherwise K per group.
+    """
+    count, exact = merged.segmentation.count, merged.segmentation.exact
+    if exact and not grows:
+        gaussians = _decode_exactly(merged, count, options)
     else:
         gaussians = _decode_count(merged, scene, merged_count(merged, options, grows=grows), options)
-        if asked.exact and len(gaussians) > asked.count:  # K each would be more than the fit may grow to
-            gaussians = _decode_count(merged, scene, asked.count, options)
-    return Decoded(gaussians, asked.count, asked.exact)
+        if exact and len(gaussians) > count:  # K per group are more than the fit may grow to
+            gaussians = _decode_count(merged, scene, count, options)
+    return Decoded(gaussians, count, exact)
 
 
 def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, options: DecodeOptions) -> Gaussians:
-    """Decode ``count`` Gaussians where they lower distortion most; None: K per Feature Gaussian."""
+    """Decode ``count`` Gaussians, more for groups in which they lower distortion most; None: K per Feature Gaussian."""
     features, members, networks = merged.features, merged.members, merged.networks
     children = None
     if count is not None:
@@ -77,26 +81,26 @@ def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, 
 
 
 def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> Gaussians:
-    """Decode ``count`` visible Gaussians where they lower distortion most."""
+    """Decode ``count`` visible Gaussians, more for groups in which they lower distortion most."""
     features, members, networks = merged.features, merged.members, merged.networks
-    every = replace(options, min_opacity=0.0)
+    with_faint = replace(options, min_opacity=0.0)
     return deal_visible(
         deal_order(features, members, networks.max_children),
         len(features),
         count,
         options.min_opacity,
-        lambda counts: decode(features, members, every, counts, networks=networks),
+        lambda counts: decode(features, members, with_faint, counts, networks=networks),
     )
 
 
 def deal_visible(
     order: np.ndarray, num_groups: int, total: int, min_opacity: float, make: Callable[[np.ndarray], Gaussians]
 ) -> Gaussians:
-    """Make ``total`` visible Gaussians; those fainter than ``min_opacity`` are replaced by children of other groups.
+    """Make ``total`` visible Gaussians; children of other groups replace Gaussians fainter than ``min_opacity``.
 
-    ``order [d]`` are the groups of further Gaussians, see :func:`deal_order`; each group gets at least one. ``make``
-    makes Gaussians, faint ones included, from the number for each group ``[g]``. There are fewer than ``total`` if the
-    groups cannot be divided into as many.
+    Each group gets one Gaussian. ``order [d]`` are the groups that get the further ones, see :func:`deal_order`.
+    ``make`` makes the Gaussians, including faint ones, given the number for each group ``[g]``. There are fewer than
+    ``total`` if the groups have too few members.
     """
     extra = max(0, total - num_groups)
     for _ in range(REFILLS + 1):
@@ -107,7 +111,7 @@ def deal_visible(
         extra += missing
     if len(gaussians) <= total:
         return gaussians
-    most_opaque = np.argsort(-as_array(gaussians.opacities), kind="stable")[:total]  # the last few may be faint
+    most_opaque = np.argsort(-as_array(gaussians.opacities), kind="stable")[:total]  # some may still be faint
     return gaussians[np.sort(most_opaque)]
 
 
@@ -138,9 +142,9 @@ def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarr
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
     """Return the number of Gaussians to decode merged views into; None: K for each Feature Gaussian.
 
-    It is a number if an exact count is requested and no fit grows to it, and where superpixels are empty, unless heads
-    make K of every group: a Gaussian that a near and a far view show belongs to the near one, so superpixels of the far
-    view may have none, and their Gaussians go to other groups.
+    It is the exact count that was requested, if no fit grows to it. It is also a number if superpixels are empty: a
+    Gaussian that a near and a far view show belongs to the near view, so superpixels of the far view may be empty, and
+    other groups get their Gaussians instead. Heads that make exactly K of every group cannot do that.
     """
     segmentation, num_empty = merged.segmentation, len(merged.segmentation.groups) - merged.num_groups
     if segmentation.exact and not grows:
@@ -151,32 +155,38 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
 
 
 def repeat(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Return every Feature Gaussian as ``counts [g]`` equal Gaussians for heads to replace, and the group of each."""
+    """Repeat each Feature Gaussian as ``counts [g]`` equal Gaussians, which heads replace; also return their groups."""
     parents = np.repeat(np.arange(len(features)), counts)
     return feature_to_gaussians(features)[parents], parents
 
 
 def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Return the children that :func:`decode` makes without networks, faint ones too, and the group ``[n]`` of each."""
-    divided = counts > 1
+    """Divide Feature Gaussians into children, faint ones included; also return the group ``[n]`` of each child.
+
+    ``counts [g]`` are the largest numbers of children.
+    """
+    is_divided = counts > 1
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
-    if divided.any():
-        starts, ids, of_children = halve(features, members, np.flatnonzero(divided), counts)
+    if is_divided.any():
+        starts, ids, child_parents = halve(features, members, np.flatnonzero(is_divided), counts)
         moments = pool_members(members, starts, ids)
-        extinctions = moments.extinctions * features.gains[of_children]
+        extinctions = moments.extinctions * features.gains[child_parents]
         children = to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
-        whole = np.flatnonzero(~divided)
-        parents = np.concatenate([whole, of_children])
+        undivided = np.flatnonzero(~is_divided)
+        parents = np.concatenate([undivided, child_parents])
         order = np.argsort(parents, kind="stable")
         parents = parents[order]
-        gaussians = Gaussians.concat([gaussians[whole], children])[order]
+        gaussians = Gaussians.concat([gaussians[undivided], children])[order]
     return gaussians, parents
 
 
 def halve(
     features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Halve the members of groups into ``counts [g]`` children: starts ``[n+1]``, members ``[m]``, groups ``[n]``."""
+    """Divide the members of groups into ``counts [g]`` children by halving.
+
+    Returns the start of each child ``[n+1]`` in the members ``[m]``, the members, and the group ``[n]`` of each child.
+    """
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
@@ -194,11 +204,11 @@ def halve(
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
-    """Give ``extra`` Gaussians to the groups where they lower distortion most; return the children ``[g]`` per group.
+    """Give ``extra`` Gaussians to groups in which they lower distortion most; return the children ``[g]`` per group.
 
-    A step that only pays together with the next step is judged by the two together (the convex hull of the group's
-    distortion), so a larger ``extra`` never removes a child. The sum is ``g + extra``, or the largest number that the
-    members give.
+    A child that only lowers distortion together with the next one counts with the mean gain of both, which is the
+    convex hull of the group's distortion. So a larger ``extra`` never removes a child. The sum is ``g + extra``, or the
+    largest number that the members give.
     """
     if extra < 0:
         raise ValueError(f"extra: expected at least 0, got {extra}")
@@ -210,17 +220,17 @@ def split_counts(features: FeatureGaussians, members: Members, extra: int, max_c
 
 
 def deal_order(features: FeatureGaussians, members: Members, max_children: int = 8) -> np.ndarray:
-    """Return the order in which groups get further Gaussians: the group ``[d]`` of each, the largest gain first."""
+    """Return the groups ``[d]`` in the order in which they get further Gaussians, the largest gain first."""
     if max_children == 1 or len(features) == 0:
         return np.zeros(0, np.int64)
     gains = hull_gains(_child_errors(features, members, max_children))
-    # Stable, group by group: of equal gains of one group the first step comes first.
+    # stable, so that among equal gains of one group the first child comes first
     order = np.argsort(-gains.reshape(-1), kind="stable")
     return order[: int(np.isfinite(gains).sum())] // gains.shape[1]
 
 
 def _child_errors(features: FeatureGaussians, members: Members, max_children: int) -> np.ndarray:
-    """Return the distortion ``[g,max_children]`` of 1, 2, ... children; NaN where members give fewer."""
+    """Return the distortion ``[g,max_children]`` with 1, 2, ... children; NaN if the members give fewer children."""
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
@@ -231,28 +241,28 @@ def _child_errors(features: FeatureGaussians, members: Members, max_children: in
             local, group, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
         )
 
-    every = np.arange(len(features))
-    tasks = [every[i : i + GROUPS_PER_TASK] for i in range(0, len(every), GROUPS_PER_TASK)]
+    groups = np.arange(len(features))
+    tasks = [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)]
     return np.concatenate(parallel_map(run, tasks))
 
 
 def hull_gains(errors: np.ndarray) -> np.ndarray:
     """Return the gain ``[f,c-1]`` of each further child, along the lower convex hull of the errors ``[f,c]``.
 
-    It is -inf where there is no child. Along the hull the gains fall from child to child.
+    The gain of a child that does not exist is -inf. Along the hull the gains fall from child to child.
     """
     num_groups, num_children = errors.shape
     gains = np.full((num_groups, num_children - 1), -np.inf)
-    at, rows = np.zeros(num_groups, int), np.arange(num_groups)
+    corner, rows = np.zeros(num_groups, int), np.arange(num_groups)  # last corner of each group's hull so far
     for _ in range(num_children - 1):
-        steps = np.arange(num_children)[None] - at[:, None]
+        steps = np.arange(num_children)[None] - corner[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
-            slopes = np.where(steps > 0, (errors[rows, at][:, None] - errors) / steps, -np.inf)
+            slopes = np.where(steps > 0, (errors[rows, corner][:, None] - errors) / steps, -np.inf)
         slopes = np.where(np.isnan(slopes), -np.inf, slopes)
-        best = num_children - 1 - np.argmax(slopes[:, ::-1], axis=1)
-        slope = slopes[rows, best]
+        next_corner = num_children - 1 - np.argmax(slopes[:, ::-1], axis=1)
+        slope = slopes[rows, next_corner]
         for child in range(1, num_children):
-            fill = np.isfinite(slope) & (child > at) & (child <= best)
-            gains[fill, child - 1] = slope[fill]
-        at = np.where(np.isfinite(slope), best, at)
+            is_between = np.isfinite(slope) & (child > corner) & (child <= next_corner)
+            gains[is_between, child - 1] = slope[is_between]
+        corner = np.where(np.isfinite(slope), next_corner, corner)
     return gains

@@ -1,6 +1,6 @@
-"""Groups -> Feature Gaussians: one per superpixel, analytic, corrected by the networks' encoder if any.
+"""Groups -> Feature Gaussians: one per superpixel by closed formulas, corrected by the networks' encoder if any.
 
-Where the depths of the views disagree, groups start fainter.
+Groups start fainter if the depths of the views disagree about them.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene
 if TYPE_CHECKING:
     from gsmerge.networks.weights import RunnableNetworks
 
-# Factors on the optical depth of groups that other views see through: those at whose place no other view has its
-# surface, and those of which fewer views have it there than see through it
+# Factors on the optical depth of groups that other views see through: ALONE if no other view has a surface at the same
+# place, DISPUTED if fewer views have a surface there than see through it
 ALONE, DISPUTED = 0.15, 0.39
-ASKED = 64  # views, the nearest, that say so: a vote that more of them hardly change
+NEAREST_VIEWS = 64  # nearest views that vote on it; more of them hardly change the vote
 
 
 def make_corrector(networks: RunnableNetworks | None, members: Members, cameras: Cameras, seed: int) -> Corrector:
-    """Bundle networks with the facts about a scene that they read; without networks nothing is corrected."""
+    """Combine networks with the facts about a scene that they read; without networks nothing is corrected."""
     if networks is None:
         return ANALYTIC
     from gsmerge.networks.apply import NetworkContext
@@ -54,7 +54,7 @@ def correct(
 ) -> FeatureGaussians:
     """Correct pooled Feature Gaussians with the encoder network, if any, which also adds latents.
 
-    ``weaken``: lower the optical depth of groups that other views see through. This leaves holes, which a long fit
+    ``weaken``: lower the optical depth of groups that other views see through. This makes holes, which a long fit
     closes.
     """
     return networks.encode(weaken_contradicted(features, members, cameras) if weaken else features)
@@ -95,7 +95,8 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 
 
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
-    """Lower the optical depth of single-view groups that other views see through."""
-    _, same, behind, *_ = cross_view_stats(features.means, features.sh0, features.views, members, cameras, ASKED).T
+    """Lower the optical depth of groups that other views see through."""
+    f = features
+    _, same, behind, *_ = cross_view_stats(f.means, f.sh0, f.views, members, cameras, NEAREST_VIEWS).T
     disputed = np.where(same > 0, DISPUTED, ALONE)
     return replace(features, gains=features.gains * np.where(behind > same, disputed, 1).astype(np.float32))

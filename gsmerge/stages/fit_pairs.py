@@ -1,4 +1,4 @@
-"""Merged pairs -> fitted: the fit of a scene that no photo shows, to renders of the scene itself."""
+"""Merged pairs -> fitted: fit a scene that no photo shows to renders of the scene itself."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from gsmerge.runtime.record import note, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians
 
-# dB that a fit may lose in a view that it was not trained on, for each of the powers of masses in
-# :data:`gsmerge.stages.pair_merge.POWERS`: few people look at an object from within
+# PSNR (dB) that a fit may lose in a view that it was not trained on, for each of the powers of masses in
+# :data:`gsmerge.stages.pair_merge.POWERS`. It is larger for an object, which few people view from inside
 TOLERANCES = 0.0, 3.0
-NEAR_INPUT = 36.0  # dB from renders of the input; nobody sees what a fit gains beyond it
+NEAR_INPUT = 36.0  # PSNR (dB) against renders of the input; nobody sees what a fit gains beyond it
 
 
 def fit_pairs(starts: Sequence[Decoded], prepared: Prepared, options: FitOptions, seed: int, target: float) -> Fitted:
     """Fit the best of several starts to renders of the input, unless it looks like the input already.
 
-    ``starts`` were merged by the powers of masses in :data:`gsmerge.stages.pair_merge.POWERS`, in their order. Where
-    the scene has no views of its own, each start is fitted, and the best result is returned. ``target`` is the PSNR
-    (dB) that was asked for.
+    ``starts`` were merged by the powers of masses in :data:`gsmerge.stages.pair_merge.POWERS`, in this order. If the
+    scene has no views of its own, each start is fitted, and the best result is returned. ``target`` is the PSNR (dB)
+    that was asked for.
     """
     photos, views = scene_photos(prepared.scene), prepared.reference.score_views
     psnrs = [score_photos(start.gaussians, photos, views, quarter=True).psnr for start in starts]
@@ -34,7 +34,7 @@ def fit_pairs(starts: Sequence[Decoded], prepared: Prepared, options: FitOptions
     if options.fit == "none":
         return unfitted(starts[best], prepared)
     if psnrs[best] >= max(NEAR_INPUT, target):
-        note("nothing is fitted: merged Gaussians look as the input")
+        note("there is no fit, because the merged Gaussians look like the input already")
         return unfitted(starts[best], prepared)
     if prepared.reference.placed:
         return fit_to_placed(starts, best, prepared, options, seed)
@@ -47,7 +47,7 @@ def unfitted(start: Decoded, prepared: Prepared) -> Fitted:
 
 
 def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
-    """Fit a start to renders of the scene's own views, and in a long fit to renders from around them."""
+    """Fit a start to renders of the scene's own views; a long fit also uses renders of views around them."""
     scene = prepared.scene_around if options.grows else prepared.scene
     fitted = fit_scene(start, scene, range(len(scene)), options, seed, num_scored=len(prepared.scene))
     accepted = fitted.report is not None and fitted.report.accepted
@@ -59,8 +59,9 @@ def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: in
 def fit_to_placed(starts: Sequence[Decoded], best: int, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
     """Fit each start to renders from placed views, and return the result with the best score in held-out views.
 
-    ``best`` is the start with the best score before the fits. It is returned with a note where no fit was accepted; so
-    is another start whose own fit lowers the score of a held-out view by more than its tolerance.
+    ``best`` is the start with the best score before the fits. A start is returned unfitted, with a note, if no fit was
+    accepted, or if the best fit does not gain on average or lowers the score of a held-out view by more than the
+    tolerance.
     """
     scene = prepared.scene_placed(placed_views(options.steps))
     placed = range(len(prepared.scene), len(scene))
@@ -72,11 +73,11 @@ def fit_to_placed(starts: Sequence[Decoded], best: int, prepared: Prepared, opti
     gains = after[best] - score_views(starts[best].gaussians, prepared)
     if accepted[best] and gains.mean() > 0 and gains.min() >= -TOLERANCES[best]:
         return replace(fits[best], cameras=prepared.scene.cameras)
-    note("nothing is fitted: a fit to placed views shows others worse; with cameras it is fitted to theirs")
+    note("there is no fit, because a fit to placed views shows held-out views worse; --cameras allows a better fit")
     return unfitted(starts[best], prepared)
 
 
 def score_views(gaussians: Gaussians, prepared: Prepared) -> np.ndarray:
-    """Return the PSNR (dB) of each view that scores are taken in, ``[v]``."""
+    """Return the PSNR (dB) ``[v]`` of each scored view."""
     photos = scene_photos(prepared.scene)
     return np.array([score_photos(gaussians, photos, [view]).psnr for view in prepared.reference.score_views])

@@ -1,4 +1,4 @@
-"""Feature Gaussians -> matches: which of them, of different views, show the same piece of surface."""
+"""Feature Gaussians -> matches: clusters that show the same piece of surface in different views."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from gsmerge.types import SH_C0, FeatureGaussians, Matches
 def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     """Cluster Feature Gaussians of different views that show the same piece of surface.
 
-    The result does not depend on the order of the Feature Gaussians: leaders are taken by weight, in ties by position.
-    Fully transparent Feature Gaussians form clusters of one.
+    The result does not depend on the order of the Feature Gaussians: leaders are chosen by weight, and by position if
+    weights are equal. Fully transparent Feature Gaussians form clusters of one.
     """
     count = len(features)
     clusters = np.full(count, -1, np.int64)
@@ -26,14 +26,14 @@ def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     if options.match != "none" and len(np.unique(features.views)) > 1:
         solid = np.flatnonzero(features.extinctions > 0)
         if len(solid) > 1:
-            clusters[solid], num_clusters = _clusters(features, solid, options)
+            clusters[solid], num_clusters = _find_clusters(features, solid, options)
     alone = np.flatnonzero(clusters < 0)
     clusters[alone] = num_clusters + np.arange(len(alone))
     return Matches(clusters, num_clusters + len(alone))
 
 
-def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOptions) -> tuple[np.ndarray, int]:
-    """Return the cluster of each of some rows, and the number of clusters."""
+def _find_clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOptions) -> tuple[np.ndarray, int]:
+    """Return the cluster ``[m]`` of each of the ``rows [m]``, and the number of clusters."""
     means, views = features.means[rows].astype(np.float64), features.views[rows]
     covars = features.covars[rows].astype(np.float64).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     colors = SH_C0 * features.sh0[rows, 0].astype(np.float64)

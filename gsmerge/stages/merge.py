@@ -28,9 +28,9 @@ class MergedViews:
 def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = ANALYTIC) -> FeatureGaussians:
     """Pool each cluster into one Feature Gaussian; clusters of one come first, unchanged.
 
-    Members are weighted by their opacities times the gains from the photos. Masses and integrated optical depths are
-    summed, so equal Gaussians on top of each other become 1 - prod(1 - alpha). Sums run in float64 about the cluster's
-    own mean: the result does not depend on the order of the members beyond rounding.
+    Members are weighted by their opacities times their gains. Masses and integrated optical depths are summed, so equal
+    Gaussians on top of each other get the opacity 1 - prod(1 - alpha). Covariances are summed in float64 about the
+    cluster's mean, so the order of the members changes the result only by rounding.
     """
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:

@@ -1,7 +1,8 @@
-"""Gaussians -> fewer Gaussians by their positions and colours alone: for scenes without known views.
+"""Gaussians -> fewer Gaussians by their positions and colours alone, for scenes without views.
 
-Cells of a k-d tree are merged pair by pair, the cheapest pairs of all cells first, in rounds whose cells differ. Masses
-add up, opacity times the area that is seen, so a surface stays as opaque as it was; scales grow where opacity cannot.
+Neighbours within a cell of a k-d tree are merged pair by pair, the cheapest pairs of all cells first, in rounds with
+different cells. Masses, which are opacity times visible area, add up, so a surface stays as opaque as it was. If the
+opacity would exceed one, scales grow instead.
 """
 
 from __future__ import annotations
@@ -20,15 +21,16 @@ from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians
 
-LEFT = 0.25  # share of the Gaussians that a round leaves, at least
-LEAST_LEFT = 0.2  # the same in each cell: longer chains of merges end in haze
-# Chosen on training scenes by the PSNR of views from cameras at random (docs/internals/notebook.md#bare-files)
-COLOR_WEIGHT = 0.6  # of squared distances of harmonics of degree 0 against nats
-# Powers of masses that costs are multiplied by: what fills the pictures of a scene, or the detail of an object
+ROUND_SHARE = 0.25  # least share of the Gaussians that remains after a round
+CELL_SHARE = 0.2  # the same in each cell; longer chains of merges make haze
+# Chosen on training scenes by the PSNR of views from random cameras (docs/internals/notebook.md#bare-files)
+COLOR_WEIGHT = 0.6  # weight of squared distances of harmonics of degree 0, relative to costs in nats
+# Powers of the masses by which costs are multiplied: the first favours large parts of the pictures, for scenes; the
+# second favours detail, for objects
 POWERS = 1.0, 0.3
-FLATNESS = 0.01  # least scale over the largest, so that the logarithm of the volume stays finite
-MIN_OPACITY = 1e-4  # of what is merged, so that masses stay positive
-WIDER = 0.05  # by how much scales grow at most for each doubling of what was merged: fewer Gaussians leave more gaps
+FLATNESS = 0.01  # least scale, relative to the largest, so that the logarithm of the volume stays finite
+MIN_OPACITY = 1e-4  # least opacity of Gaussians that are merged, so that masses stay positive
+WIDER = 0.05  # most growth of scales for each doubling of the merged number: fewer Gaussians would leave more gaps
 CELLS_PER_TASK = 256
 
 
@@ -39,10 +41,10 @@ class Cloud:
     means: np.ndarray  # [n,3] float64
     covars: np.ndarray  # [n,6] float32 upper triangles
     masses: np.ndarray  # [n] float32
-    weights: np.ndarray  # [n] float32, of costs
+    weights: np.ndarray  # [n] float32, weights of costs
     sh: np.ndarray  # [n,3k] float32
-    sizes: np.ndarray  # [n] int32, Gaussians merged
-    rows: np.ndarray  # [n] int64, of the first of them in the input
+    sizes: np.ndarray  # [n] int32, number of input Gaussians that were merged into each
+    rows: np.ndarray  # [n] int64, row of the first of them in the input
 
     def __len__(self) -> int:
         return len(self.means)
@@ -53,9 +55,10 @@ class Cloud:
 
 @stage("reduce")
 def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) -> Gaussians:
-    """Merge finite Gaussians in any frame into ``count``, at least one; none is dropped.
+    """Merge finite Gaussians in any frame into ``count`` Gaussians, at least one; none is dropped.
 
-    Returns all if there are no more than ``count``. ``power``: of the masses, by which costs are weighed.
+    If there are no more than ``count``, they are returned unchanged. ``power``: costs are weighted by the masses to
+    this power.
     """
     count = max(1, count)
     if len(gaussians) <= count:
@@ -63,12 +66,12 @@ def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) 
     cloud = cloud_of(gaussians)
     cloud.weights[:] = power_of(cloud.masses, power)
     while len(cloud) > count:
-        cloud = _merge_round(cloud, max(count, int(LEFT * len(cloud))))
+        cloud = _merge_round(cloud, max(count, int(ROUND_SHARE * len(cloud))))
     return gaussians_of(cloud, gaussians, WIDER)
 
 
 def cloud_of(g: Gaussians) -> Cloud:
-    """Compute the moments of Gaussians; flat ones get a little thickness."""
+    """Compute the moments of Gaussians; flat Gaussians get a little thickness."""
     count = len(g)
     covars, masses = np.empty((count, 6), np.float32), np.empty(count, np.float32)
     quats, scales = (np.ascontiguousarray(column, np.float32) for column in (g.quats, g.scales))
@@ -79,7 +82,7 @@ def cloud_of(g: Gaussians) -> Cloud:
 
 
 def _merge_round(cloud: Cloud, count: int) -> Cloud:
-    """Merge the cheapest pairs of all cells until ``count`` Gaussians are left, or until no pairs are left."""
+    """Merge the cheapest pairs of all cells until ``count`` Gaussians remain, or until there are no pairs."""
     order, starts = _divide(cloud.means)
     pairs, costs = np.zeros((len(cloud), 2), np.int32), np.full(len(cloud), np.inf, np.float32)
     colors = np.ascontiguousarray(cloud.sh[:, :3])
@@ -87,36 +90,36 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
     def work(first: int) -> None:
         last = min(first + CELLS_PER_TASK, len(starts) - 1)
         agglomerate(
-            cloud.means, cloud.covars, cloud.masses, cloud.weights, colors, order, starts, COLOR_WEIGHT, LEAST_LEFT,
+            cloud.means, cloud.covars, cloud.masses, cloud.weights, colors, order, starts, COLOR_WEIGHT, CELL_SHARE,
             first, last, pairs, costs,
         )  # fmt: skip
 
     parallel_map(work, range(0, len(starts) - 1, CELLS_PER_TASK))
     chosen = pairs[_cheapest(costs, len(cloud) - count)]
-    if len(chosen) == 0:  # costs that are no numbers: what weighs most stays
+    if len(chosen) == 0:  # no cost is a number: keep the Gaussians with the largest masses
         return cloud[np.sort(np.argsort(-cloud.masses, kind="stable")[:count])]
     return merge_rows(cloud, chosen)
 
 
 def merge_rows(cloud: Cloud, pairs: np.ndarray) -> Cloud:
-    """Merge disjoint pairs of rows ``[m,2]`` int32, each into its first one, whose place it has."""
+    """Merge disjoint pairs of rows ``[m,2]`` int32; the merged Gaussian takes the place of the first row."""
     merge_pairs(pairs, cloud.means, cloud.covars, cloud.masses, cloud.weights, cloud.sh, cloud.sizes)
-    left = np.ones(len(cloud), bool)
-    left[pairs[:, 1]] = False
-    return cloud[left]
+    remains = np.ones(len(cloud), bool)
+    remains[pairs[:, 1]] = False
+    return cloud[remains]
 
 
 def _divide(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Divide means ``[n,3]`` into cells of neighbours: their order ``[n]`` and where each cell starts ``[c+1]``."""
+    """Divide means ``[n,3]`` into cells of neighbours; return their order ``[n]`` and the cell starts ``[c+1]``."""
     count = len(means)
     starts = np.array([0, count])
-    while (starts[1:] - starts[:-1]).max() > CELL:  # as the tree halves its runs
+    while (starts[1:] - starts[:-1]).max() > CELL:  # in the same way as the tree halves its runs
         starts = np.sort(np.concatenate([starts, (starts[1:] + starts[:-1]) // 2]))
     return make_tree(means)[0], starts
 
 
 def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
-    """Return the rising indices of the ``count`` lowest finite costs ``[n]``; among equal costs the first."""
+    """Return the indices, ascending, of the ``count`` lowest finite costs ``[n]``; among equal costs the first."""
     finite = np.isfinite(costs)
     count = min(count, int(finite.sum()))
     if count == 0:
@@ -127,9 +130,10 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
 
 
 def gaussians_of(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
-    """Convert moments to Gaussians; those that were not merged stay the same.
+    """Convert moments to Gaussians; Gaussians that were not merged are copied from ``source``.
 
-    Masses that would need an opacity above one make scales larger instead, at most by ``wider`` for each doubling.
+    A mass that would need an opacity above one makes scales larger instead, at most by the share ``wider`` for each
+    doubling of the merged number.
     """
     scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
     squares = scales * scales
@@ -140,7 +144,7 @@ def gaussians_of(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussia
     sh = cloud.sh.reshape(len(cloud), -1, 3)
     means, quats, scales = to_float32(cloud.means), to_float32(quats), to_float32(scales)
     out = Gaussians(means, quats, scales, to_float32(opacities), sh[:, :1].copy(), sh[:, 1:].copy())
-    alone = np.flatnonzero(cloud.sizes == 1)
+    unmerged = np.flatnonzero(cloud.sizes == 1)
     for name, column in vars(out).items():
-        column[alone] = getattr(source, name)[cloud.rows[alone]]
+        column[unmerged] = getattr(source, name)[cloud.rows[unmerged]]
     return out

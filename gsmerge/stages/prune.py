@@ -1,7 +1,7 @@
-"""Fitted Gaussians -> pruned Gaussians: those that nobody sees are not written.
+"""Fitted Gaussians -> pruned Gaussians: Gaussians that nobody sees are dropped.
 
-A fit leaves many Gaussians that are faint, or hidden by others. They change no photo by more than rounding to eight
-bits does, but every viewer has to load and draw them.
+After a fit many Gaussians are faint, or hidden by others. They change no photo by more than rounding to eight bits
+does, but every viewer has to load and draw them.
 """
 
 from __future__ import annotations
@@ -17,22 +17,23 @@ from gsmerge.raster.photos import Photos, blank_photos, photo_errors
 from gsmerge.runtime.record import stage
 from gsmerge.types import Cameras, Gaussians
 
-ROUNDING = 1 / (255 * math.sqrt(12))  # root mean square of what rounding to eight bits changes
-FIRST = 0.02  # largest blending weight below which Gaussians are left out in the first trial
-TRIALS, AIM, CLOSE = 6, 0.9, 0.75  # weights that are tried; shares of ROUNDING that are aimed at, and near enough
-LESS = 0.8  # times a weight that is too large is the next one, at most
-COMPARED = 8  # views, at most, in which pictures with and without them are compared
-# Times a photo's pixel is one in which weights are found, and one of pictures that are compared. Their pixels are
-# samples of the photo's, as the low-pass stays, and thus have the same root mean square
+ROUNDING = 1 / (255 * math.sqrt(12))  # root mean square of the change by rounding to eight bits
+FIRST = 0.02  # limit of the first trial: Gaussians with a smaller largest blending weight are left out
+TRIALS, AIM, CLOSE = 6, 0.9, 0.75  # most limits that are tried; shares of ROUNDING to aim at, and that are enough
+LESS = 0.8  # a limit that is too large is lowered at least by this factor
+COMPARED = 8  # most views in which pictures with and without the Gaussians are compared
+# Sizes of pixels, relative to the photos': of pictures in which weights are found, and of pictures that are compared.
+# These pixels are samples of the photo, with the same low-pass, so the root mean square is the same
 LEVELS = 2, 4
 
 
 @stage("prune")
 def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gaussians]:
-    """Split Gaussians into those that ``cameras`` see, and those that they do not, the clearest of these first.
+    """Split Gaussians into those that ``cameras`` see and those that they do not; the most visible of these come first.
 
-    Unseen are as many as can go, least blending weight first, while the pictures of no camera change by more than
-    ``ROUNDING`` (root mean square). What lies outside of all pictures stays.
+    A Gaussian is unseen if its largest blending weight is below a limit. The limit is as large as possible, while the
+    pictures of no camera change by more than ``ROUNDING`` (root mean square) without the unseen Gaussians. Gaussians
+    outside of all pictures count as seen.
     """
     peaks, inside = peak_weights(gaussians, blank_photos(cameras, LEVELS[0]))
     peaks[~inside] = np.inf
@@ -43,7 +44,7 @@ def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gau
 
 
 def _least_weight(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> float:
-    """Find the largest weight below which all Gaussians can go, of those that are tried; 0 for none."""
+    """Find the largest limit, of those that are tried, below which all Gaussians can be left out; 0: there is none."""
     splats, least, most, weight = make_splats(gaussians), 0.0, math.inf, FIRST
 
     def clip(_: int, image: np.ndarray, __: np.ndarray) -> np.ndarray:
@@ -52,20 +53,19 @@ def _least_weight(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> fl
     whole = photo_errors(splats, photos, clip)
 
     def measure_change(weight: float) -> float:
-        """Measure the largest root mean square, over the pictures, of what changes without lesser weights."""
+        """Measure the change (root mean square) of the picture that changes most without smaller weights."""
         shown = peaks >= weight
 
-        def compare(view: int, image: np.ndarray, left: np.ndarray) -> float:
-            return float(((clip(view, image, left) - whole[view]) ** 2).mean(dtype=np.float64))
+        def compare(view: int, image: np.ndarray, transmittance: np.ndarray) -> float:
+            return float(((clip(view, image, transmittance) - whole[view]) ** 2).mean(dtype=np.float64))
 
         return math.sqrt(max(photo_errors(splats, photos, compare, keep=lambda _: shown)))
 
     for _ in range(TRIALS):
         changed = measure_change(weight)
         least, most = (least, weight) if changed > ROUNDING else (weight, most)
-        # what goes changes pictures about as the square of the limit
-        by = math.sqrt(AIM * ROUNDING / max(changed, 1e-9))
-        weight *= min(by, LESS) if changed > ROUNDING else min(by, 2.0)
+        factor = math.sqrt(AIM * ROUNDING / max(changed, 1e-9))  # the change grows about with the square of the limit
+        weight *= min(factor, LESS) if changed > ROUNDING else min(factor, 2.0)
         if least and (changed > CLOSE * ROUNDING or not least < weight < most):
             break
     return least

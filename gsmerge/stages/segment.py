@@ -1,9 +1,9 @@
-"""Scene -> groups: the superpixels of every view, evenly many or cut from a region tree.
+"""Scene -> groups: the superpixels of every view, the same number in each or cut from a region tree.
 
-In the tree superpixels merge where little is lost, and split where much is gained. Distortion lives in image space:
-squared colour error plus the squared error of the depth relative to a plane, so that a flat wall costs nothing from any
-angle and far things count no less than near ones. All views of a scene share one threshold, so every Gaussian buys
-about the same.
+The tree has few superpixels where little is lost, and many where much is gained. Distortion is measured in image space.
+It is the squared colour error plus the squared error of the depth relative to a plane, so a flat wall costs nothing
+from any angle, and far things count as much as near ones. All views of a scene share one threshold, so every Gaussian
+lowers the distortion about equally.
 """
 
 from __future__ import annotations
@@ -25,19 +25,20 @@ from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups, PicturedScene, Scene, Segmentation
 
 DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median
-DEPTH_WEIGHT = 1.0  # of squared relative depth errors against squared colour errors (sRGB in [0, 1])
-COMPACTNESS = 1e-5  # of squared pixels against squared colours; without it regions become snakes that no Gaussian fits
-# Largest side of a region, as a share of the image's longer side: the rasterizer's affine approximation bends larger
-# Gaussians. Exceeded only where the budget leaves no other choice.
+DEPTH_WEIGHT = 1.0  # weight of squared relative depth errors, relative to squared colour errors (sRGB in [0, 1])
+# Weight of squared pixels, relative to squared colours; without it regions become snakes that no Gaussian fits
+COMPACTNESS = 1e-5
+# Largest side of a region, as a share of the image's longer side, because the rasterizer's affine approximation bends
+# larger Gaussians. It is exceeded only if the budget is too small for more regions.
 MAX_EXTENT = 1 / 8
-KNEE_STEP = 1.25  # the slope of the curve is taken over this factor of the count
+KNEE_STEP = 1.25  # the slope of the curve is measured over this factor of the count
 KNEE_SLOPE = 1.0  # dB of predicted quality per relative increase of the count: below it, more are not worth it
 KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (noise, views that disagree)
 
 
 @dataclass(frozen=True, eq=False)
 class SuperpixelChoices:
-    """Method, limits and numbers for cutting a scene into superpixels."""
+    """Settings and limits for cutting a scene into superpixels."""
 
     options: SegmentOptions  # Method and number
     limits: CountLimits  # Limits of the number of Gaussians
@@ -47,7 +48,7 @@ class SuperpixelChoices:
 
 @dataclass(eq=False)
 class SharedTree:
-    """The region tree that all counts of a run are cut from; the first one builds it."""
+    """The region tree from which all counts of a run are cut; it is built for the first of them."""
 
     tree: RegionTree | None = None
 
@@ -61,11 +62,12 @@ class SharedTree:
 
 @stage("segment")
 def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int | None) -> Segmentation:
-    """Cut every view into superpixels, by the options or so that they give exactly ``count`` Gaussians.
+    """Cut every view into superpixels: as the options say, or so that they give exactly ``count`` Gaussians.
 
-    For an exact count the region tree is cut, which gives a plain wall few superpixels and a fern many; so it is if
-    some pixels count more than others. A finer tree is built if the scene's own is too coarse. Adaptive superpixels
-    change the number of Gaussians; if it exceeds the budget, the tree is cut at the largest allowed count instead.
+    For an exact count the region tree is cut, which gives a plain wall few superpixels and a fern many. The tree is
+    also cut if some pixels count more than others. If the shared tree is too coarse, a finer one is built. Adaptive
+    superpixels change the number of Gaussians; if it exceeds the budget, the tree is cut at the largest allowed count
+    instead.
     """
     limits, options, views = choices.limits, choices.options, len(scene)
     if count is None and scene.importance is not None and not options.adapts:
@@ -74,7 +76,7 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
         pictures, each = scene.images, max(1, int(limits.per_view * choices.start_share))
         if not options.adapts:
             return Segmentation(segment(pictures, options, each), limits.default, exact=False)
-        # to the number in the end, of which the fit begins with a share
+        # the superpixels adapt to the final number; the fit begins with a share of it
         groups = segment(pictures, options, limits.per_view, adapt=each / limits.per_view)
         count = round(limits.default * len(groups) / (each * views))
         if count <= limits.max_count:
@@ -91,7 +93,7 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
 def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
     """Build the tree of all coarser segmentations of a scene, fine enough for ``count`` Gaussians.
 
-    A pixel that counts as several has the squared colour errors of so many.
+    The squared colour error of a pixel is multiplied by its importance.
     """
     pictures, important = scene.images, scene.importance
     leaves = max(limits.per_view, -(-count // len(scene)))
@@ -105,7 +107,7 @@ def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
     """Find the number of Gaussians at the knee of the scene's distortion curve, within the limits."""
     limits, shared = choices.limits, choices.shared or SharedTree()
     tree = shared.get(scene, choices)
-    usable = tree.counts >= tree.min_regions  # none larger than MAX_EXTENT
+    usable = tree.counts >= tree.min_regions  # counts without regions larger than MAX_EXTENT
     return max(limits.min_count, min(knee(tree.counts[usable], tree.distortions[usable]), limits.max_count))
 
 
@@ -114,9 +116,9 @@ class RegionTree:
     """Hierarchy of superpixels: all merges in every view, from the finest cut to one region per view, in order."""
 
     groups: Groups  # The superpixels that it starts from
-    parents: tuple[np.ndarray, ...]  # Per view [2·leaves-1] int32: union of a region, or -1
-    order: np.ndarray  # [m] int64, all merges, cheapest first; view v's from `first[v]` on
-    first: np.ndarray  # [v+1] int64, merges in the views before
+    parents: tuple[np.ndarray, ...]  # For each view [2·leaves-1] int32: the union that a region is part of, or -1
+    order: np.ndarray  # [m] int64, all merges, cheapest first; those of view v are numbered from `first[v]` on
+    first: np.ndarray  # [v+1] int64, number of merges in the views before
     distortions: np.ndarray  # [m+1] float64 mean squared error after the first i merges
     min_regions: int  # Fewest regions before any is larger than `MAX_EXTENT`
 
@@ -134,24 +136,24 @@ def front_depths(scene: Scene) -> np.ndarray:
     """Return the depth of the Gaussian in front of every pixel, ``[v,h,w]`` float32, world units."""
     cameras, means, fronts = scene.cameras, scene.gaussians.means, scene.get_pixels().fronts
 
-    def one_view(view: int) -> np.ndarray:
+    def view_depths(view: int) -> np.ndarray:
         depths = camera_depths(means[fronts[view]], cameras.viewmats[view].astype(means.dtype))
         return depths.astype(np.float32)
 
-    return np.stack(parallel_map(one_view, range(len(scene))))
+    return np.stack(parallel_map(view_depths, range(len(scene))))
 
 
 def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> RegionTree:
     """Merge neighbouring superpixels in order of added distortion, until each view is a single region.
 
-    ``images [v,h,w,3]`` sRGB in [0, 1]; ``depths [v,h,w]``, where values of at most 0 count as very near; ``groups``
-    are 4-connected, none empty. Pixels outside ``valid [v,h,w]`` do not count, and superpixels without a valid pixel
+    ``images [v,h,w,3]`` are sRGB in [0, 1]. ``depths [v,h,w]`` of at most 0 count as very near. ``groups`` are
+    4-connected, and none is empty. Pixels outside ``valid [v,h,w]`` do not count, and superpixels without a valid pixel
     merge first. Raises ValueError if the arguments do not fit together.
     """
     _check_pictures(images, depths, groups, valid)
     extent = max(1.0, MAX_EXTENT * max(images.shape[1:3]))
 
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, int]:
+    def merge_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, int]:
         usable = _usable_depths(depths[view], valid[view])
         labels, count = pad_labels(groups.labels[view]), groups.counts[view]
         pixels = np.ascontiguousarray(images[view], np.float32)
@@ -160,9 +162,10 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
         pairs = adjacent_pairs(labels)
         return *merge_order(pairs, rows, DEPTH_WEIGHT, COMPACTNESS, extent), start, int((usable > 0).sum())
 
-    parents, of_view, growths, starts, num_pixels = zip(*parallel_map(one_view, range(len(images))), strict=True)
-    first, heights = np.concatenate([[0], np.cumsum([len(h) for h in of_view])]), np.concatenate(of_view)
-    # Heights never fall from child to parent and children come first, so a stable sort keeps them in front.
+    merged_views = parallel_map(merge_view, range(len(images)))
+    parents, view_heights, growths, starts, num_pixels = zip(*merged_views, strict=True)
+    first, heights = np.concatenate([[0], np.cumsum([len(h) for h in view_heights])]), np.concatenate(view_heights)
+    # Heights never fall from child to parent, and children come first, so a stable sort keeps children before parents
     order = np.argsort(heights, kind="stable")
     added = np.concatenate([[sum(starts)], np.concatenate(growths)[order]])
     distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))
@@ -171,6 +174,7 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
 
 
 def _check_pictures(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> None:
+    """Raise ValueError if shapes differ, or if a superpixel is empty."""
     shape = list(groups.labels.shape)
     for name, array, want in (("images", images, [*shape, 3]), ("depths", depths, shape), ("valid", valid, shape)):
         if list(array.shape) != want:
@@ -192,8 +196,8 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def cut_tree(tree: RegionTree, budget: int) -> Groups:
     """Cut the tree into exactly ``budget`` regions over all views, at least one in each.
 
-    ``budget`` is limited to the number of superpixels. The regions of a smaller budget are unions of those of a larger
-    one. Raises ValueError if ``budget`` is below the number of views.
+    A ``budget`` above the number of superpixels gives all superpixels. The regions of a smaller budget are unions of
+    those of a larger budget. Raises ValueError if ``budget`` is below the number of views.
     """
     num_views = len(tree.parents)
     if budget < num_views:
@@ -201,13 +205,13 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
     keep = np.zeros(len(tree.order), bool)
     keep[tree.order[: max(0, len(tree) - budget)]] = True
 
-    def one_view(view: int) -> tuple[np.ndarray, int]:
+    def cut_view(view: int) -> tuple[np.ndarray, int]:
         view_keep = keep[tree.first[view] : tree.first[view + 1]]
         leaves = tree.groups.counts[view]
-        of_leaf = cut_labels(tree.parents[view], view_keep, leaves)
-        return of_leaf[tree.groups.labels[view]], leaves - int(view_keep.sum())
+        leaf_labels = cut_labels(tree.parents[view], view_keep, leaves)
+        return leaf_labels[tree.groups.labels[view]], leaves - int(view_keep.sum())
 
-    labels, counts = zip(*parallel_map(one_view, range(num_views)), strict=True)
+    labels, counts = zip(*parallel_map(cut_view, range(num_views)), strict=True)
     return Groups(np.stack(labels), counts)
 
 

@@ -1,9 +1,8 @@
-"""Detection of sky Gaussians by the photos, without a network or a download.
+"""Find sky Gaussians by the photos, without a network or a download.
 
-In each photo sky is a smooth region that comes down from the upper border, nowhere warmer than
-grey, and that pales towards the horizon, as air does; without that, as under clouds, it has to be
-several times as far away as the rest. Ceilings and white walls have the first three in common with
-it, seldom the others, and never in several views.
+In each photo the sky is a smooth region that begins at the upper border and is nowhere warmer than grey. It also pales
+towards the horizon, as air does; otherwise, as under clouds, it has to be several times as far away as the rest.
+Ceilings and white walls share the first three properties, seldom the last two, and never in several views.
 """
 
 from __future__ import annotations
@@ -21,17 +20,18 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
 
-SIDE = 480.0  # pixels of the longer side that gradients are measured for
+SIDE = 480.0  # length in pixels of the longer side to which gradients are scaled
 SMOOTH = 0.02  # largest gradient of a colour per pixel
-DARK, WHITE, GREY = 0.35, 0.75, 0.12  # sky is blue and no darker, or brighter than the second with so little chroma
-WARM = 0.03  # most that red exceeds blue, in nine tenths of the region
-LEAST_AREA, LEAST_TOP = 0.02, 0.4  # of the picture, and of its upper border
-PALER, PALER_RANGE = -0.12, 0.08  # correlation of saturation with the row, at most; and spread of saturation, at least
-FAR = 3.0  # times the depth of the rest
-LEAST_VIEWS, LEAST_SHARE = 2, 0.2  # views that show sky, and their share of all: fewer may be mistaken
+# Sky is blue and brighter than DARK, or brighter than WHITE with less chroma than GREY
+DARK, WHITE, GREY = 0.35, 0.75, 0.12
+WARM = 0.03  # red exceeds blue at most by so much, in nine tenths of the region
+LEAST_AREA, LEAST_TOP = 0.02, 0.4  # least share of the picture, and of its upper border, that is sky
+PALER, PALER_RANGE = -0.12, 0.08  # largest correlation of saturation with the row; least spread of saturation
+FAR = 3.0  # the sky is at least so many times as far away as the rest
+LEAST_VIEWS, LEAST_SHARE = 2, 0.2  # fewest views that show sky, and least share of all views; fewer may be mistaken
 AGREEMENT = 0.7  # least share of a Gaussian's blending weights that lies in the sky
-LAYERS, LAST_LAYER = 6, 0.02  # most rounds; share of all sky so far that a round which is the last adds
-MAX_SAMPLE_GAUSSIANS = 200_000  # Gaussians that depths are taken from
+LAYERS, LAST_LAYER = 6, 0.02  # most rounds; a round that adds less than this share of the sky found so far is the last
+MAX_SAMPLE_GAUSSIANS = 200_000  # most Gaussians by which depths are compared
 
 
 def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
@@ -39,17 +39,17 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
     regions, mask = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
     if not regions:
         return mask
-    for _ in range(LAYERS):  # what the sky in front has hidden comes next
+    for _ in range(LAYERS):  # each round finds sky that the sky of earlier rounds has hidden
         rows = np.flatnonzero(~mask)
-        above = _mostly_inside(gaussians[rows], cameras, regions)
-        mask[rows[above]] = True
-        if above.sum() < LAST_LAYER * mask.sum():
+        is_sky = _mostly_inside(gaussians[rows], cameras, regions)
+        mask[rows[is_sky]] = True
+        if is_sky.sum() < LAST_LAYER * mask.sum():
             break
     return mask
 
 
 def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict[int, np.ndarray]:
-    """Return a mask ``[h,w]`` of the sky for each view that shows sky, by view; empty if too few views do."""
+    """Return a mask ``[h,w]`` of the sky for each view that shows sky, by view; none if too few views show sky."""
     regions = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
     shown = {
         view: region
@@ -73,12 +73,14 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
 
 
 def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
-    """Return whether a region ``[h,w]`` shows things several times as far away as the rest of the picture."""
+    """Return whether a region ``[h,w]`` is several times as far away as the rest of the picture."""
     (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // MAX_SAMPLE_GAUSSIANS))], camera)
     inside = (depths > 0) & is_inside(pixels, camera)
     x, y = pixels[inside].astype(int).T
-    hit, depths = region[y, x], depths[inside]
-    return bool(hit.any() and not hit.all() and np.median(depths[hit]) > FAR * np.median(depths[~hit]))
+    in_region, depths = region[y, x], depths[inside]
+    if not in_region.any() or in_region.all():
+        return False
+    return bool(np.median(depths[in_region]) > FAR * np.median(depths[~in_region]))
 
 
 def sky_region(photo: np.ndarray) -> np.ndarray:
@@ -86,21 +88,21 @@ def sky_region(photo: np.ndarray) -> np.ndarray:
     height, width = photo.shape[:2]
     scale = max(height, width) / SIDE
     sigma = max(1.5 * scale, 0.5)
-    upper = photo[: round(4 * sigma) + 3]  # what the upper border depends on
+    upper = photo[: round(4 * sigma) + 3]  # the rows on which the blurred upper border depends
     if _like_sky(blur(upper, sigma), scale)[0].mean() < LEAST_TOP:
         return np.zeros((height, width), bool)
     soft = blur(photo, sigma)
     _, labels = cv2.connectedComponents(_like_sky(soft, scale).astype(np.uint8), connectivity=4)
     region = np.isin(labels, np.setdiff1d(labels[0], 0))
-    warm = region.mean() < LEAST_AREA or np.percentile((soft[..., 2] - soft[..., 0])[region], 10) < -WARM
-    return np.zeros_like(region) if warm else region
+    is_no_sky = region.mean() < LEAST_AREA or np.percentile((soft[..., 2] - soft[..., 0])[region], 10) < -WARM
+    return np.zeros_like(region) if is_no_sky else region
 
 
 def _like_sky(soft: np.ndarray, scale: float) -> np.ndarray:
-    """Return a mask ``[h,w]`` of what is smooth and blue or white in a blurred photo."""
+    """Return a mask ``[h,w]`` of the pixels of a blurred photo that are smooth, and blue or white."""
     right, down = (reduce(np.maximum, np.moveaxis(np.abs(slope), 2, 0)) / 8 for slope in sobel(soft))
     red, green, blue = colors = np.moveaxis(soft, 2, 0)
-    bright, dark = reduce(np.maximum, colors), reduce(np.minimum, colors)  # a tenth of the time of max(2)
+    bright, dark = reduce(np.maximum, colors), reduce(np.minimum, colors)  # takes a tenth of the time of max(2)
     is_blue = (blue >= red) & (blue >= green - 0.02) & (bright > DARK)
     is_white = (bright > WHITE) & (bright - dark < GREY)
     return np.asarray((np.sqrt(right * right + down * down) * scale < SMOOTH) & (is_blue | is_white))

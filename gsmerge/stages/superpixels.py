@@ -1,15 +1,16 @@
 """Partition each view into superpixels of similar colour and regular shape (paper section 4.1).
 
-The default, ``rdseg``, spends the superpixels where they lower the squared colour error most: rectangles cut best
-first (more than asked for), merged with Ward's rule to the exact number, then exact moves of border pixels. ``bass``
-is Bayesian adaptive superpixel segmentation from a hexagonal grid, ``bass-st`` the same from seeds drawn by the
-Shi-Tomasi response, as in the paper, ``bass-adaptive`` the same with splits and merges, ``slic`` the common baseline,
-and ``grid`` plain rectangles: where they are a few pixels large and no fit follows, they are as good and cost nothing.
-No superpixel is empty, each is 4-connected, and a run repeats bit for bit.
+The default, ``rdseg``, uses the superpixels where they lower the squared colour error most. It cuts more rectangles
+than asked for, best first, merges them with Ward's rule to the exact number, and then moves border pixels exactly.
+``bass`` is Bayesian adaptive superpixel segmentation from a hexagonal grid. ``bass-st`` is the same from seeds drawn by
+the Shi-Tomasi response, as in the paper. ``bass-adaptive`` is the same with splits and merges. ``slic`` is the common
+baseline. ``grid`` makes plain rectangles; if these are a few pixels large and no fit follows, they are as good as the
+others and cost nothing. No superpixel is empty, each is 4-connected, and the result is the same bit for bit in each
+run.
 
-There are exactly as many superpixels as asked for, with one exception: from a share of the pixels, ``bass-adaptive``
-comes to a number of its own in each view, at most four times more or fewer. Where a number is asked for, here or by a
-budget, its moves go on to that number, those of the highest Hastings ratio first.
+The number of superpixels is exactly the one that is asked for, with one exception: if a share of the pixels is asked
+for, ``bass-adaptive`` finds its own number in each view, at most four times more or fewer. If a number is asked for,
+here or by a budget, it goes on with splits or merges to that number, those of the highest Hastings ratio first.
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.types import Groups
 
-RECTANGLES, EARLY_SWEEPS = 2.0, 0  # rectangles per superpixel that rdseg merges, and sweeps before it does
+RECTANGLES, EARLY_SWEEPS = 2.0, 0  # rectangles per superpixel that rdseg merges, and sweeps before the merges
 NUM_SWEEPS = 2
-BLOCK = 32  # side of the squares that the cutting starts from, pixels
-PIXEL_START = 0.45  # above this many rectangles per pixel, merging starts from the pixels themselves
+BLOCK = 32  # side in pixels of the squares that are cut into rectangles
+PIXEL_START = 0.45  # above so many rectangles per pixel, the pixels themselves are merged
 RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
 SLIC_COMPACTNESS = 10  # scikit-image's default
 
@@ -84,14 +85,14 @@ def superpixels(
         image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
         count: Superpixels, 1 to h·w.
         segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
-        rectangles: Of ``rdseg``: rectangles per superpixel that it begins with, at least 1.
-        early_sweeps: Of ``rdseg``: sweeps over border pixels before rectangles are merged.
-        compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the BASS methods).
-        adapt: Of ``bass-adaptive``, which changes ``count`` by a factor of a quarter to four: share of the changed
-            number to return. None: exactly ``count``.
+        rectangles: For ``rdseg``: rectangles per superpixel that it begins with, at least 1.
+        early_sweeps: For ``rdseg``: sweeps over border pixels before rectangles are merged.
+        compactness: Weight of squared pixels, relative to squared colours, in [0, 1] (not for the BASS methods).
+        adapt: For ``bass-adaptive``: None: return exactly ``count`` superpixels. Otherwise the method changes ``count``
+            by a factor of a quarter to four, and returns this share of the changed number.
 
     Returns:
-        ``[h,w]`` int32, dense from 0, a tensor for a tensor; the same on every run.
+        Labels ``[h,w]`` int32 without gaps from 0 on, the same in every run; a tensor for a tensor.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -101,7 +102,7 @@ def superpixels(
         >>> labels.shape, int(labels.max())
         ((32, 48), 59)
     """
-    SegmentOptions(segmentation=segmentation, rectangles=rectangles, compactness=compactness)  # checks them
+    SegmentOptions(segmentation=segmentation, rectangles=rectangles, compactness=compactness)  # checks the values
     pixels = _as_pixels(as_array(image))
     height, width, _ = pixels.shape
     if count < 1:
@@ -122,13 +123,13 @@ def superpixels(
 
 
 def grid_labels(height: int, width: int, count: int) -> np.ndarray:
-    """Return labels ``[h,w]`` int32 of ``count`` rectangles, in rows of equally many rectangles, up to one."""
-    min_rows = -(-count // width)  # rows of blocks that can hold them all
-    lines = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
-    first = np.arange(lines + 1) * count // lines  # first label of each row of blocks
-    line = np.arange(height) * lines // height
-    blocks = np.diff(first)[line]
-    return (first[line][:, None] + np.arange(width) * blocks[:, None] // width).astype(np.int32)
+    """Return labels ``[h,w]`` int32 of ``count`` rectangles in rows; their numbers per row differ by at most one."""
+    min_rows = -(-count // width)  # rows of rectangles that can hold them all
+    num_rows = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
+    first = np.arange(num_rows + 1) * count // num_rows  # first label of each row of rectangles
+    row = np.arange(height) * num_rows // height  # row of rectangles of each row of pixels
+    num_columns = np.diff(first)[row]
+    return (first[row][:, None] + np.arange(width) * num_columns[:, None] // width).astype(np.int32)
 
 
 def saliency(image: Array) -> Array:
@@ -177,7 +178,7 @@ def _every_pixel(height: int, width: int) -> np.ndarray:
 
 
 def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int, compactness: float) -> np.ndarray:
-    """Split into rectangles, merge to the exact number, move border pixels; return padded labels."""
+    """Cut into rectangles, merge them to the exact number, move border pixels; return padded labels."""
     height, width, _ = pixels.shape
     spread = np.float32(compactness**0.5)
     num_rectangles = int(rectangles * count)
@@ -191,12 +192,12 @@ def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int,
 
 
 def _lab_colours(pixels: np.ndarray) -> np.ndarray:
-    """Return CIELAB / 100; OpenCV reads it from tables, with the same bits on every processor."""
+    """Return CIELAB / 100; OpenCV computes it by tables, with the same bits on every processor."""
     return np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
 
 
 def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None) -> np.ndarray:
-    """Run BASS from hexagonal or from saliency seeds; return padded labels."""
+    """Run BASS from seeds on a hexagonal grid, or drawn by saliency; return padded labels."""
     from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels
 
     height, width, _ = pixels.shape
@@ -212,9 +213,10 @@ def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None
 
 
 def _slic(pixels: np.ndarray, count: int, compactness: float) -> np.ndarray:
-    """Run scikit-image's SLIC, merge its pieces with Ward's rule to the exact number; return padded labels.
+    """Run scikit-image's SLIC, and merge its pieces with Ward's rule to the exact number; return padded labels.
 
-    It is given CIELAB of channels that span [0, 1], as it would make it: its own depends on the processor.
+    CIELAB is computed here, from channels that span [0, 1] as in scikit-image, whose own CIELAB depends on the
+    processor.
     """
     from skimage.measure import label
     from skimage.segmentation import slic
@@ -222,7 +224,7 @@ def _slic(pixels: np.ndarray, count: int, compactness: float) -> np.ndarray:
     height, width, _ = pixels.shape
     span = pixels.max() - pixels.min()
     colours = _lab_colours((pixels - pixels.min()) / (span or 1))
-    weight = SLIC_COMPACTNESS / (100 * float(np.ptp(colours)) or 1)  # the colours, too, are made to span [0, 1]
+    weight = SLIC_COMPACTNESS / (100 * float(np.ptp(colours)) or 1)  # SLIC scales the colours to [0, 1], too
     asked = count
     while asked < height * width:
         pieces = slic(colours, n_segments=asked, compactness=weight, start_label=0, channel_axis=-1, convert2lab=False)
