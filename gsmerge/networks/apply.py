@@ -28,6 +28,7 @@ from gsmerge.networks.tokens import (
     sample_members,
     split_tables,
 )
+from gsmerge.networks.weights import RunnableNetworks
 from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
@@ -42,7 +43,7 @@ RunTable = Callable[[np.ndarray, int], Array]  # takes rows and width of a table
 class NetworkContext(Corrector):
     """Networks, with their inputs other than Feature Gaussians."""
 
-    networks: NetworkWeights | Networks  # encoder, merger, refiner and decoder heads; in training torch modules
+    networks: RunnableNetworks  # encoder, merger, refiner and decoder heads; in training torch modules
     members: Members  # the scene's Gaussians
     cameras: Cameras  # the scene's views
     seed: int = 0  # of the sampling of members in large groups

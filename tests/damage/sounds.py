@@ -24,7 +24,7 @@ from former_formats import compressed_bytes, spz4_bytes
 from made_gaussians import random_gaussians
 from model_files import long_lrm as export_long_lrm
 from network_fixtures import noisy, written
-from program_cameras import long_lrm, world_mirror, write_globalsplat, write_metashape, write_opensfm, write_polycam
+from program_cameras import FORMATS
 from splat_transform_programs import write_set
 from tiny_scene import (
     make_tiny,
@@ -46,6 +46,7 @@ from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.crop_file import read_crop
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.io.photo_files import decode_alpha, decode_levels
+from gsmerge.kernels.matrices import invert
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.scene.read import load_scene
 from gsmerge.settings.compact import CompactOptions
@@ -59,6 +60,7 @@ from .changes import glb_bytes, pack_members
 SPLATTING = "KHR_gaussian_splatting"
 SPZ_IN_GLB = f"{SPLATTING}_compression_spz_2"
 NAMES = ("view_000.png", "view_001.png", "view_002.png")
+VIEW_NAMES = [Path(name).stem for name in NAMES]
 TINY = replace(make_tiny(6, 4), names=NAMES)
 SOME = random_gaussians(6, 0, degree=1)
 PHOTO_ENDINGS = ("png", "jpg", "bmp", "webp", "tiff", "ppm")
@@ -286,6 +288,19 @@ def write_levels(folder: Path, leaves: int = 1) -> None:
 # Makers of cameras
 
 
+def world_mirror(c2w: np.ndarray, K: np.ndarray) -> dict[str, Any]:
+    """The document of WorldMirror's ``camera_params.json``."""
+    poses = [{"camera_id": name, "matrix": pose.tolist()} for name, pose in zip(VIEW_NAMES, c2w, strict=True)]
+    return {"extrinsics": poses, "intrinsics": [{**pose, "matrix": K.tolist()} for pose in poses]}
+
+
+def long_lrm(c2w: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> dict[str, Any]:
+    """The document of Long-LRM's cameras."""
+    common = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": size[0], "h": size[1]}
+    poses = zip(VIEW_NAMES, invert(c2w), strict=True)
+    return {"frames": [{"file_path": name, "w2c": pose.tolist(), **common} for name, pose in poses]}
+
+
 def write_long_lrm(folder: Path) -> None:
     save_json(folder / "cameras.json", long_lrm(TINY.c2w, TINY.K, (TINY.width, TINY.height)))
 
@@ -352,9 +367,14 @@ def write_dataparser(folder: Path) -> None:
     save_json(folder / "transforms.json", {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 2.0})
 
 
+def write_metashape(folder: Path) -> Path:
+    """Write a file of Metashape with a lens."""
+    return FORMATS["Metashape"].write(folder, "<cy>-2</cy>", "<cy>-2</cy><k1>0.1</k1>")
+
+
 def write_metashape_moved(folder: Path) -> None:
     """Write a file of Metashape with its world."""
-    path = write_metashape(folder, "<k1>0.1</k1>")
+    path = write_metashape(folder)
     move = "<rotation>1 0 0 0 1 0 0 0 1</rotation><translation>2 4 6</translation><scale>2</scale>"
     path.write_text(path.read_text().replace("<chunk>", f"<chunk><transform>{move}</transform>"))
 
@@ -456,11 +476,11 @@ SOUNDS: dict[str, Sound] = {
     "frames": Sound("transforms.json", write_frames, check_cameras, INSPECT, rare=True),
     "bare frames": Sound("transforms.json", write_bare_frames, check_cameras, INSPECT, rare=True),
     "Blender": Sound("transforms.json", write_blender, check_cameras, INSPECT, rare=True),
-    "GlobalSplat": Sound("cameras.json", write_globalsplat, check_cameras, INSPECT),
-    "OpenSfM": Sound("reconstruction.json", write_opensfm, check_cameras, INSPECT),
-    "Metashape": Sound("cameras.xml", partial(write_metashape, lens="<k1>0.1</k1>"), check_metashape, INSPECT),
+    "GlobalSplat": Sound("cameras.json", FORMATS["GlobalSplat cameras.json"].write, check_cameras, INSPECT),
+    "OpenSfM": Sound("reconstruction.json", FORMATS["OpenSfM"].write, check_cameras, INSPECT),
+    "Metashape": Sound("cameras.xml", write_metashape, check_metashape, INSPECT),
     "Metashape moved": Sound("cameras.xml", write_metashape_moved, check_metashape, INSPECT, rare=True),
-    "Polycam": Sound("keyframes/corrected_cameras", write_polycam, check_cameras, (), packed=True),
+    "Polycam": Sound("keyframes/corrected_cameras", FORMATS["Polycam"].write, check_cameras, (), packed=True),
     "pose folder": Sound("pose", write_pose_folder, check_cameras, (), packed=True),
     **{name: Sound("a.txt", write_text("a.txt", text), check_cameras, INSPECT) for name, text in POSE_LISTS.items()},
     "Tanks and Temples": Sound("a.log", write_text("a.log", LOG), check_cameras, INSPECT),
