@@ -184,8 +184,8 @@ def _exporters_page(page: str) -> str:
     results: dict[str, list[str]] = {}
     for one in EXPORTERS.values():
         for model in one.models:
-            leaves = model.leaves.partition(";")[0].replace("no cameras", "")
-            facts = "; ".join(filter(None, (f"`{one.name}`", leaves)))
+            output = model.output.partition(";")[0].replace("no cameras", "")
+            facts = "; ".join(filter(None, (f"`{one.name}`", output)))
             results.setdefault(model.result, []).append(f"{model.title} ({facts})")
     return _renew(page, "models", [f"- *{result}*: {'; '.join(models)}" for result, models in results.items()])
 

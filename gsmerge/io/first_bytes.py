@@ -104,14 +104,22 @@ def read_start(path: Path, count: int = 1 << 12) -> bytes:
     return b""
 
 
-def refuse_picture(path: Path, *, by_name: bool) -> None:
-    """Raise SceneError for a picture of a format that is not read, by its first bytes, or else its name."""
-    start, ending = read_start(path, _START), path.suffix.lower()
-    names = [name for name, pattern in _PICTURES if pattern.match(start)]
-    names += [name for name, endings, _ in OTHER_PICTURES if by_name and ending in endings]
+def refuse_picture(path: Path) -> None:
+    """Raise SceneError for a picture of a format that is not read, by its first bytes or else by its name."""
+    names = _list_formats(read_start(path, _START))
+    names += [name for name, endings, _ in OTHER_PICTURES if path.suffix.lower() in endings]
     if names:
-        problem = f"expected an image, found a picture of the format {names[0]}, which is not read"
-        raise SceneError(path, problem, CONVERT)
+        raise _unread_picture(path, names[0])
+
+
+def _list_formats(start: bytes) -> list[str]:
+    """List the formats of pictures, of those that are not read, to which the first bytes of a file belong."""
+    return [name for name, pattern in _PICTURES if pattern.match(start)]
+
+
+def _unread_picture(path: Path, name: str) -> SceneError:
+    """Make the error of a picture of a format that is not read."""
+    return SceneError(path, f"expected an image, found a picture of the format {name}, which is not read", CONVERT)
 
 
 def check_first_bytes(path: Path, size: int) -> None:
@@ -125,9 +133,9 @@ def check_first_bytes(path: Path, size: int) -> None:
     if ending in FOREIGN:
         what, remedy = FOREIGN[ending]
         raise SceneError(path, f"expected a scene, found {what}", remedy)
-    if ending in _PHOTOS:
-        refuse_picture(path, by_name=False)
     start = read_start(path, _START)
+    if ending in _PHOTOS and (names := _list_formats(start)):
+        raise _unread_picture(path, names[0])
     for row, pattern in zip(OTHER_CONTENTS, _PATTERNS, strict=True):
         match = pattern.match(start) if ending not in row.right and ending in (row.wrong or (ending,)) else None
         if match:

@@ -126,7 +126,7 @@ def match_masks(folder: Path, names: Sequence[str], option: str = "--masks") -> 
 def list_images(folder: Path) -> list[Path]:
     """List all images below a folder in natural order ("2" before "10"); SceneError for too many files."""
     images = [f for f in walk_files(folder) if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
-    return sorted(images, key=lambda f: natural_key(f.relative_to(folder).as_posix()))
+    return natural_order(images)
 
 
 def check_photo_folder(path: Path) -> None:
@@ -168,8 +168,8 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def natural_order(paths: Iterable[PathT]) -> list[PathT]:
-    """Sort paths so that "view 2" comes before "view 10"; equal numbers, as of "view 02", by their letters."""
-    return sorted(sorted(paths), key=lambda path: natural_key(os.fspath(path)))
+    """Sort paths so that "view 2" comes before "view 10"; paths with equal numbers, as "view 02", by their letters."""
+    return sorted(sorted(paths), key=lambda path: natural_key(os.fspath(path).replace(os.sep, "/")))
 
 
 def find_image(folder: Path, name: str, remedy: str = _NAME_FOLDER) -> Path | None:

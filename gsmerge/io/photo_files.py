@@ -326,7 +326,7 @@ def _undecodable(path: Path, size: Size) -> SceneError:
 
 def _unreadable(path: Path) -> SceneError:
     """Make the error of a file that is no image of a format that is read."""
-    refuse_picture(path, by_name=True)
+    refuse_picture(path)
     return SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
 
 
@@ -560,6 +560,15 @@ class PhotoTransform:
             return np.ascontiguousarray(whole[self.top : self.top + self.height, self.left : self.left + self.width])
 
         return change_photos(images, one, (self.width, self.height))
+
+
+def limit_size(size: Size, side: int) -> Size:
+    """Shrink a size in proportion until its longer side has ``side`` pixels; return a smaller size unchanged."""
+    if max(size) <= side:
+        return size
+    scale = side / max(size)
+    width, height = (max(1, round(whole * scale)) for whole in size)
+    return width, height
 
 
 def resize_to(size: Size, to: Size) -> PhotoTransform:

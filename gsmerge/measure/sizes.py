@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.facts.views import resize_cameras
+from gsmerge.io.photo_files import limit_size
 from gsmerge.kernels.pictures import enlarge
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Views
@@ -26,8 +27,9 @@ def zoom_cameras(cameras: Cameras, zoom: float) -> Cameras:
 
 def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
     """Shrink the image size of cameras to at most ``side`` pixels on the longer side; 0: keep it."""
-    long_side = max(cameras.width, cameras.height)
-    return zoom_cameras(cameras, side / long_side) if 0 < side < long_side else cameras
+    size = cameras.width, cameras.height
+    smaller = limit_size(size, side or max(size))
+    return cameras if smaller == size else resize_cameras(cameras, *smaller)
 
 
 def fill_cameras(cameras: Cameras, width: int, height: int) -> Cameras:

@@ -1,1 +1,1 @@
-"""Scenes from files: the files that belong together, their exporters' habits, views and held-out views."""
+"""Read scenes from files: find the files that belong together, know exporters, read views and held-out views."""

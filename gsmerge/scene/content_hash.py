@@ -1,4 +1,4 @@
-"""Hash everything that is read of a scene, and make names from a scene's own."""
+"""Hash all files that a scene is read from, and fill the names of scenes into paths."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def content_hash(files: Sequence[Path]) -> str:
 
 
 def read_files(files: SceneFiles) -> list[Path]:
-    """List all files and folders that reading a scene would read, each once."""
+    """List all files and folders from which a scene is read, each once."""
     paths = list(files.paths)
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
@@ -52,7 +52,7 @@ def read_files(files: SceneFiles) -> list[Path]:
 
 
 def photos_of(cameras: Path) -> list[Path]:
-    """List the photos of a camera file: the files that it names, otherwise image folders next to it."""
+    """List the photos of a camera file: the files that it names, otherwise image folders beside it."""
     camera_file = cameras_of(cameras)
     root = cameras if cameras.is_dir() else cameras.parent
     names = () if camera_file is None else camera_file.names
@@ -61,7 +61,7 @@ def photos_of(cameras: Path) -> list[Path]:
 
 
 def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
-    """Read the cameras of a file; None if that fails, since reading the scene reports the reason."""
+    """Read the cameras of a file; None if that fails, since the reader of the scene reports the reason."""
     try:
         return read_cameras(path, scene=scene)
     except SceneError:
@@ -81,4 +81,4 @@ def filled(template: str | None, scene: Path) -> Path | None:
     try:
         return Path(template.format(scene=scene, parent=parent, stem=stem_of(scene)))
     except (AttributeError, LookupError, TypeError, ValueError) as error:
-        raise UsageError(f"expected {{scene}}, {{parent}} or {{stem}} in braces, got {template}") from error
+        raise UsageError(f"{template}: expected only {{scene}}, {{parent}} or {{stem}} in braces") from error

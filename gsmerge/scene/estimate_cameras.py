@@ -1,7 +1,7 @@
-"""Estimate the cameras of rows whose file has none, or poses alone, and how photos were brought to their grid.
+"""Estimate cameras for rows without any or with poses alone, and find how photos were resized to the rows' grid.
 
-Photos of any size are compared with the views of a grid, whose pictures are its rows' own colours: models squeeze or
-crop photos, and some cut a border off what they write.
+Models resize photos without their aspect ratio or crop them, and some cut a border off their output. Therefore photos
+of any size are compared with the pictures of a grid, which are the colours of its rows.
 """
 
 from __future__ import annotations
@@ -29,37 +29,41 @@ def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: PhotoArra
     """Estimate the focal length of cameras whose file has poses alone; SceneError if that fails."""
     estimated = alignment.estimate_focal(ply, camera_file, photos)
     if estimated is None:
-        reason = "no focal length fits the Gaussians" if len(photos) else "no photos that show them"
+        reason = "no focal length fits the Gaussians" if len(photos) else "no photos to estimate them from"
         raise missing_intrinsics(camera_file.path, f", and {reason}")
     return estimated
 
 
 def estimate_cameras(ply: GaussianFile, path: Path, folder: Path | None) -> CameraFile | None:
-    """Estimate cameras of the photos in a folder, or those of a grid of any size; None for other rows."""
+    """Estimate the cameras of the photos in a folder, or else of a grid of any size; None if the rows are no grid."""
     cameras, paths = None, [] if folder is None else list_images(folder)
     if folder is not None and paths:
         names = [photo.relative_to(folder).as_posix() for photo in paths]
-        with suppress(SceneError):  # what is no image has no size
-            size = image_size(paths[0])  # as it is stored, or turned
-            cameras = alignment.estimate_cameras(path, ply.gaussians, ply.valid, names, size, size[::-1])
+        with suppress(SceneError):  # the first file may be no image
+            size = image_size(paths[0])
+            turned = size[::-1]  # by its orientation tag
+            cameras = alignment.estimate_cameras(path, ply.gaussians, ply.valid, names, size, turned)
     return cameras or alignment.estimate_from_rows(path, ply.gaussians, ply.valid)
 
 
 @dataclass(frozen=True)
 class GridFit:
-    """How photos were brought to the pixels of a grid of rows."""
+    """How a model resized and cropped photos to the pixels of a grid of rows."""
 
     size: Size  # of the grid
-    crops: bool = False  # whether their middle was cut out, and not the whole squeezed
-    trim: tuple[int, int] = (0, 0)  # columns and lines at both sides that the grid lacks
+    crops: bool = False  # True: resized in proportion and cropped at the centre; False: width and height independently
+    trim: tuple[int, int] = (0, 0)  # columns and lines that the model cut off each side after that
 
     def transform(self, size: Size) -> PhotoTransform:
-        """Return the transform of photos of a size to the grid with its borders."""
+        """Return the transform of photos of a size to the grid with the borders that the model cut off."""
         width, height = (side + 2 * cut for side, cut in zip(self.size, self.trim, strict=True))
         return (resize_and_crop if self.crops else resize_to)(size, (width, height))
 
     def cut(self, photo: np.ndarray) -> np.ndarray:
-        """Bring a photo ``[h,w,3]`` of any size to the pixels of the grid; one that lies where this stands stays so."""
+        """Resize and crop a photo ``[h,w,3]`` of any size to the pixels of the grid.
+
+        A landscape photo of a portrait grid, or the reverse, is turned for that, and the result is turned back.
+        """
         (width, height), (x, y) = self.size, self.trim
         if (photo.shape[1] - photo.shape[0]) * (width - height) < 0:
             return np.rot90(self.cut(np.ascontiguousarray(np.rot90(photo))), -1)
@@ -67,7 +71,7 @@ class GridFit:
         return np.asarray(whole[y : y + height, x : x + width])
 
     def cameras(self, camera_file: CameraFile, size: Size) -> CameraFile:
-        """Return cameras of the grid with its borders, and how photos of a size are brought there."""
+        """Return the cameras of the grid with its borders; their ``photo_map`` is the transform of photos of a size."""
         (x, y), Ks, pixel_ids = self.trim, camera_file.Ks.copy(), camera_file.pixel_ids
         Ks[:, :2, 2] += self.trim
         if pixel_ids is not None:
@@ -80,23 +84,23 @@ class GridFit:
 
 
 def list_fits(size: Size) -> list[GridFit]:
-    """List the ways in which models bring photos to a grid of a size, simple ones first."""
+    """List how models resize and crop photos to a grid of a size, simple fits first."""
     trims = [(trim, trim) for trim in (0, *alignment.TRIMS)]
     trims += product(alignment.da3_borders(size[0]), alignment.da3_borders(size[1]))
     return [GridFit(size, crops, trim) for crops in (False, True) for trim in dict.fromkeys(trims)]
 
 
 def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: Sequence[GridFit]) -> GridFit:
-    """Choose how photos ``[h,w,3]`` that show the views were brought to their grid: of equals the first."""
+    """Choose the fit by which photos ``[h,w,3]`` match the pictures of their views best; of equal fits the first."""
     views = [view for view, photo in enumerate(photos) if photo is not None]
 
     def score(fit: GridFit) -> np.ndarray:
         parts = [correlate_parts(shown, view, fit.cut(photos[view])) for view in views]  # type: ignore[arg-type]
         return np.concatenate(parts)
 
-    best, most = fits[0], score(fits[0])
+    best, best_scores = fits[0], score(fits[0])
     for fit in fits[1:]:
         scores = score(fit)
-        if stands_out(scores - most):
-            best, most = fit, scores
+        if stands_out(scores - best_scores):
+            best, best_scores = fit, scores
     return best

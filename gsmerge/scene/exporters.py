@@ -1,7 +1,7 @@
-"""Hints on how to read a file, by its caller and by the exporters that are known by name.
+"""The table of known exporters, and hints of the caller on how to read a file.
 
-To add a model, add a :class:`Model` to the exporter whose columns, order and encodings it shares, or with an exporter
-of its own; ``python tasks.py reference`` renews docs/reference/exporters.md.
+To add a model, add a :class:`Model` to the exporter whose columns, order and encodings it shares, or add an exporter.
+``python tasks.py reference`` renews docs/reference/exporters.md.
 """
 
 from __future__ import annotations
@@ -21,9 +21,7 @@ if TYPE_CHECKING:
     from gsmerge.io.formats.read import FileInfo
 
 FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "other"]
-TURNED: tuple[FrameKind, ...] = ("first", "middle", "upright")  # by exporters, means and rotations alike
-
-
+TURNED: tuple[FrameKind, ...] = ("first", "middle", "upright")  # frames into which exporters turn means and rotations
 AUTO = ReadHints()
 
 
@@ -33,46 +31,46 @@ def make_hints(values: dict[str, Any]) -> ReadHints:
     unknown = sorted(values.keys() - names)
     if unknown:
         known = sorted({*names, *SCENE_ARGUMENTS})
-        near = suggest_name(unknown[0], known)
-        raise ValueError(f"expected {join_words(map(repr, known))}, got {unknown[0]!r}{near}")
+        suggestion = suggest_name(unknown[0], known)
+        raise ValueError(f"expected {join_words(map(repr, known))}, got {unknown[0]!r}{suggestion}")
     return ReadHints(**values)
 
 
 @dataclass(frozen=True)
 class Model:
-    """A model or program whose saving code was read."""
+    """A model or program, whose code for saving was read to describe its files."""
 
-    title: str  # as people call it
-    source: str  # repository and commit; two commits: the second is that of a file that was read again later
-    leaves: str  # what it writes, but for what its exporter says
-    result: str = "read right"  # what becomes of that, and what the user adds
-    place: str = ""  # pattern of its files' paths, where no other model with such columns calls its own so
-    brings: str = ""  # what brings its cameras where they are missing, a clause
+    title: str  # the name that people use
+    source: str  # repository and commit; a second commit is that of a file that was read again later
+    output: str  # what it writes, as far as the exporter does not describe it
+    result: str = "read right"  # how gsmerge reads that output, and what the user adds
+    place: str = ""  # pattern of its files' paths, if no other model with the same columns uses these paths
+    camera_advice: str = ""  # how to get its cameras if they are missing, a clause
 
 
 @dataclass(frozen=True)
 class Exporter:
-    """A way to save files of Gaussians, and the properties by which its files are known."""
+    """Code that saves Gaussians, shared by some models, and the properties by which its files are recognised."""
 
-    name: str  # as on the command line
-    models: tuple[Model, ...]  # that save so
+    name: str  # on the command line
+    models: tuple[Model, ...]  # the models that use it
     opacity: Literal["logit", "raw"]  # how it stores opacities
-    order: str  # order of its rows; "unordered": none, but each is made of a pixel; "none": they belong to no pixels
-    kinds: tuple[str, ...] = ("full",)  # which pixels it keeps; see ``gsmerge/alignment/layouts.py``
+    order: str  # order of its rows; "unordered": each row has a pixel, in no order; "none": rows have no pixels
+    kinds: tuple[str, ...] = ("full",)  # which pixels it writes; see ``gsmerge/alignment/layouts.py``
     # where its Gaussians may lie in the frame of the cameras; see :class:`gsmerge.geometry.Similarity`
     frames: tuple[FrameKind, ...] = ("same",)
     per_pixel: tuple[int, ...] = (1,)  # Gaussians per pixel
     degrees: tuple[int, ...] = (0,)  # SH degrees that it writes
     normals: bool = True  # whether it writes the columns nx, ny, nz
     quats: QuatChoice = "wxyz"  # how it stores rotations
-    check_rotations: bool = True  # whether another reading of the rotations may be tried
+    check_rotations: bool = True  # whether rotations may be read in another convention that fits the surface better
     elements: tuple[str, ...] = ()  # elements besides ``vertex`` that it always writes
     byte_columns: tuple[str, ...] = ()  # columns that it writes as bytes
     comment: str = ""  # part of a comment in the header that it always writes
-    cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: none, any may be given
+    cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: it writes none, and any may be given
 
     def may_have_written(self, info: FileInfo, layout: Layout | None, frame: Similarity | None, cameras: str) -> bool:
-        """Return whether a file looks as if this exporter had written it; see :func:`choose_exporters`."""
+        """Return whether this exporter may have written a file; see :func:`choose_exporters` for the arguments."""
         if not self.writes_columns(info) or (self.cameras and cameras not in self.cameras):
             return False
         if layout is None or frame is None:
@@ -86,7 +84,7 @@ class Exporter:
         )
 
     def writes_columns(self, info: FileInfo) -> bool:
-        """Return whether the header and the opacities of a file are as this exporter writes them."""
+        """Return whether a file has the header and the opacities that this exporter writes."""
         return (
             info.sh_degree in self.degrees
             and self.normals == ("nx" in info.columns)
@@ -98,23 +96,23 @@ class Exporter:
 
     @property
     def is_marked(self) -> bool:
-        """Whether its files have what no other exporter writes."""
+        """Whether its files have an element, column or comment that no other exporter writes."""
         return bool(self.elements or self.byte_columns or self.comment)
 
 
 _UPRIGHT: tuple[FrameKind, ...] = ("upright",)
 _ANY: tuple[FrameKind, ...] = ("same", "scaled", "shifted", "other")
 _NORMALS = ("nx", "ny", "nz")
-# What users have to add, or what is lost
+# Results of reading: what users have to add, or what is lost
 _NAME_CAMERAS = "read right with cameras, or with those that its grid shows"
 _NO_PIXELS = "read without pixels"
 _IF_GRID_SHOWS = "read right where the rows show their grid, else without pixels"
 _WITH_CAMERAS = "read without pixels; photos are used where cameras are named"
-# Place of a trained scene, and what brings its cameras
-_TRAINED = "iteration_*/point_cloud.ply", "cameras.json of the run has the cameras: give its folder, or name it"
+# Place of a trained scene, and how to get its cameras
+_TRAINED = "iteration_*/point_cloud.ply", "cameras.json of the run has the cameras: name its folder, or the file itself"
 
 _EXPORTERS = (
-    # Its own renderer uses its rotations as they are stored, so they are never read in another way.
+    # Its own renderer uses the stored rotations as they are, so they are never read in another convention.
     Exporter(
         "da3",
         (
@@ -342,7 +340,7 @@ _EXPORTERS = (
                 "Long-LRM", "arthurhero/Long-LRM d92dd51; `data/dataset.py` 1fccf47, `main.py` 3c35270",
                 "`gaussians_001.ply`; `input_frame_idx.txt`; in some versions `pos_avg_inv.txt` and `scene_scale.txt`",
                 "read right with the data set's file of cameras",
-                brings="the data set's .json file has the cameras: name it with --cameras",
+                camera_advice="the data set's .json file has the cameras: name it with --cameras",
             ),
             Model(
                 "tttLRM", "cwchenwang/tttLRM 1d133c2",
@@ -384,8 +382,8 @@ _EXPORTERS = (
             Model(
                 "nerfstudio", "nerfstudio-project/nerfstudio 50e0e3c",
                 "`splat.ply` in its own frame; `dataparser_transforms.json` with the map into that", _WITH_CAMERAS,
-                brings="the transforms.json that it was trained on has the cameras: name it with --cameras, and keep"
-                " dataparser_transforms.json beside the file",
+                camera_advice="the transforms.json that it was trained on has the cameras: name it with --cameras, and"
+                " keep dataparser_transforms.json beside the file",
             ),
         ),
         "logit", "none", degrees=(0, 1, 2, 3), comment="Nerstudio",
@@ -438,15 +436,18 @@ def choose_exporters(
 
 
 def find_cameras_of_model(info: FileInfo) -> str:
-    """Say what brings the cameras of a file, by the model that wrote it; empty where that is not known."""
+    """Describe how to get the cameras of a file from the model that wrote it; empty if the model is unknown.
+
+    A model is recognised by the path of the file, or by a mark of its exporter. All recognised models must agree.
+    """
     path, exporters = Path(info.path).absolute(), [e for e in EXPORTERS.values() if e.writes_columns(info)]
-    models = [(model, exporter.is_marked) for exporter in exporters for model in exporter.models if model.brings]
-    known = [model for model, is_marked in models if (path.match(model.place) if model.place else is_marked)]
-    says = {model.brings for model in known}
-    return f"{' or '.join(model.title for model in known)}: {says.pop()}" if len(says) == 1 else ""
+    models = [(model, exporter.is_marked) for exporter in exporters for model in exporter.models if model.camera_advice]
+    matching = [model for model, is_marked in models if (path.match(model.place) if model.place else is_marked)]
+    advice = {model.camera_advice for model in matching}
+    return f"{' or '.join(model.title for model in matching)}: {advice.pop()}" if len(advice) == 1 else ""
 
 
 def exporter_names(exporters: Sequence[Exporter]) -> str:
     """Join the titles of exporters for a message."""
     titles = join_words(model.title for exporter in exporters for model in exporter.models)
-    return titles or "none that is known by name"
+    return titles or "none of the known ones"

@@ -42,38 +42,38 @@ _HOLDS_VIEWS = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
 _FIND_DEPTH_MAPS = LazyFunction("gsmerge.io.formats.depth_maps", "find_depth_maps")
 # The first that exists and is no result wins; then the folder's only .ply.
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
-# Of trained scenes, the one of the most steps: INRIA's, and gsplat's
+# Of several trained scenes in a folder, that of the most steps is read: INRIA's, and gsplat's
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
-SCENES_PLACE = "gaussians"  # where DepthSplat and its relatives write NAME.ply, with the photos in images/NAME
+SCENES_PLACE = "gaussians"  # DepthSplat and its relatives write NAME.ply there, with the photos in images/NAME
 IMAGE_PLACES = (
     "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
     "keyframes/images",
 )  # fmt: skip
 MASK_PLACES = ("masks",)
-_PICTURES = ("images", "masks", "protect")  # of the files of a scene
-_POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs
+_PICTURES = ("images", "masks", "protect")  # fields of SceneFiles that are folders of pictures
+_POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names that other programs use for them
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
-# ends of paths that many scenes have
+# Ends of paths that programs give to all their scenes
 _USUAL_END = re.compile(
     r"/(?:(?:exports/)?gs_ply/\d+|(?:point_cloud/iteration_\d+/)?point_cloud|ply/point_cloud_\d+|scene|gaussians)$"
 )
-# what files are called that have a view or a part each
+# Words before the numbers of files that each have one view or one part of a scene
 _PARTS = {"view", "chunk", "part", "block", "tile"}
-_LEVEL = re.compile(r"\.level\d+(?=\.)")  # in the name of a level of detail, as :func:`level_output` makes it
+_LEVEL = re.compile(r"\.level\d+(?=\.)")  # in the name of a level of detail, see :func:`level_output`
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 _PACKED = {*SCENE_SUFFIXES} - {".ply", DEPTHS.ending}
-_MAX_HEADERS = 1_000  # of a folder that are read; the other files are taken for scenes
-_MAX_DEPTH = 3  # of the folders that are searched below one without a scene
-_MAX_ENTRIES = 10_000  # in them
+_MAX_HEADERS = 1_000  # headers of a folder's files that are read; further files count as scenes
+_MAX_DEPTH = 3  # of the folders that are searched below a folder without a scene
+_MAX_ENTRIES = 10_000  # files and folders in them
 
 
 @dataclass(frozen=True)
 class SceneFiles:
     """The files of a scene.
 
-    Cameras may be a COLMAP folder or the ``.ply`` that holds its own, images the ``.npz`` or ``.torch`` that holds
-    them; of a ``.gsm`` both are that.
+    ``cameras`` may be a COLMAP folder, or the ``.ply`` itself if it holds its cameras. ``images`` may be an ``.npz`` or
+    ``.torch`` that holds them. For a ``.gsm`` both are the file itself.
     """
 
     ply: Path
@@ -82,10 +82,10 @@ class SceneFiles:
     masks: Path | None = None  # a folder
     protect: Path | None = None  # a folder; never searched
     more: tuple[SceneFiles, ...] = ()  # other scenes of the same place, each in a frame of its own
-    parts: tuple[Path, ...] = ()  # all files whose rows the scene has, ``ply`` first; empty for one
-    num_copies: int = 0  # other files of the same bytes in the folder
-    named: frozenset[str] = frozenset()  # those of cameras and pictures that were not searched
-    above: tuple[Path, ...] = ()  # cameras and photos in the folder above, where none were found; never read
+    parts: tuple[Path, ...] = ()  # all files of a scene in several files, ``ply`` first; empty for a single file
+    num_copies: int = 0  # number of other files in the folder with the same bytes
+    named: frozenset[str] = frozenset()  # names of the fields that the caller gave, which are not searched
+    above: tuple[Path, ...] = ()  # cameras and photos in the folder above, if the scene has none; never read
 
     @property
     def plys(self) -> tuple[Path, ...]:
@@ -94,52 +94,53 @@ class SceneFiles:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Paths of all that the scene is read from: Gaussians, cameras, and folders of pictures."""
-        others = (self.cameras, self.images, self.masks, self.protect)
-        return (*self.plys, *(path for path in others if path is not None))
+        """Paths of all files and folders that the scene is read from: Gaussians, cameras and pictures."""
+        beside = (self.cameras, self.images, self.masks, self.protect)
+        return (*self.plys, *(path for path in beside if path is not None))
 
-    def without_found(self, problem: str) -> Iterator[SceneFiles]:
-        """Yield copies without what was found and may not belong to the scene, if the file ``problem`` is unusable.
+    def without_found(self, unusable: str) -> Iterator[SceneFiles]:
+        """Yield copies without files that were searched and may not belong to the scene.
 
-        Images that the cameras' file holds go with it.
+        ``unusable``: path of the file that the scene could not be read with. If the caller named its folder of
+        pictures, there are no copies. Images inside the cameras' file are left out together with the cameras.
         """
-        alone, place = self, Path(problem)
-        if any(name in self.named and place.is_relative_to(getattr(self, name) or os.devnull) for name in _PICTURES):
+        without_images, path = self, Path(unusable)
+        if any(name in self.named and path.is_relative_to(getattr(self, name) or os.devnull) for name in _PICTURES):
             return
-        if "masks" not in self.named and self.masks is not None and place.is_relative_to(self.masks):
+        if "masks" not in self.named and self.masks is not None and path.is_relative_to(self.masks):
             yield replace(self, masks=None)
         if "images" not in self.named:
-            alone = replace(self, images=None, named=self.named | {"images"})
-            yield alone
+            without_images = replace(self, images=None, named=self.named | {"images"})
+            yield without_images
         if "cameras" not in self.named and self.cameras not in (None, self.ply):
             if self.images is None or self.images != self.cameras:
                 yield replace(self, cameras=None)
-            yield replace(alone, cameras=None)
+            yield replace(without_images, cameras=None)
 
     @property
     def is_state(self) -> bool:
-        """Whether it is a state, whose Gaussians have no pixels."""
+        """Whether the file is a state (``.gsm``), whose Gaussians have no pixels."""
         return self.ply.suffix.lower() == STATE_ENDING
 
     @property
     def base(self) -> Path:
-        """Path from which names of results are derived: the file, or ``scene.ply`` in a folder of parts or frames."""
+        """Path from which the names of results are made: the file, or ``scene.ply`` for a folder of parts or frames."""
         if is_frame(self.ply):
             return self.ply.parent.with_name("scene.ply")
         return self.ply.with_name("scene.ply") if self.parts else self.ply
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes that several files are read as one scene, and on what lies above it."""
+        """Notes that several files are read as one scene, and on cameras and photos in the folder above."""
         notes = []
         if self.num_copies:
-            notes.append(f"{self.num_copies + 1} files have the same bytes: {self.ply.name} is read")
+            notes.append(f"{self.num_copies + 1} files have the same bytes; {self.ply.name} is read")
         elif self.parts:
             notes.append(f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}")
         if self.above:
             names = " and ".join(map(str, self.above))
-            remedy = "name that folder, or them by --images and --cameras"
-            notes.append(f"not beside the scene but one folder above, and not read: {names}; {remedy}")
+            remedy = "to read them, name that folder as the scene, or name them with --images and --cameras"
+            notes.append(f"{names} are in the folder above the scene and are not read; {remedy}")
         return tuple(notes)
 
 
@@ -154,21 +155,24 @@ def find_scene_files(
 ) -> SceneFiles:
     """Find a scene's files from its path; files that the caller names, or "none", are not searched.
 
-    ``within``: a folder, up to which the folders above the path are searched, too; a path to a folder is one.
+    These folders are searched in this order:
 
-    Cameras inside the ``.ply``, or belonging to depth maps, take precedence over others beside it, and those of a
-    result, ``NAME.cameras.json``, over all others.
+    - the given folder;
+    - the folder of the ``.ply``, and that of the file that it links to;
+    - the folder above it if its own is ``gs_ply/``, ``ply/`` or ``gaussians/``, or the folder two above it if its own
+      is ``point_cloud/iteration_n/``;
+    - the folders above it up to ``within``, by default up to the given folder.
 
-    The search goes through the given folder, that of the ``.ply`` and of what it links to, the folder above it for
-    ``gs_ply/``, ``ply/`` and ``gaussians/``, two above it for ``point_cloud/iteration_n/``, and those between. In each
-    the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in their order. If
-    no place has cameras, the only file of any name that holds cameras is taken, or one of a program whose cameras are
-    not read, to say so. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder, because the
-    model saw those. A result of gsmerge is taken if a folder has nothing else.
+    In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
+    their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, and cameras inside the
+    ``.ply`` or of depth maps over those beside it. If no place has cameras, the only file of any name that holds
+    cameras is taken. Without it, cameras of a program whose files are not read are taken, so that the reader says so.
+    Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder, because the model saw these. A
+    result of gsmerge is taken as the scene only if a folder has nothing else.
 
     Raises:
-        SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist. Several are one
-            scene if they are numbered views or parts, see ``docs/reference/formats.md``.
+        SceneError: If there is no ``.ply``, or several to choose from, or if a named file does not exist. Several files
+            are one scene if they are numbered views or parts, see ``docs/reference/formats.md``.
     """
     path, given = Path(path), {"cameras": cameras, "images": images, "masks": masks}
     if images is not None and images != NONE:
@@ -185,7 +189,7 @@ def find_scene_files(
     plys = find_plys(path, camera_path) if os.path.isdir(path) else [path]
     ply, num_copies = plys[0], len(list_plys(path)) - len(plys) if os.path.isdir(path) else 0
     if ply == path and is_frame(path):
-        problem = "expected the folder of all frames of DA3-Streaming, found one frame"
+        problem = "expected the folder with all frames of DA3-Streaming, found a single frame"
         raise SceneError(path, problem, f"name {path.parent}")
     for part in plys:
         check_file(part)
@@ -194,7 +198,7 @@ def find_scene_files(
     roots = _search_roots(path, ply, within)
     if cameras is None:
         places = (find(root) for find in (find_cameras, find_other_cameras, find_unread) for root in roots)
-        own = ply.parent.parent / POSES if is_frame(ply) else ply  # by which depth maps are placed
+        own = ply.parent.parent / POSES if is_frame(ply) else ply  # the cameras of depth maps
         camera_path = own if ply.suffix == DEPTHS.ending else result_cameras(ply)
         camera_path = camera_path or next((place for place in places if place is not None), None)
     if images is None and is_frame(ply):
@@ -206,10 +210,10 @@ def find_scene_files(
         image_path = camera_path if has_images else None
     if image_path is None and images is None:
         folders = [f for root in roots for place in IMAGE_PLACES if can_be_listed(f := root / place, "images")]
-        # of several scenes each may have a folder of its own
+        # If a folder has several scenes, each may have its own folder of images
         names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
-        of_scene = [place / name for place in folders for name in names]
-        image_path = next((f for f in of_scene + folders if f.is_dir() and list_images(f)), None)
+        own_folders = [place / name for place in folders for name in names]
+        image_path = next((f for f in own_folders + folders if f.is_dir() and list_images(f)), None)
     if masks is None:
         beside = [] if image_path is None else [image_path.parent]
         candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
@@ -221,7 +225,7 @@ def find_scene_files(
 
 
 def can_be_listed(folder: Path, option: str) -> bool:
-    """Return whether a path is a folder; SceneError, which names the ``option``, for one without the right to read."""
+    """Return whether a path is a folder; SceneError, which names the ``option``, for a folder that is not readable."""
     try:
         os.scandir(folder).close()
     except (FileNotFoundError, NotADirectoryError):
@@ -233,7 +237,7 @@ def can_be_listed(folder: Path, option: str) -> bool:
 
 
 def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[Path, ...]:
-    """Find the photos and cameras that a scene lacks in the folder above all that were searched, ``roots``."""
+    """Find the photos and cameras that a scene lacks in the folder above the searched folders ``roots``."""
     own = Path(os.path.realpath(files.ply))
     folder = min((r for r in roots if own.is_relative_to(r)), default=roots[0], key=lambda r: len(r.parts))
     places = list[Path | None]()
@@ -247,7 +251,7 @@ def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[Path, ...]:
 
 
 def _search_roots(path: Path, ply: Path, within: StrPath | None) -> list[Path]:
-    """List the folders that are searched for what belongs to a file; see :func:`find_scene_files`."""
+    """List the folders in which files that belong to a ``.ply`` are searched; see :func:`find_scene_files`."""
     base = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
     above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE, FRAMES))
@@ -260,10 +264,10 @@ def _search_roots(path: Path, ply: Path, within: StrPath | None) -> list[Path]:
 
 
 def _check_folders(**folders: Path | None) -> None:
-    """Raise SceneError for what is no folder, by option."""
+    """Raise SceneError if a path is no folder; the names of the arguments are the options."""
     for option, path in folders.items():
         if path is not None and not path.is_dir():
-            raise SceneError(path, f"expected a folder of pictures for --{option}, found a file")
+            raise SceneError(path, f"expected a folder of pictures for --{option}, found a file", "name its folder")
 
 
 def _list_between(folder: Path, top: Path) -> list[Path]:
@@ -272,13 +276,13 @@ def _list_between(folder: Path, top: Path) -> list[Path]:
 
 
 def scene_title(ply: Path) -> str:
-    """Name a scene for a page: by its file, or by its folder where the file has the name that all scenes of it have."""
+    """Name a scene for a page: by its file, or by its folder if its program gives the same name to all files."""
     path = ply.absolute().with_name(ply.stem.removesuffix(".compact")).as_posix()
     return Path(_USUAL_END.sub("", path)).name or ply.stem
 
 
 def result_cameras(ply: Path) -> Path | None:
-    """Find the cameras that ``compact`` wrote beside a result, or one of its levels of detail; None without them."""
+    """Find the cameras that ``compact`` wrote beside a result, or beside that of a level of detail; None without."""
     names = ply.name, _LEVEL.sub("", ply.name)
     beside = (viewer_cameras_path(ply.with_name(name)) for name in names)
     return next((path for path in beside if path.is_file()), None)
@@ -299,7 +303,7 @@ def named_path(path: StrPath | None) -> Path | None:
 def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
     """Find the files of a folder's only scene, as :func:`find_scene_files`; several files are its parts, in order.
 
-    Of files of the same bytes it is the first.
+    If all files have the same bytes, the first is returned.
     """
     plys = list_plys(folder)
     if len(plys) == 1:
@@ -325,12 +329,12 @@ def _are_copies(plys: Sequence[Path]) -> bool:
 
 
 def _are_numbered(plys: Sequence[Path]) -> bool:
-    """Return whether files of one folder have numbers for names."""
+    """Return whether files are in one folder and their names end in numbers."""
     return len({path.parent for path in plys}) == 1 and all(_NUMBERED.fullmatch(path.name) for path in plys)
 
 
 def _several_scenes(folder: Path, plys: Sequence[Path]) -> SceneError:
-    """Make the error of a folder with several files that may be scenes, moments of one, or its parts."""
+    """Make the error of a folder with several files, which may be scenes, moments of a scene, or its parts."""
     places = {path.parent for path in plys}
     start = places.pop() if len(places) == 1 else folder
     problem = f"expected one .ply file in the folder, found {len(plys)}"
@@ -338,17 +342,23 @@ def _several_scenes(folder: Path, plys: Sequence[Path]) -> SceneError:
     if not _are_numbered(plys):
         return SceneError(folder, f"{problem} ({names})", "name one, or give the folder to gsmerge batch")
     counts = {header_counts(path)[0] for path in plys[:_MAX_HEADERS]}
-    what = f"moments of {counts.pop():,} Gaussians each" if len(counts) == 1 else "moments or parts"
-    calls = f"gsmerge batch {start} takes each moment, gsmerge convert {start}/*.ply one.ply joins parts of one scene"
-    return SceneError(folder, f"{problem} ({names}), numbered as {what}", f"name one; {calls}")
+    kind = f"moments of {counts.pop():,} Gaussians each" if len(counts) == 1 else "moments or parts"
+    calls = f"gsmerge batch {start} for all moments, or gsmerge convert {start}/*.ply one.ply to join parts of a scene"
+    return SceneError(folder, f"{problem} ({names}), numbered like {kind}", f"name one, or run {calls}")
 
 
 def list_plys(folder: Path) -> list[Path]:
     """List the files that may be a folder's scene.
 
-    They are the file of a usual name; or the files in the folder, in ``gaussians/`` or further down; or depth maps; or
-    only results of gsmerge; or the ``meta.json`` of a ``.sog``. At last a file of a usual name without Gaussians is
-    listed, so that its reader reports what it lacks.
+    The first of these that is there is listed:
+
+    1. the file with a usual name, or else all others in the folder;
+    2. files in ``gaussians/``;
+    3. files in folders below;
+    4. depth maps;
+    5. results of gsmerge;
+    6. the ``meta.json`` of a ``.sog``;
+    7. a file with a usual name but without Gaussians, so that its reader reports what it lacks.
     """
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
     plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)]
@@ -365,7 +375,7 @@ def _plys_in(folder: Path) -> list[Path]:
 def _scenes_below(folder: Path) -> list[Path]:
     """List the folders of scenes below a folder, down to a limited depth; empty if there are too many entries."""
     scenes, places, num_entries = [], [(folder, 0)], 0
-    for place, depth in places:  # which grows
+    for place, depth in places:  # the loop appends to this list
         with suppress(OSError), os.scandir(place) as entries:
             if depth and _plys_in(place):
                 scenes.append(place)
@@ -382,8 +392,8 @@ def _scenes_below(folder: Path) -> list[Path]:
 def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:
     """Return the files that are views or parts of one scene, ordered by number; None if they are several scenes.
 
-    They are parts if their names say so, or if the number of cameras is that of the files. A file with a camera of its
-    own is in a frame of its own.
+    They are parts if their names say so, or if there are as many cameras as files. Files that hold a camera are
+    several scenes, each in its own frame.
     """
     matches = [_NUMBERED.fullmatch(path.name) for path in plys]
     names = {match[1].lower() if match else "" for match in matches}
@@ -395,15 +405,15 @@ def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> li
         missing = next((low + 1 for low, high in pairwise(ordered) if high > low + 1), None)
         if missing is not None:
             first, last = (numbers[ordered[place]].name for place in (0, -1))
-            problem = f"expected all parts from {first} to {last}, found none with number {missing}"
-            raise SceneError(folder, problem, "add it, or name one of the files")
+            problem = f"expected all parts from {first} to {last}, found no part with the number {missing}"
+            raise SceneError(folder, problem, "add the missing part, or name one of the files")
     elif plys[0].parent.name == SCENES_PLACE or not _has_camera_each(plys, cameras):
         return None
     return None if any(map(_has_own_camera, plys)) else [numbers[number] for number in ordered]
 
 
 def _has_own_camera(path: Path) -> bool:
-    with suppress(SceneError):  # which reading the part raises again
+    with suppress(SceneError):  # the reader of the part reports it
         return read_sharp_camera(path) is not None
     return False
 
@@ -418,7 +428,7 @@ def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
 
 
 def named_ply(folder: Path) -> Path | None:
-    """Find the scene in a folder by a usual name; for trained scenes, the one of the most steps. None without one."""
+    """Find the scene with a usual name in a folder; of trained scenes, that of the most steps. None without any."""
     for place in PLY_PLACES:
         if (folder / place).is_file() and _is_scene(folder / place):
             return folder / place
@@ -429,9 +439,9 @@ def named_ply(folder: Path) -> Path | None:
 
 
 def other_plys(folder: Path) -> list[Path]:
-    """List the other files directly in a folder that may be scenes: no results of gsmerge, no point clouds.
+    """List the ``.ply`` files directly in a folder that may be scenes: no results of gsmerge, no point clouds.
 
-    Without any it is the only file of another format, except in a web site.
+    If there are none, list the only file of another format. The exception is a web site, whose scene is a result.
     """
     plys = natural_order(folder.glob("[!.]*.ply"))
     scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
@@ -445,6 +455,6 @@ def _results_in(folder: Path) -> list[Path]:
 
 
 def _is_scene(path: Path) -> bool:
-    """Return whether a file may be a scene: its name and header say neither result nor point cloud."""
-    named = path.name in _POINT_CLOUDS or _RESULT.search(path.name)
-    return not named and header_content(path) == "Gaussians"
+    """Return whether a file may be a scene: neither its name nor its header is that of a result or a point cloud."""
+    is_other = path.name in _POINT_CLOUDS or _RESULT.search(path.name)
+    return not is_other and header_content(path) == "Gaussians"

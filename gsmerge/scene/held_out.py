@@ -1,4 +1,4 @@
-"""Read unseen photos with their cameras in the frame of a scene, to compare its renders with."""
+"""Read held-out photos with their cameras in the frame of a scene; renders of the scene are compared with them."""
 
 from __future__ import annotations
 
@@ -22,53 +22,56 @@ from gsmerge.scene.read import Loaded
 from gsmerge.scene.views import limit_photo_size
 from gsmerge.types import Scene, StrPath, Views
 
-_MAX_ANGLE = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
-_MAX_SHIFT = 0.005  # of the distance between the views
-_MIN_SHARED = 3  # views that determine how two worlds lie to one another
-_SAME_POSE = 1e-4  # of the distance to the scene, and in entries of the rotation: the very same view
+_MAX_ANGLE = 0.2  # degrees by which a view's two poses may differ after one frame is moved to the other
+_MAX_SHIFT = 0.005  # distance of these two poses, relative to the extent of all views
+_MIN_SHARED = 3  # views that determine the similarity between two worlds
+_SAME_POSE = 1e-4  # largest difference of poses of the same view: relative to the scene's distance, and of rotations
 
 
 @dataclass(frozen=True)
 class HeldOutViews(Views):
-    """Held-out views: t views that the scene was not made of, in the frame of its Gaussians."""
+    """Held-out views: t views that the scene was not made from, in the frame of its Gaussians."""
 
-    places: tuple[int, ...]  # of each along the trajectory: its index in the camera file
-    context_places: tuple[int, ...] | None  # the same of the scene's views; None where they are not all in the file
+    places: tuple[int, ...]  # index of each view in the camera file, which is its place along the trajectory
+    context_places: tuple[int, ...] | None  # such indices of the scene's views; None if the file lacks one of them
     notes: tuple[str, ...] = ()  # what was adapted, one sentence each
 
 
 def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
     """Read held-out photos and their cameras, in any format of a scene.
 
-    Views that the scene was made from are left out. If the file has those views as well, under the same names, their
-    poses map its world to that of the Gaussians; otherwise its world is assumed to be that of the scene's own cameras.
-    Poses are read in the convention that the scene's cameras needed. ``images``: folder of the photos; None: as the
-    camera file says. SceneError if a file is missing or damaged, or no view is left.
+    Views that the scene was made from are left out. If the file has these views too, under the same names, their poses
+    give the map from its world to that of the Gaussians. Otherwise its world is assumed to be that of the scene's own
+    cameras. Poses are read in the convention in which the scene's cameras fit. ``images``: folder of the photos; None:
+    the files that the camera file names. SceneError if a file is missing or damaged, or no view is left.
     """
     path = Path(cameras)
     if not path.exists():
-        raise SceneError(path, "expected cameras of held-out views, found nothing")
+        raise SceneError(path, "expected cameras of held-out views, found no such file or folder")
     camera_file, shared = read_into_frame(load, path)
     shared |= _repeated(camera_file.viewmats, load.scene)
     places = [i for i in range(len(camera_file)) if i not in shared]
     if not places:
-        raise SceneError(path, "expected views that the scene was not made of, found none")
+        problem = "expected held-out views, found only views that the scene was made from"
+        raise SceneError(path, problem, "name a camera file that has other views of the scene")
     chosen = select_views(camera_file, places)
     photos = stored_photos(SceneFiles(load.files.ply, path, _folder(path, chosen, images)), chosen)
     if not len(photos):
         root = path if path.is_dir() else path.parent
         missing = next((name for name in chosen.names if find_image(root, name) is None), chosen.names[0])
-        raise SceneError(path, f"no photo found for {missing}", "name their folder with --target-images")
+        raise SceneError(
+            path, f"expected photos of its views, found none for {missing}", "name their folder with --target-images"
+        )
     pinholes, photos, _ = as_pinholes(chosen, photos)
     photos, notes = limit_photo_size(photos, 0, AUTO.max_side, unaligned=False)
-    inverse = {view: place for place, view in shared.items()}
-    complete = 0 < len(inverse) == len(load.scene)
+    place_of_view = {view: place for place, view in shared.items()}
+    has_all = 0 < len(place_of_view) == len(load.scene)
     return HeldOutViews(
         cameras=to_cameras(pinholes, photo_size(photos)),
         images=as_floats(photos),
         names=chosen.names,
         places=tuple(places),
-        context_places=tuple(inverse[view] for view in range(len(load.scene))) if complete else None,
+        context_places=tuple(place_of_view[view] for view in range(len(load.scene))) if has_all else None,
         notes=tuple(notes),
     )
 
@@ -79,36 +82,37 @@ def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int
     Frame and convention are chosen as in :func:`read_held_out`.
     """
     stored, cameras = read_cameras(path, scene=load.files.ply.stem), load.cameras
-    readings = [stored]
+    candidates = [stored]
     if cameras is not None and cameras.source == stored.source and cameras.convention != stored.convention:
-        readings.insert(0, with_convention(stored, cameras.convention))  # as the scene's own had to be read
-    worlds = [(reading, *_find_world(reading, _shared_views(reading, load.scene.names), load)) for reading in readings]
-    camera_file, world, shared = next((reading for reading in worlds if reading[2]), worlds[0])
+        candidates.insert(0, with_convention(stored, cameras.convention))  # in which the scene's own cameras fit
+    worlds = [(each, *_find_world(each, _shared_views(each, load.scene.names), load)) for each in candidates]
+    camera_file, world, shared = next((each for each in worlds if each[2]), worlds[0])
     return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
 
 
 def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
-    """Find the folder of the photos: the given one, or one next to cameras that do not name files."""
+    """Find the folder of the photos: the named one, or a folder beside cameras that name no files."""
     if images is not None:
         if not Path(images).is_dir():
-            raise SceneError(images, "expected a folder of photos")
+            found = "a file" if Path(images).exists() else "no such folder"
+            raise SceneError(images, f"expected a folder of photos, found {found}", "name it with --target-images")
         return Path(images)
     if len(cameras.images):
         return path
     root = path if path.is_dir() else path.parent
-    says = any((root / name).is_file() for name in cameras.names)
-    return None if says else next((root / place for place in IMAGE_PLACES if (root / place).is_dir()), None)
+    names_files = any((root / name).is_file() for name in cameras.names)
+    return None if names_files else next((root / place for place in IMAGE_PLACES if (root / place).is_dir()), None)
 
 
 def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
     """Map indices in the file to views of the scene that have the same name; empty if stems are not unique."""
-    place, views = (
+    places, views = (
         {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(view_names)}
         for view_names in (camera_file.names, names)
     )
-    if len(place) < len(camera_file) or len(views) < len(names):
+    if len(places) < len(camera_file) or len(views) < len(names):
         return {}
-    return {place[stem]: view for stem, view in views.items() if stem in place}
+    return {places[stem]: view for stem, view in views.items() if stem in places}
 
 
 def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) -> tuple[Similarity, dict[int, int]]:
@@ -140,7 +144,7 @@ def _stored_world(load: Loaded) -> Similarity:
     if (camera_file.names, camera_file.convention) != (load.cameras.names, load.cameras.convention):
         return IDENTITY
     if np.array_equal(camera_file.viewmats, load.cameras.viewmats):
-        return IDENTITY  # to the bit
+        return IDENTITY  # a fit would differ from it by rounding
     return fit_similarity(camera_file.viewmats, load.cameras.viewmats)
 
 
@@ -159,12 +163,12 @@ def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> 
 
 
 def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:
-    """Map views to the views of the scene with the same position and viewing direction."""
+    """Map views, whose poses ``moved [t,4,4]`` are in the scene's frame, to views of the scene with the same pose."""
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
     ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
-    # what is seen lies as far away as the views may be apart, or farther; one view has nothing else to measure by
+    # The limit is relative to the distance of the scene, since a single view has no distance between views
     limit = _SAME_POSE * float(np.linalg.norm(camera_centres(ours) - middle, axis=1).max())
-    near = np.linalg.norm(camera_centres(moved)[:, None] - camera_centres(ours), axis=2) <= limit
-    alike = np.abs(moved[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= _SAME_POSE
-    return {int(i): int(view) for i, view in zip(*np.nonzero(near & alike), strict=True)}
+    same_place = np.linalg.norm(camera_centres(moved)[:, None] - camera_centres(ours), axis=2) <= limit
+    same_rotation = np.abs(moved[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= _SAME_POSE
+    return {int(i): int(view) for i, view in zip(*np.nonzero(same_place & same_rotation), strict=True)}

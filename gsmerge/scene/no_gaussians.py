@@ -1,4 +1,4 @@
-"""What models and programs leave without Gaussians, and how each is made to write some."""
+"""Recognise the output of models and programs that has no Gaussians, and say how to get Gaussians from each."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES, list_images
 from gsmerge.scene.files import IMAGE_PLACES
 
-MAX_FOLDERS = 100  # in a folder of scenes that are looked into
+MAX_FOLDERS = 100  # folders that are searched in a folder of scenes
 _NAME = "name the .ply of the Gaussians, or the folder that it is in"
 
 
 @dataclass(frozen=True)
 class PointsOnly:
-    """A model or program that left files without Gaussians, and what makes it, or another, write them."""
+    """A model or program whose output has no Gaussians, and how to get Gaussians from it or from another program."""
 
-    title: str  # as people call it
-    files: tuple[str, ...]  # patterns of what it leaves in a folder, one of which is enough
+    title: str  # the name that people use
+    files: tuple[str, ...]  # patterns of its output in a folder; one match is enough
     remedy: str
 
 
-_TRAIN = "name a model's .ply, and this with --cameras, or train Gaussians on it"
-_PHOTOS = "photos", "a model such as Depth Anything 3 or AnySplat makes a scene of them first: alone they are none"
-# In the order of trial
+_TRAIN = "train Gaussians on it, or name the .ply of a model, and this file with --cameras"
+_PHOTOS = "photos", "make Gaussians from the photos first, with a model such as Depth Anything 3 or AnySplat"
+# They are tried in this order
 POINTS_ONLY = (
     PointsOnly(
         "Depth Anything 3",
         ("exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "scene.glb"),
-        'ask it for export_format="npz", whose depth maps are read, or for "npz-gs_ply" with infer_gs=True and a giant'
+        'run it with export_format="npz", whose depth maps are read, or with "npz-gs_ply", infer_gs=True and a giant'
         " model",
     ),
     PointsOnly("gsplat's trainer", ("ckpts/ckpt_*.pt",), "run it with its option save_ply"),
-    PointsOnly("nerfstudio", ("nerfstudio_models/*.ckpt",), "write them with ns-export gaussian-splat"),
+    PointsOnly("nerfstudio", ("nerfstudio_models/*.ckpt",), "write Gaussians with ns-export gaussian-splat"),
     PointsOnly(
         "DA3-Streaming or VGGT-Long",
         ("camera_poses.txt",),
         "run DA3-Streaming with save_depth_conf_result: True, whose results_output/frame_*.npz are read",
     ),
-    PointsOnly("FLARE", ("pred.npz",), f"it has no Gaussians to write: {_TRAIN}"),
+    PointsOnly("FLARE", ("pred.npz",), f"FLARE writes no Gaussians; {_TRAIN}"),
     PointsOnly(
         "VGGT or MapAnything",
         ("sparse/points.ply", "dense_mesh.glb", "glbscene_*.glb", "predictions.npz", "points.ply"),
-        "write depth, extrinsic, intrinsic and images into predictions.npz, whose depth maps are read",
+        "write depth, extrinsic, intrinsic and images to predictions.npz, whose depth maps are read",
     ),
     PointsOnly(
         "COLMAP",
@@ -67,7 +67,7 @@ POINTS_ONLY = (
 
 
 def no_gaussians(folder: Path) -> SceneError:
-    """Make the error of a folder without a scene: what is there instead, and what to do."""
+    """Make the error of a folder without a scene: what it contains instead, and what to do."""
     try:
         os.scandir(folder).close()
     except OSError as error:
@@ -78,7 +78,7 @@ def no_gaussians(folder: Path) -> SceneError:
 
 
 def find_remedy(folder: Path) -> str:
-    """Return what to do about a folder of folders without a scene; empty if nothing in them is known."""
+    """Return what to do about a folder of folders without a scene; empty if none has known content."""
     with suppress(OSError):
         inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
         places = [(place, _content(place)) for place in (folder, *islice(inside, MAX_FOLDERS))]
@@ -89,7 +89,7 @@ def find_remedy(folder: Path) -> str:
 
 
 def _content(folder: Path) -> tuple[str, str] | None:
-    """Describe the known content of a folder without a .ply, and what to do with it; None if nothing in it is known."""
+    """Describe the known content of a folder without a .ply, and what to do with it; None if no content is known."""
     files = (
         path
         for path in sorted(folder.glob("[!.]*"))
@@ -104,7 +104,7 @@ def _content(folder: Path) -> tuple[str, str] | None:
             return f"{file.relative_to(folder).as_posix()} of {row.title}", _remedy(row, file)
     points = next((path for path in sorted(folder.glob("[!.]*.ply")) if header_content(path) == "other"), None)
     if points is not None:
-        return f"points or a mesh in {points.name}", _NAME
+        return f"points or a mesh ({points.name})", _NAME
     foreign = next((path for path in sorted(folder.glob("[!.]*")) if path.suffix.lower() in FOREIGN), None)
     if foreign is not None:
         what, remedy = FOREIGN[foreign.suffix.lower()]
@@ -114,18 +114,18 @@ def _content(folder: Path) -> tuple[str, str] | None:
 
 
 def check_scene_file(path: Path) -> None:
-    """Raise SceneError with the remedy for a file that is known to hold no Gaussians, such as ``results.npz``."""
+    """Raise SceneError, with a remedy, for a file that is known to hold no Gaussians, such as ``results.npz``."""
     suffix = path.suffix.lower()
     if suffix not in SEVERAL_USES or not check_file(path) or may_hold_gaussians(path):
         return
-    if suffix == ".npz" and not array_names(path):  # damaged, which its reader says
+    if suffix == ".npz" and not array_names(path):  # the reader reports the damage
         return
     matching = (row for row in POINTS_ONLY if any(path.match(Path(file).name) for file in row.files))
     row = next(matching, POINTS_ONLY[-1])
-    problem = f"expected a file of Gaussians, found {suffix[1:]} without any, as {row.title} writes it"
+    problem = f"expected a file of Gaussians, found a {suffix} without Gaussians, as {row.title} writes it"
     raise SceneError(path, problem, _remedy(row, path))
 
 
 def _remedy(row: PointsOnly, path: Path) -> str:
     missing = " and ".join(missing_of_depths(path))
-    return f"its depth maps lack {missing}: add {missing}, and they are read" if missing else row.remedy
+    return f"add {missing} to the file; its depth maps cannot be read without" if missing else row.remedy

@@ -1,4 +1,4 @@
-"""Read a scene from its files: a :class:`gsmerge.types.Scene` with the pixel of every row where it has one."""
+"""Read a scene from its files: a :class:`gsmerge.types.Scene` with the pixel of every row if rows have pixels."""
 
 from __future__ import annotations
 
@@ -79,55 +79,54 @@ class SceneViews:
     cameras: Cameras
     images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
     names: tuple[str, ...]
-    of_scene: tuple[int, ...]  # which of them each view of the scene is
+    of_scene: tuple[int, ...]  # for each view of the scene, its index among these c views
 
     @property
     def used(self) -> tuple[int, ...]:
-        """Which of them the scene has, each once, in its order."""
+        """Indices of the views that the scene has, each once, in the scene's order."""
         return tuple(dict.fromkeys(self.of_scene))
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """A scene, and all facts about its files and how they were read."""
+    """A scene, with all facts about its files and how they were read."""
 
-    # the scene, with its pixels where the rows show them
-    scene: Scene
+    scene: Scene  # with pixels if the rows have them
     info: FileInfo
     files: SceneFiles
-    # the cameras in the order of the views, as their file has them; None where there are none, or they do not fit
+    # the cameras as stored in their file, in the order of the views; None without cameras, or if they do not fit
     cameras: CameraFile | None
-    views: SceneViews  # all views that there are cameras of, also those that the scene does not have
+    views: SceneViews  # all views of the camera file, including those that the scene does not have
     exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
-    notes: tuple[str, ...]  # what was adapted or looks odd, one sentence each, without a full stop
-    # how well every view's Gaussians project into their own pixels; None where rows show no pixels
+    notes: tuple[str, ...]  # adapted or unusual content, one sentence each, without a full stop
+    # how well every view's Gaussians project into their own pixels; None if rows have no pixels
     alignment: Alignment | None = None
-    recovery: Recovery | None = None  # which reading of the rows won, and by how much; None without pixels
-    problem: str | None = None  # why the rows show no pixels, in one sentence; None where they do
-    # how far each camera was moved to its Gaussians; empty where none was
+    recovery: Recovery | None = None  # the layout of rows that fits best, and by how much; None without pixels
+    problem: str | None = None  # why the rows have no pixels, in one sentence; None if they have
+    # how far each camera was moved to its Gaussians; empty if none was moved
     moves: Sequence[dict[str, Any]] = ()
-    joined: Sequence[dict[str, Any]] = ()  # where each of several scenes lies; empty for one
-    left_out: str | None = None  # the note that names what was found beside the file and does not belong to it
+    joined: Sequence[dict[str, Any]] = ()  # where each of several joined scenes lies; empty for one scene
+    left_out: str | None = None  # the note on files beside the scene that do not belong to it
 
     def pixel_scene(self) -> Scene:
-        """Return the scene; SceneError with the reason if it has not one Gaussian per pixel."""
+        """Return the scene; SceneError with the reason if it does not have one Gaussian per pixel."""
         if self.scene.has_own_pixels:
             return self.scene
         raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
 
     def without_photos(self) -> Loaded:
-        """Return a copy without the photos of the camera file, to free their memory; the scene keeps its photos."""
+        """Return a copy without the photos of all views, which frees their memory; the scene keeps its own photos."""
         cameras = None if self.cameras is None else replace(self.cameras, images=())
         return replace(self, cameras=cameras, views=replace(self.views, images=NO_IMAGES))
 
     def with_left_out(self, notes: Sequence[str]) -> Loaded:
-        """Return a copy with notes on what was found beside the file and is not used."""
+        """Return a copy with notes on files that were found beside the scene and are not used."""
         left_out = "; ".join(filter(None, (self.left_out, *notes))) or None
         return replace(self, notes=(*self.notes, *notes), left_out=left_out) if notes else self
 
     @property
     def comments(self) -> tuple[str, ...]:
-        """Comments of the file's header that a result copies, whose Gaussians are not flat."""
+        """Comments of the file's header that a result copies, except that for 2D Gaussians: those of results are 3D."""
         return tuple(comment for comment in kept_comments(self.info) if comment != FLAT_COMMENT)
 
     @property
@@ -158,29 +157,29 @@ def read_scene(
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> Scene:
-    """Read a scene: ``.ply``, cameras, and images where there are any.
+    """Read a scene: its ``.ply``, and its cameras and images if there are any.
 
-    Which row belongs to which pixel is found by measuring (docs/reference/exporters.md).
+    The pixel of each row is found by measuring which order of rows fits the cameras (docs/reference/exporters.md).
 
     Args:
         path: The ``.ply``, or a folder that has it.
-        *more: Other scenes of the same place, which are joined with it in its frame (docs/guide/sharp.md).
-        cameras: Camera file or folder, or "none"; None looks next to the ``.ply``, and warns if they do not fit.
-        images: Folder of images, an ``.npz`` that holds them, or "none"; None: likewise.
-        masks: Folder of images named as the photos, dark where a photo does not count, or "none"; None: ``masks``
-            beside the photos, and where these are transparent. Lighter greys are weights in a fit.
-        protect: Folder of images named as the photos, white where a text or a face has to stay sharp; see
+        *more: Other scenes of the same place. They are joined with the first one, in its frame (docs/guide/sharp.md).
+        cameras: Camera file or folder, or "none". None: search beside the ``.ply``, and warn if the cameras do not fit.
+        images: Folder of images, an ``.npz`` that holds images, or "none". None: search as for cameras.
+        masks: Folder of images with the names of the photos, dark where a photo does not count, or "none". None: use
+            the folder ``masks`` beside the photos, and the photos' transparency. Lighter greys are weights in a fit.
+        protect: Folder of images with the names of the photos, white where a text or a face has to stay sharp; see
             :attr:`Scene.importance`.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
         **hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
             :class:`gsmerge.settings.reading.ReadHints`.
 
     Returns:
-        The scene; its ``pixels`` are None where the rows belong to no pixels that are known.
+        The scene; its ``pixels`` are None if the pixels of the rows are unknown.
 
     Raises:
-        SceneError: If a file is missing or damaged, or the Gaussians are not those of named cameras' views.
-        ValueError: If an argument is none of the possible ones.
+        SceneError: If a file is missing or damaged, or the Gaussians do not belong to the views of named cameras.
+        ValueError: If an argument has a value that is not possible.
 
     Example:
         >>> scene = gsmerge.read_scene("demo/scene.ply", cameras="demo/transforms.json")
@@ -223,18 +222,18 @@ def load_scene(
 
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> Loaded:
-    """Read a scene from files that were found already, as :func:`load_scene` does."""
+    """Read a scene as :func:`load_scene` does, from the files that :func:`find_scene_files` found."""
     with use_threads():
-        each = (replace(files, more=()), *files.more)
+        scenes = (replace(files, more=()), *files.more)
         loads = [
             align_scene(read_gaussian_file(source, opacity=opacity, hints=hints), source, hints=hints)
-            for source in each
+            for source in scenes
         ]
     return loads[0] if len(loads) == 1 else _join_loads(loads, files)
 
 
 def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
-    """Make one scene of several of the same place, with the notes of all."""
+    """Join several scenes of the same place to one, with the notes of all."""
     from gsmerge.alignment.registration.join import join_scenes
 
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
@@ -256,89 +255,113 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
 
 
 def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> GaussianFile:
-    """Read the Gaussians of a scene's files; the encoding of opacities is given by the option or the exporter."""
+    """Read the Gaussians of a scene's files.
+
+    A named exporter that writes logits decides the encoding of opacities, unless ``opacity`` does.
+    """
     exporter = find_exporter(hints.exporter)
+    # An exporter of raw opacities does not decide: they are recognised, and some of its versions write logits
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
-        opacity = "logit"  # activated ones show themselves, and some versions write logits in their place
+        opacity = "logit"
     return read_parts(files.parts, opacity=opacity) if files.parts else read_gaussians(files.ply, opacity=opacity)
 
 
 def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True) -> Loaded:
-    """Combine Gaussians, cameras and photos to a scene; find the pixel of every row if there is one.
+    """Combine Gaussians, cameras and photos to a scene, with the pixel of every row if rows have pixels.
 
-    What was found beside the file is left out, with a note, if the scene can only be read without it. Raises as
-    :func:`read_scene`; without ``photos`` no photos are searched.
+    If the scene can only be read without some files that were found beside it, these are left out, with a note.
+    SceneError as in :func:`read_scene`. ``photos=False``: search no photos.
     """
     try:
         return _align(ply, files, read_scene_cameras(ply, files), hints=hints, photos=photos)
     except SceneError as error:
-        why = SceneError(error.path, error.problem, error.remedy)  # without what it holds in memory
-    of_photos = Path(why.path).suffix.lower() in IMAGE_SUFFIXES
-    of_photos |= files.images != files.cameras and why.path == str(files.images)
-    for fewer in files.without_found(why.path):
+        cause = SceneError(error.path, error.problem, error.remedy)  # a copy: the traceback keeps arrays in memory
+    for fewer in files.without_found(cause.path):
         with suppress(SceneError):
             load = _align(ply, fewer, read_scene_cameras(ply, fewer), hints=hints, photos=photos)
-            # without photos, cameras of another scene may see these Gaussians, too
-            is_sure = load.scene.has_own_pixels or of_photos
-            is_sure |= fewer.cameras != files.cameras or fewer.masks != files.masks
-            if is_sure and ("images" not in files.named or files.images is None or load.scene.images is not None):
-                return _leave_out(load, files, why)
+            if _is_usable(load, fewer, files, cause):
+                return _note_left_out(load, files, cause)
     if "cameras" not in files.named:
         _check_hints(ply, hints)
-    left = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
-    remedy = "; ".join(filter(None, (why.remedy, f"{' and '.join(left)} reads the file alone" if left else "")))
-    raise SceneError(why.path, why.problem, remedy)
+    options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
+    read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
+    raise SceneError(cause.path, cause.problem, "; ".join(filter(None, (cause.remedy, read_alone))))
 
 
-def _leave_out(load: Loaded, files: SceneFiles, why: SceneError) -> Loaded:
-    """Add the note that what was found beside a file is not used, and why, to the scene that was read without it."""
+def _is_usable(load: Loaded, fewer: SceneFiles, files: SceneFiles, cause: SceneError) -> bool:
+    """Return whether a scene that was read from ``fewer`` files than were found replaces the one that failed.
+
+    Photos that the caller named must be in it. If only photos are left out, either they caused the error, or the rows
+    must have pixels: without photos, cameras of another scene may see these Gaussians, too.
+    """
+    if "images" in files.named and files.images is not None and load.scene.images is None:
+        return False
+    if fewer.cameras != files.cameras or fewer.masks != files.masks:
+        return True
+    is_of_photo = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES
+    is_of_folder = files.images != files.cameras and cause.path == str(files.images)
+    return load.scene.has_own_pixels or is_of_photo or is_of_folder
+
+
+def _note_left_out(load: Loaded, files: SceneFiles, cause: SceneError) -> Loaded:
+    """Add a note to a scene that was read without some of the found ``files``: which are left out, and why."""
     names = [str(files.cameras)] if load.files.cameras != files.cameras else []
     if load.files.masks != files.masks:
         names.append(f"the masks in {files.masks}")
     photos = f"the photos in {files.images or files.ply.parent}"
-    said = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
-    if said or (load.files.named != files.named and files.images not in (files.cameras, None)) or not names:
+    repeated = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
+    without_photos = load.files.named != files.named and files.images not in (files.cameras, None)
+    if repeated or without_photos or not names:
         names.append(photos)
-    known = files.ply, files.ply.parent, files.cameras, files.images, files.masks
-    where = "" if why.path in map(str, known) else f"{why.path}: "
-    verb, remedy = "is" if names == [str(files.cameras)] else "are", why.remedy or "name what fits, or say none"
-    note = " ".join(f"{' and '.join(names)} {verb} left out: {where}{why.problem}; {remedy}".split())
-    return replace(load, notes=(*(text for text in load.notes if text not in said), note), left_out=note)
+    is_known = cause.path in map(str, (files.ply, files.ply.parent, files.cameras, files.images, files.masks))
+    where = "" if is_known else f"{cause.path}: "
+    verb = "is" if names == [str(files.cameras)] else "are"
+    remedy = cause.remedy or "name the files that fit, or say none"
+    note = " ".join(f"{' and '.join(names)} {verb} left out: {where}{cause.problem}; {remedy}".split())
+    return replace(load, notes=(*(text for text in load.notes if text not in repeated), note), left_out=note)
 
 
 def _align(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile | None, *, hints: ReadHints, photos: bool = True
 ) -> Loaded:
-    """Combine Gaussians, cameras and photos as :func:`align_scene`, and raise a SceneError if anything is unusable."""
+    """Combine Gaussians, cameras and photos as :func:`align_scene`; SceneError if any file cannot be used."""
     if camera_file is None:
         return _without_cameras(ply, files, hints)
     proposal = propose_photos(files, camera_file) if photos else None
     if proposal is None:
         inside = photos_inside(files, camera_file) if photos else ()
         load = _combine(ply, files, camera_file, ScenePhotos(inside), hints)
-        searched = photos and "images" not in files.named and load.scene.images is None
-        searched &= RESULT_COMMENT not in ply.info.comments  # beside which lie clips of it
-        unread = describe_unread(files.ply.parent, IMAGE_PLACES) if searched else []
+        lacks_photos = photos and "images" not in files.named and load.scene.images is None
+        is_result = RESULT_COMMENT in ply.info.comments  # films beside it are clips of it
+        unread = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
         return replace(load, notes=(*load.notes, *unread))
     load = _assign_of_one_shape(ply, files, camera_file, proposal, hints)
-    usual = proposal.folder
-    seen = usual.parent / SEEN_PLACE
-    if usual == seen or files.images is None or not seen.is_dir() or load.scene.images is None:
+    resized = proposal.folder.parent / SEEN_PLACE
+    if proposal.folder == resized or files.images is None or not resized.is_dir() or load.scene.images is None:
         return load
-    other_files = replace(files, images=seen)
-    with suppress(SceneError):  # photos of other views
-        proposal = propose_photos(other_files, camera_file)
-        other = None if proposal is None else _assign(ply, other_files, camera_file, proposal, hints)
-        if other is not None and other.scene.images is not None and shows_better(other.scene, load.scene):
-            text = f"photos are those of {SEEN_PLACE}: they show what the Gaussians show, those of {usual.name} less"
-            return replace(other, notes=(*other.notes, text))
+    return _prefer_resized(load, ply, replace(files, images=resized), camera_file, hints)
+
+
+def _prefer_resized(
+    load: Loaded, ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints
+) -> Loaded:
+    """Return the scene with the photos that WorldMirror resized if they fit its Gaussians better, else ``load``.
+
+    ``files`` have the folder of these photos.
+    """
+    with suppress(SceneError):  # they may be of other views
+        proposal = propose_photos(files, camera_file)
+        resized = None if proposal is None else _assign(ply, files, camera_file, proposal, hints)
+        if resized is not None and resized.scene.images is not None and shows_better(resized.scene, load.scene):
+            text = f"photos are read from {SEEN_PLACE}, since they fit the Gaussians better"
+            return replace(resized, notes=(*resized.notes, text))
     return load
 
 
 def _assign_of_one_shape(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
 ) -> Loaded:
-    """Combine as :func:`_assign`, without the views of another shape than most if all together cannot be used."""
+    """Combine as :func:`_assign`; if that fails, leave out the views whose shape is not that of most."""
     try:
         return _assign(ply, files, camera_file, proposal, hints)
     except SceneError:
@@ -354,97 +377,97 @@ def _assign(
 ) -> Loaded:
     """Combine Gaussians and cameras with the photos that names propose, or with those that show the views.
 
-    Photos that cannot be read, and views that none shows, are named in a note. SceneError if no photo shows any.
+    Notes name photos that cannot be read, and views without a photo. SceneError if no photo shows any view.
     """
-    whole, why, fit = None, None, None
-    is_grid = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED  # of any size
-    while whole is None and why is None and not is_grid and any(photo is not None for photo in proposal.named):
+    load, cause, fit = None, None, None
+    is_grid = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED  # photos may have any size
+    while load is None and cause is None and not is_grid and any(photo is not None for photo in proposal.named):
         try:
-            whole = _combine(ply, files, camera_file, read_photos(proposal, proposal.choice, camera_file), hints)
+            load = _combine(ply, files, camera_file, read_photos(proposal, proposal.choice, camera_file), hints)
         except SceneError as error:
             fewer = proposal.without_broken() if error.path in map(str, proposal.pool) else None
-            proposal, why = (proposal, error) if fewer is None else (fewer, None)
+            proposal, cause = (proposal, error) if fewer is None else (fewer, None)
     try:
-        bare = whole or _combine(ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
+        base = load or _combine(ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
     except SceneError as error:
-        raise why or error from None
+        raise cause or error from None
     if is_grid and proposal.pool:
-        fit = fit_to_grid(bare.scene, proposal)
-    guessed, is_read = list_guessed(bare.scene, camera_file), whole is not None
+        fit = fit_to_grid(base.scene, proposal)
+    guessed, is_read = list_guessed(base.scene, camera_file), load is not None
     proposal = proposal.without_views(guessed)
-    chosen = assign_to_views(bare.scene, bare.views.of_scene, proposal, read=is_read, guessed=guessed, fit=fit)
+    chosen = assign_to_views(base.scene, base.views.of_scene, proposal, read=is_read, guessed=guessed, fit=fit)
     if not any(chosen):
-        if why is not None:
-            raise why
+        if cause is not None:
+            raise cause
         if "images" in files.named:
             raise SceneError(proposal.folder, *refuse_photos(proposal, camera_file))
-        alone = _combine(ply, files, camera_file, ScenePhotos(), hints) if whole is not None else bare
-        return alone.with_left_out([describe_unused(proposal, camera_file)])
+        bare = base if load is None else _combine(ply, files, camera_file, ScenePhotos(), hints)
+        return bare.with_left_out([describe_unused(proposal, camera_file)])
     described, left_out = describe_assignment(proposal, chosen, camera_file)
-    if whole is None or chosen != proposal.choice:
+    if load is None or chosen != proposal.choice:
         camera_file = name_by_photos(camera_file, proposal, chosen, fit)
-        whole = _combine(ply, files, camera_file, read_photos(proposal, chosen, camera_file), hints)
-    return replace(whole, notes=(*whole.notes, *described)).with_left_out(left_out)
+        load = _combine(ply, files, camera_file, read_photos(proposal, chosen, camera_file), hints)
+    return replace(load, notes=(*load.notes, *described)).with_left_out(left_out)
 
 
 def _combine(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, photos: ScenePhotos, hints: ReadHints
 ) -> Loaded:
-    """Combine Gaussians, cameras and their photos; SceneError if anything is unusable."""
+    """Combine Gaussians, cameras and their photos; SceneError if any of them cannot be used."""
     exporter = find_exporter(hints.exporter)
     default_order = camera_file.order if exporter is None else exporter.order
     if default_order == "auto" and RESULT_COMMENT in ply.info.comments:
-        default_order = "none"  # its own results have no pixels to look for
+        default_order = "none"  # results of gsmerge have no pixels
     order = default_order if hints.order == "auto" else hints.order
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
     notes += [camera_file.focal] if camera_file.focal else []
-    whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)
-    limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
+    whole, (pictures, bar_notes) = pictures, cut_bars(pictures, camera_file)
+    limited, size_notes = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
 
     depths, frames = partial(read_depths, Path(camera_file.path)), partial(read_dataparser, files.ply, files.cameras)
-    if files.is_state and files.cameras == files.ply:  # which see its Gaussians
-        problem = "expected one Gaussian per pixel, found results of batches"
+    if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians
+        problem = "expected one Gaussian per pixel, found the Gaussians of a state"
         cameras = to_cameras(pinholes, photo_size(limited))
         result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
     else:
         result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, depths=depths, frames=frames)
-    notes += [*cut, *smaller, *result.notes]
+    notes += [*bar_notes, *size_notes, *result.notes]
     if result.pixel_ids is None:
         _check_hints(ply, hints)
-        cameras, images, smaller = limit_view_size(result.cameras, result.images, hints.max_side)
+        cameras, images, size_notes = limit_view_size(result.cameras, result.images, hints.max_side)
         result = replace(result, cameras=cameras, images=images)
-        notes += smaller
+        notes += size_notes
     size = photo_size(limited)
-    unused = [name for name in ("masks", "protect") if getattr(files, name) is not None]
+    unused = [f"--{name}" for name in ("masks", "protect") if getattr(files, name) is not None]
     if unused and not (size and pictures is whole):
-        why = "the photos have bars" if size else "there are no photos"
-        notes.append(f"pictures of {' and '.join(unused)} are not used: {why}")
-    if pictures is not whole:  # files with bars are not read again
+        reason = "the photos have bars, which are cut off" if size else "there are no photos"
+        notes.append(f"the pictures of {' and '.join(unused)} are not used, since {reason}")
+    if pictures is not whole:  # photos with bars have neither larger files nor masks
         return _make_load(ply, files, hints, result, notes, absent=photos.absent)
     large, masks, more = find_larger_and_masks(files, camera_file, photos, size, result.transform, result.cameras)
     return _make_load(ply, files, hints, result, [*notes, *more], large, masks, photos.absent)
 
 
 def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
-    """Make a scene without views, which are placed later; photos are not used, with a note."""
-    option = find_cameras_of_model(ply.info)
-    notes = [option] if option else []
+    """Make a scene without views, since views are placed later; a note says that photos are not used."""
+    advice = find_cameras_of_model(ply.info)
+    notes = [advice] if advice else []
     _check_hints(ply, hints)
     if files.images is not None:
-        wanted = "no cameras that fit them, such as a transforms.json or a COLMAP model; name them with --cameras"
-        notes += [f"the photos in {files.images} are not used: {wanted}"]
-    problem = "expected one Gaussian per pixel, found no cameras that have any"
+        reason = "no cameras were found, such as a transforms.json or a COLMAP model; name them with --cameras"
+        notes += [f"the photos in {files.images} are not used: {reason}"]
+    problem = "expected one Gaussian per pixel, found no cameras"
     return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
 
 
 def _check_hints(ply: GaussianFile, hints: ReadHints) -> None:
-    """Raise SceneError for rows that are no pixels if a hint says how they are."""
-    hinted = [] if hints.order in ("auto", *MAY_BE_UNALIGNED) else [f"order={hints.order}"]
-    hinted += [f"quats={hints.quats}"] if hints.quats in ("camera", "xyzw-root") else []
-    if hinted:
-        problem = f"expected rows that are pixels of views with --hint {hinted[0]}, found no such pixels"
-        raise SceneError(ply.info.path, problem, "leave the hint out, or give the cameras that fit with --cameras")
+    """Raise SceneError for rows without pixels if a hint describes the pixels' order or rotations."""
+    given = [] if hints.order in ("auto", *MAY_BE_UNALIGNED) else [f"order={hints.order}"]
+    given += [f"quats={hints.quats}"] if hints.quats in ("camera", "xyzw-root") else []
+    if given:
+        problem = f"expected rows that are pixels of views, as --hint {given[0]} says, found rows without pixels"
+        raise SceneError(ply.info.path, problem, "leave the hint out, or name the cameras that fit with --cameras")
 
 
 def _make_load(
@@ -457,9 +480,9 @@ def _make_load(
     masks: Masks = NO_MASKS,
     absent: Sequence[int] = (),
 ) -> Loaded:
-    """Make the scene of rows, their pixels and the views, with notes on how it was read.
+    """Make the scene from rows, their pixels and the views, with notes on how it was read.
 
-    Cameras of ``absent`` have no photo.
+    ``absent``: indices of the cameras without a photo.
     """
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
     camera_names = () if camera_file is None else camera_file.names
@@ -482,13 +505,13 @@ def _make_load(
     if layout is None or frame is None:
         scene = read_rotations(scene, hints.quats)
         if camera_file is not None and hints.exporter != "auto":
-            tried = f"only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
-            more.append(f"the rows are the pixels of no views: {tried}")
+            tried = f"only those of the given exporter {hints.exporter} were tried; --hint exporter=auto tries all"
+            more.append(f"the rows are the pixels of no views in any known order: {tried}")
     else:
-        assert camera_file is not None, "pixels are those of cameras"
-        scene, note = use_depths(scene, camera_file, layout, frame.scale)
-        scene, turned = set_rotations(scene, hints, exporters, frame)
-        more += [*note, *turned]
+        assert camera_file is not None, "pixels belong to cameras"
+        scene, depth_notes = use_depths(scene, camera_file, layout, frame.scale)
+        scene, rotation_notes = set_rotations(scene, hints, exporters, frame)
+        more += [*depth_notes, *rotation_notes]
         if result.given is not None:
             scene = move_views(scene, result.given[views])
             result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
@@ -511,10 +534,10 @@ def _make_load(
 
 
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
-    """Move a file's cameras into the frame of the Gaussians if pixels or colours show it; else keep them.
+    """Move a file's cameras into the frame of the Gaussians if pixels or colours show that frame; else keep them.
 
-    ``photos`` that were named and cannot be read raise an error; with False photos are left out. SceneError if named
-    cameras have no size.
+    ``photos``: read photos, and raise SceneError if named ones cannot be read; False: leave photos out. SceneError if
+    named cameras have no size.
     """
     with suppress(SceneError):
         camera_file = read_scene_cameras(ply, files)
@@ -527,12 +550,12 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
         else:
             pictures = stored_photos(files, camera_file) if photos else ()
             cameras = to_cameras(camera_file, photo_size(pictures))
-            from gsmerge.alignment import check_cameras  # few scenes come here
+            from gsmerge.alignment import check_cameras  # few scenes need it
 
             if "cameras" not in files.named and not check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
                 return align_scene(ply, files, hints=hints, photos=photos)
-            note = "the cameras do not fit the Gaussians and stay as their file has them"
+            note = "the cameras do not fit the Gaussians; they stay as stored in their file"
             as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
             load = replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)
         return load
-    return align_scene(ply, files, hints=hints, photos=photos)  # without what cannot be read, if it was not named
+    return align_scene(ply, files, hints=hints, photos=photos)  # leaves out unreadable files that were not named

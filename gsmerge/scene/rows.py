@@ -1,4 +1,4 @@
-"""Rows of a file -> Gaussians of a scene, in the order of their pixels: places, colours, depths, rotations."""
+"""Make the Gaussians of a scene from the rows of a file: their pixels, colours, depths and rotations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gsmerge.scene.exporters import TURNED, Exporter, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.types import Gaussians, Pixels, Scene
 
-_PART = 1 << 20  # numbers that are compared at once
+_BLOCK = 1 << 20  # numbers that are compared at once
 
 
 def color_from_photos(gaussians: Gaussians, pixels: Pixels | None, images: np.ndarray, files: SceneFiles) -> Gaussians:
@@ -38,9 +38,9 @@ def color_from_photos(gaussians: Gaussians, pixels: Pixels | None, images: np.nd
 
 
 def use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: float) -> tuple[Scene, list[str]]:
-    """Start from depth maps beside the file where they are better, or where the exporter dropped pixels; with notes.
+    """Move Gaussians to the depth maps beside the file if these fit better, and put back pixels that it lacks.
 
-    ``unit``: that of the cameras' file in the scene's.
+    ``unit``: length of one unit of the cameras' file in the scene's units. Also returns notes.
     """
     depths = read_depths(Path(camera_file.path)) if layout.per_pixel == 1 else None
     size = scene.cameras.height, scene.cameras.width
@@ -50,53 +50,55 @@ def use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: floa
     from gsmerge.alignment import choose_depths, fill_from_depths
 
     scene, moved = choose_depths(scene, depths, unit)
-    notes = [f"{moved:,} Gaussians start at the depth maps, which other views confirm more often"] * (moved > 0)
+    notes = [f"{moved:,} Gaussians start at the depth maps, which other views confirm more often"] if moved else []
     if scene.images is None or layout.kind not in ("box+depth", "pruned"):
         return scene, notes
     full = fill_from_depths(scene, depths, scene.images)
     count = len(full.gaussians) - len(scene.gaussians)
-    filled = f"{count:,} pixels that the exporter dropped are put back from the depth maps"
-    return full, [*notes, *[filled] * (count > 0)]
+    added = f"{count:,} pixels that the exporter dropped are put back from the depth maps"
+    return full, [*notes, *([added] if count > 0 else [])]
 
 
 def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussians, Pixels | None]:
-    """Take the rows of a file that are Gaussians and that something draws, in the order of their pixels if known.
+    """Take the rows of a file that are visible Gaussians, in the order of their pixels if known.
 
-    If nothing draws any, all rows that are Gaussians are taken.
+    If all are too faint to be drawn, all valid rows are taken.
     """
-    there = ply.valid & (ply.gaussians.opacities >= LEAST_OPACITY)
-    there = there if there.any() else ply.valid
+    taken = ply.valid & (ply.gaussians.opacities >= LEAST_OPACITY)
+    taken = taken if taken.any() else ply.valid
     grid, ids = (len(result.views), result.cameras.height, result.cameras.width), result.pixel_ids
     if ids is None or (len(ids) == prod(grid) and _counts_up(ids)):
-        gaussians = ply.gaussians if there.all() else ply.gaussians[there]
-        return gaussians, None if ids is None else Pixels.of_grid(there.reshape(grid))
-    rows = np.flatnonzero(there)
+        gaussians = ply.gaussians if taken.all() else ply.gaussians[taken]
+        return gaussians, None if ids is None else Pixels.of_grid(taken.reshape(grid))
+    rows = np.flatnonzero(taken)
     rows = rows[np.argsort(ids[rows], kind="stable")]
     homes, gaussians = ids[rows], ply.gaussians[rows]
     if len(np.unique(homes)) == len(homes) and homes[0] >= 0:
         mask = np.zeros(prod(grid), bool)
         mask[homes] = True
         return gaussians, Pixels.of_grid(mask.reshape(grid))
-    seen = np.flatnonzero(homes >= 0)
+    in_pixels = np.flatnonzero(homes >= 0)  # several Gaussians share a pixel, or some have none
     viewmats = result.cameras.viewmats[list(result.views)]
-    depths = camera_depths(gaussians.means[seen].astype(np.float64), viewmats[homes[seen] // prod(grid[1:])])
+    depths = camera_depths(gaussians.means[in_pixels].astype(np.float64), viewmats[homes[in_pixels] // prod(grid[1:])])
     fronts = np.full(prod(grid), -1, np.int32)
-    farthest_first = seen[np.argsort(-depths, kind="stable")]
-    fronts[homes[farthest_first]] = farthest_first
+    farthest_first = in_pixels[np.argsort(-depths, kind="stable")]
+    fronts[homes[farthest_first]] = farthest_first  # the nearest Gaussian of a pixel is written last
     return gaussians, Pixels(homes, fronts.reshape(grid), own=True)
 
 
 def _counts_up(ids: np.ndarray) -> bool:
-    """Return whether numbers are 0, 1, 2, ...; compared in parts, as there may be hundreds of millions."""
-    starts = range(0, len(ids), _PART)
-    parts = ((first, ids[first : first + _PART]) for first in starts)
-    return all(np.array_equal(part, np.arange(first, first + len(part), dtype=ids.dtype)) for first, part in parts)
+    """Return whether numbers are 0, 1, 2, ...; they are compared block by block, since there may be many millions."""
+    blocks = ((first, ids[first : first + _BLOCK]) for first in range(0, len(ids), _BLOCK))
+    return all(np.array_equal(block, np.arange(first, first + len(block), dtype=ids.dtype)) for first, block in blocks)
 
 
 def set_rotations(
     scene: Scene, hints: ReadHints, exporters: Sequence[Exporter], frame: Similarity
 ) -> tuple[Scene, list[str]]:
-    """Read rotations by the hint, as the given exporter stores them, or as fits the surface; with a note."""
+    """Convert rotations as the hint says, as the named exporter stores them, or so that they fit the surface.
+
+    Also returns a note if the last of these changed them.
+    """
     turn = frame.rotation if frame.kind in TURNED else None
     if hints.quats != "auto":
         return read_rotations(scene, hints.quats, turn), []

@@ -1,4 +1,4 @@
-"""The cameras and photos of a scene: read, turned, cut, at a size that memory has room for; masks and larger files."""
+"""Read the cameras and photos of a scene at a size that memory has room for; find larger photos and masks."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from gsmerge.io.photo_files import (
     change_photos,
     decode_views,
     keep_photos,
+    limit_size,
     photo_size,
     resize_to,
     same_shape,
@@ -27,22 +28,22 @@ from gsmerge.scene.masks import NO_MASKS, Masks, read_masks
 from gsmerge.scene.photos import ScenePhotos, stored_photos
 from gsmerge.types import Cameras, LargePhotos
 
-_MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the Gaussians belong to pixels
-_FLOAT_PIXEL = 12  # bytes
-_BAR_SPREAD = 8  # of 255, range of a bar's colours
+_MAX_BYTES = 2 << 30  # of all photos as floats while it is unknown whether the Gaussians belong to pixels
+_FLOAT_PIXEL = 12  # bytes of a pixel as three floats
+_BAR_SPREAD = 8  # largest range of a bar's colours, of 255
 _ROUNDING = 1e-6  # pixels
 
 
 def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
     """Read a scene's cameras from their file or the ``.ply``, or estimate them; None if there are none.
 
-    If a file has only poses, the focal length is estimated; SceneError if that fails. Views that repeat others count
-    once, unless there may be as many rows for each.
+    If a file has only poses, the focal length is estimated; SceneError if that fails. Repeated views are dropped,
+    unless the number of rows is a multiple of the number of views.
     """
     stored = None
     if files.cameras is not None:
         stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
-        if len(ply.gaussians) % len(stored):  # otherwise each may have rows of its own
+        if len(ply.gaussians) % len(stored):  # otherwise each view may have rows of its own
             stored = drop_repeats(stored)
         if stored.focal is not None:
             return stored
@@ -67,11 +68,21 @@ def find_larger_and_masks(
     transform: PhotoTransform | None,
     cameras: Cameras,
 ) -> tuple[LargePhotos | None, Masks, list[str]]:
-    """Find the photos at full file size, if that is larger than the scene's, and masks of the pixels that count.
+    """Find the photos at the size of their files, if that is larger than the scene's, and masks of pixels that count.
 
-    Files are read again when a photo is asked for; photos inside other files stay in memory. ``size`` is that of the
-    undistorted photos, and ``transform`` how they were fitted to the rows; ``cameras`` are the scene's, in the order of
-    the camera file. Masks come from files and from transparency. Also returns notes.
+    A photo's file is read again when the photo is asked for; photos inside other files stay in memory. Masks come from
+    files and from transparency.
+
+    Args:
+        files: The files of the scene.
+        camera_file: The cameras as stored, with lenses.
+        photos: The photos of these cameras.
+        size: Size of the undistorted photos; None without photos.
+        transform: Transform of the photos to the pixels of the rows; None if they were not changed.
+        cameras: The scene's cameras, in the order of the camera file.
+
+    Returns:
+        The larger photos (None without any), the masks, and notes.
     """
     stored = photos.file_size or photo_size(photos.pictures)
     if stored is None or size is None:
@@ -82,7 +93,7 @@ def find_larger_and_masks(
     Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if lenses else None
 
     def cut(view: int, picture: np.ndarray) -> np.ndarray:
-        """Undistort a picture of the photo's upright size, and crop it to the view."""
+        """Undistort a picture of the upright photo's size, and crop it to what the view shows."""
         if Ks is not None:
             picture = undistort_photos([picture], Ks[view : view + 1], lenses[view : view + 1])[0]
         return np.ascontiguousarray(picture[window.rows, window.columns])
@@ -100,31 +111,31 @@ def find_larger_and_masks(
 
 @dataclass(frozen=True)
 class _Window:
-    """The part of a photo's file that a view of the grid shows."""
+    """The part of a photo's file that a view shows."""
 
     rows: slice
     columns: slice
-    to_file: np.ndarray  # [3,3] from pixels of the grid to those of the part
-    is_larger: bool  # whether it has more pixels than the view on both sides
+    to_file: np.ndarray  # [3,3] from pixels of the view to those of this part
+    is_larger: bool  # whether this part has more pixels than the view on both sides
 
 
 def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
-    """Find the part of files with the size ``stored`` that the grid shows; see :func:`find_larger_and_masks`."""
+    """Find the part of files of the size ``stored`` that the views show; see :func:`find_larger_and_masks`."""
     fitted = transform or resize_to(size, size)
-    scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)
-    cut, grid = np.array([fitted.left, fitted.top]), np.array([fitted.width, fitted.height])
-    shown = np.array([cameras.width, cameras.height]) / grid  # of unaligned scenes, whose views may be reduced again
-    first = np.floor(cut / scale).astype(int)
-    last = np.minimum(np.ceil((cut + grid) / scale - _ROUNDING).astype(int), stored)
+    scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)  # from pixels of the file to the grid
+    corner, grid = np.array([fitted.left, fitted.top]), np.array([fitted.width, fitted.height])
+    reduction = np.array([cameras.width, cameras.height]) / grid  # views of unaligned scenes may be reduced again
+    first = np.floor(corner / scale).astype(int)
+    last = np.minimum(np.ceil((corner + grid) / scale - _ROUNDING).astype(int), stored)
     to_file = np.eye(3)
-    to_file[(0, 1), (0, 1)] = 1 / (scale * shown)
-    to_file[:2, 2] = cut / scale - first
+    to_file[(0, 1), (0, 1)] = 1 / (scale * reduction)
+    to_file[:2, 2] = corner / scale - first
     (left, top), (right, bottom) = first.tolist(), last.tolist()
-    return _Window(slice(top, bottom), slice(left, right), to_file, bool((scale * shown).max() < 1))
+    return _Window(slice(top, bottom), slice(left, right), to_file, bool((scale * reduction).max() < 1))
 
 
 def cut_bars(photos: PhotoArrays, camera_file: CameraFile) -> tuple[PhotoArrays, list[str]]:
-    """Cut off bars around photos if the rest has the cameras' shape, with a note; otherwise change nothing."""
+    """Cut off bars around photos if the rest has the cameras' aspect ratio; return a note, empty if nothing is cut."""
     size = photo_size(photos)
     shapes = sizes_of(camera_file)
     if size is None or not shapes or camera_file.photo_map is not None:
@@ -132,7 +143,7 @@ def cut_bars(photos: PhotoArrays, camera_file: CameraFile) -> tuple[PhotoArrays,
     if any(same_shape(shape, size) for shape in shapes):
         return photos, []
     counts = [count_bars(photos[view], _BAR_SPREAD) for view in range(len(photos))]
-    above, below, left, right = (int(count) for count in np.median(counts, 0))
+    above, below, left, right = (int(count) for count in np.median(counts, 0))  # pixels of the bars
     inner = size[0] - left - right, size[1] - above - below
     if inner == size or not any(same_shape(shape, inner) for shape in shapes):
         return photos, []
@@ -140,17 +151,17 @@ def cut_bars(photos: PhotoArrays, camera_file: CameraFile) -> tuple[PhotoArrays,
     def cut(_: int, photo: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(photo[above : size[1] - below, left : size[0] - right])
 
-    note = f"the photos of {size[0]} x {size[1]} have bars around pictures of {inner[0]} x {inner[1]}: they are cut off"
+    note = f"bars around the photos are cut off: {size[0]} x {size[1]} pixels become {inner[0]} x {inner[1]}"
     return keep_photos(change_photos(photos, cut, inner)), [note]
 
 
 def limit_photo_size(
     photos: PhotoArrays, rows: int, max_side: int, *, unaligned: bool
 ) -> tuple[PhotoArrays, list[str]]:
-    """Resize photos that are too large for memory to at most ``max_side`` pixels per side, with notes.
+    """Resize photos that are too large for memory to at most ``max_side`` pixels per side; return them and notes.
 
-    Photos whose pixels may be the ``rows`` Gaussians of the file keep their size, unless they are known to be
-    ``unaligned``.
+    Photos keep their size if their pixels may be the Gaussians in the file's ``rows``, of which there are at least half
+    as many as pixels. ``unaligned``: the rows are known to have no pixels, so photos of any total size are resized.
     """
     size = photo_size(photos)
     if size is None:
@@ -163,7 +174,11 @@ def limit_photo_size(
 
 
 def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tuple[Cameras, np.ndarray, list[str]]:
-    """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; with a note."""
+    """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; return them and a note.
+
+    The size is that of :func:`gsmerge.measure.sizes.shrink_views`. The pixels are not: photos of a scene are resized
+    as files are, photos to compare as their renders are.
+    """
     transform, notes = _limit((cameras.width, cameras.height), max_side)
     if transform is not None:
         cameras, smaller = transform.cameras(cameras), transform.photos(images)
@@ -174,9 +189,8 @@ def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tupl
 
 def _limit(size: Size, max_side: int) -> tuple[PhotoTransform | None, list[str]]:
     """Make the transform that resizes pictures to ``max_side``, and a note; None if they are small enough."""
-    if max(size) <= max_side:
+    smaller = limit_size(size, max_side)
+    if smaller == size:
         return None, []
-    scale = max_side / max(size)
-    width, height = (max(1, round(side * scale)) for side in size)
-    note = f"views of {size[0]} x {size[1]} are worked on at {width} x {height}"
-    return resize_to(size, (width, height)), [f"{note}: no side is longer than {max_side} pixels (max_side)"]
+    note = f"views of {size[0]} x {size[1]} are resized to {smaller[0]} x {smaller[1]}"
+    return resize_to(size, smaller), [f"{note}, since max_side allows {max_side} pixels per side"]

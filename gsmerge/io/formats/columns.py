@@ -68,6 +68,12 @@ _PATTERNS = tuple(re.compile(kind.names, re.IGNORECASE) for kind in COLUMN_KINDS
 _NUMBERS = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}  # of 1, 2 and 4 bytes
 
 
+def _find_kind(name: str) -> ColumnKind | None:
+    """Return the first kind whose pattern a column's name matches; None for an unknown name."""
+    kinds = (kind for kind, names in zip(COLUMN_KINDS, _PATTERNS, strict=True) if names.fullmatch(name))
+    return next(kinds, None)
+
+
 def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
     """Return a note on columns, and elements that are ``layers``, that are not used and change what is drawn.
 
@@ -79,8 +85,7 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
     for name in row.names or ():
         if name in arrays.REQUIRED or name.startswith("f_rest_") or name == arrays.FILTER:
             continue
-        kinds = (kind for kind, names in zip(COLUMN_KINDS, _PATTERNS, strict=True) if names.fullmatch(name))
-        kind = next(kinds, None)
+        kind = _find_kind(name)
         if kind is not None or row[name].kind == "f":
             by_kind.setdefault(kind, []).append(name)
     for kind, names in by_kind.items():
@@ -107,8 +112,7 @@ def _check_types(path: Path, row: np.dtype[np.void]) -> None:
 
 def describes_places(name: str) -> bool:
     """Return whether a column may hold places or directions, such as a motion; labels and weights do not."""
-    kinds = (kind for kind, names in zip(COLUMN_KINDS, _PATTERNS, strict=True) if names.fullmatch(name))
-    kind = next(kinds, None)
+    kind = _find_kind(name)
     return kind is None or bool(kind.what)
 
 

@@ -24,17 +24,10 @@ def read_extra_columns(info: FileInfo) -> np.ndarray:
     if not info.extra_columns:
         return np.empty(info.count, [])
     rows = ply.read_rows(path).rows
-    names = [name for name in info.extra_columns if not rows.dtype[name].hasobject]
-    out = np.empty(info.count, [(name, rows.dtype[name].newbyteorder("<")) for name in names])
     if len(rows) != info.count:
-        raise SceneError(path, f"expected {info.count:,} rows, found {len(rows):,}: it changed while it was read")
-    size = max(1, ply.BLOCK_BYTES // rows.dtype.itemsize)
-    with ply.open_rows(path, rows) as read:
-        for first in range(0, len(rows), size):
-            block = read(slice(first, first + size))
-            for name in names:
-                out[name][first : first + size] = block[name]
-    return out
+        problem = f"expected {info.count:,} rows, found {len(rows):,}, since the file changed while it was read"
+        raise SceneError(path, problem, "run the command again")
+    return ply.read_columns(path, rows, [name for name in info.extra_columns if not rows.dtype[name].hasobject])
 
 
 def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:

@@ -89,11 +89,20 @@ def read_rows(path: Path) -> arrays.StoredRows:
     )
 
 
-def _read_column(path: Path, rows: np.ndarray, name: str) -> np.ndarray:
-    """Read one column of a file's rows."""
+def read_columns(path: Path, rows: np.ndarray | arrays.PackedRows, names: Sequence[str]) -> np.ndarray:
+    """Read some columns of a file's rows, block by block, as a structured array ``[n]`` of little-endian values."""
+    out = np.empty(len(rows), [(name, rows.dtype[name].newbyteorder("<")) for name in names])
     size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
     with open_rows(path, rows) as read:
-        return np.concatenate([read(slice(i, i + size))[name] for i in range(0, len(rows), size)])
+        for first in range(0, len(rows), size):
+            block = read(slice(first, first + size))
+            for name in names:
+                out[name][first : first + size] = block[name]
+    return out
+
+
+def _read_column(path: Path, rows: np.ndarray, name: str) -> np.ndarray:
+    return np.asarray(read_columns(path, rows, [name])[name])
 
 
 def _adapt_rows(rows: np.ndarray, *, linear: bool, white: float) -> np.ndarray:

@@ -363,7 +363,7 @@ def _choose_encoding(
     judged = opacities if len(empty) == 0 else opacities.copy()
     judged[empty] = np.nan
     declared = _declared_encoding(paths, parts, judged)
-    return declared or guess_encoding(judged), declared is None
+    return declared or _guess_encoding(judged), declared is None
 
 
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
@@ -377,7 +377,7 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
         values = opacities[first : first + len(part.rows)]
         first += len(values)
         is_clear = len(parts) > 1 and np.isfinite(values).sum() >= _MIN_JUDGED
-        encoding = part.encoding or (guess_encoding(values) if is_clear else None)
+        encoding = part.encoding or (_guess_encoding(values) if is_clear else None)
         if encoding is not None:
             seen.setdefault(encoding, path.name)
         if len(seen) > 1:
@@ -424,7 +424,7 @@ def _check_raw(path: Path, opacities: np.ndarray) -> None:
         raise SceneError(path, problem, "leave out --hint opacity=raw")
 
 
-def guess_encoding(opacities: np.ndarray) -> str:
+def _guess_encoding(opacities: np.ndarray) -> str:
     """Return "raw" where finite stored opacities lie in [0, 1], but for roundings and damage; else "logit".
 
     The density of logits goes on beyond 0 and 1, that of opacities ends there: hardly any lies beyond, and fewer than

@@ -151,7 +151,7 @@ LARGE = replace(
     height=72,
     images=np.stack([cv2.resize(image, (96, 72), interpolation=cv2.INTER_CUBIC) for image in SMOOTH.images]),
 )
-NOTE = "views of 96 x 72 are worked on at 48 x 36: no side is longer than 48 pixels (max_side)"
+NOTE = "views of 96 x 72 are resized to 48 x 36, since max_side allows 48 pixels per side"
 
 
 def save(folder: Path, *, shuffled: bool = True, tiny: Tiny = LARGE) -> Path:

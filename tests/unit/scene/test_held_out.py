@@ -116,7 +116,7 @@ def test_views_of_other_names_that_stand_in_the_same_place_are_no_targets(tiny: 
     load = load_scene(tiny.save(tmp_path / "scene"))
     poses = {"p": tiny.c2w[0], "q": between(tiny), "r": tiny.c2w[1]}
     assert read_held_out(load, write_views(tmp_path / "all", poses, tiny)).names == ("images/q.png",)
-    with refuses(SceneError, "transforms.json", "views", "none"):
+    with refuses(SceneError, "transforms.json", "held-out views", "only views"):
         read_held_out(load, write_views(tmp_path / "none", {"p": tiny.c2w[0]}, tiny))
 
 

@@ -45,7 +45,7 @@ def test_masks_beside_the_photos_by_their_names(tiny_folder: Path, tiny: Tiny, n
     assert load.scene.masks is not None
     assert np.array_equal(load.scene.masks[1], half(tiny))
     assert load.scene.masks[[0, 2]].all()  # they have none
-    assert "masks leave out 17 % of the photos; of 3, 1 have one" in load.notes
+    assert "masks leave out 17 % of the photos' pixels; 1 of 3 photos have a mask" in load.notes
 
 
 def test_a_folder_of_masks_that_is_named(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_bars_around_photos_are_cut_off(tiny_folder: Path, tiny: Tiny) -> None:
         write(tiny_folder / "images" / name, np.pad(image, ((3, 4), (0, 0), (0, 0)))[..., ::-1])
     load = load_scene(tiny_folder)
     assert np.array_equal((load.scene.images * 255).round(), tiny.images)
-    assert "the photos of 20 x 21 have bars around pictures of 20 x 14: they are cut off" in load.notes
+    assert "bars around the photos are cut off: 20 x 21 pixels become 20 x 14" in load.notes
 
 
 def test_a_folder_of_masks_in_a_format_that_is_not_read(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_a_folder_of_other_masks_beside_the_photos_is_not_used(tiny_folder: Path
 def test_masks_without_photos_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
     write(tiny_folder / "masks" / tiny.names[0], half(tiny).astype(np.uint8) * 255)
     shutil.rmtree(tiny_folder / "images")
-    assert "pictures of masks are not used: there are no photos" in load_scene(tiny_folder).notes
+    assert "the pictures of --masks are not used, since there are no photos" in load_scene(tiny_folder).notes
 
 
 def test_bright_pixels_count_by_their_opacity(tmp_path: Path) -> None:

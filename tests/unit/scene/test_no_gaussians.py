@@ -99,11 +99,11 @@ def test_a_file_that_holds_no_gaussians(tmp_path: Path, tiny: Tiny, name: str, s
 @pytest.mark.parametrize(
     ("arrays", "lacks"),
     [
-        (("depth", "c2w", "images"), "lack K:"),
-        (("depth", "K", "images"), "lack c2w:"),
-        (("depth", "c2w"), "lack K and images:"),
-        (("depths", "extrinsic"), "lack intrinsics:"),
-        (("depth", "image"), "lack extrinsics and intrinsics:"),
+        (("depth", "c2w", "images"), "add K to"),
+        (("depth", "K", "images"), "add c2w to"),
+        (("depth", "c2w"), "add K and images to"),
+        (("depths", "extrinsic"), "add intrinsics to"),
+        (("depth", "image"), "add extrinsics and intrinsics to"),
     ],
 )
 def test_what_depth_maps_lack_is_named(tmp_path: Path, arrays: tuple[str, ...], lacks: str) -> None:

@@ -87,7 +87,7 @@ def test_photos_that_lie_on_their_side(folder: Path, truth: np.ndarray, tagged: 
         Image.fromarray(np.ascontiguousarray(lying)).save(path, exif=exif)
     loaded = load_scene(folder)
     assert right_ones(loaded, truth) == [True] * VIEWS
-    assert any("they were turned" in text and "3 of 4 photos" in text for text in loaded.notes) is not tagged
+    assert any("are turned" in text and "3 of 4 photos" in text for text in loaded.notes) is not tagged
 
 
 def test_photos_that_are_mirrored(folder: Path, truth: np.ndarray) -> None:
@@ -95,8 +95,8 @@ def test_photos_that_are_mirrored(folder: Path, truth: np.ndarray) -> None:
         Image.fromarray(np.ascontiguousarray((read(path) * 255).round().astype(np.uint8)[:, ::-1])).save(path)
     loaded = load_scene(folder)
     assert right_ones(loaded, truth) == [True] * VIEWS
-    assert any("they were mirrored" in text and "4 of 4 photos" in text for text in loaded.notes)
-    assert not any("they were turned" in text for text in loaded.notes)
+    assert any("are mirrored" in text and "4 of 4 photos" in text for text in loaded.notes)
+    assert not any("are turned" in text for text in loaded.notes)
 
 
 def test_tags_of_photos_that_are_upright(folder: Path, truth: np.ndarray) -> None:
@@ -107,7 +107,7 @@ def test_tags_of_photos_that_are_upright(folder: Path, truth: np.ndarray) -> Non
         Image.open(path).convert("RGB").save(path, exif=exif)
     loaded = load_scene(folder)
     assert right_ones(loaded, truth) == [True] * VIEWS
-    assert any("4 of 4 photos lie otherwise" in text for text in loaded.notes)
+    assert any("4 of 4 photos are turned" in text for text in loaded.notes)
 
 
 def test_a_photo_without_a_camera_is_named(folder: Path, truth: np.ndarray) -> None:
@@ -249,7 +249,7 @@ def test_names_that_were_given_to_other_photos(folder: Path, truth: np.ndarray) 
         path.write_bytes(contents[(view + 1) % VIEWS])
     loaded = load_scene(folder)
     assert right_ones(loaded, truth) == [True] * VIEWS
-    assert any("matched with views by what they show" in text for text in loaded.notes)
+    assert any("matched with views by their content" in text for text in loaded.notes)
 
 
 def test_numbers_of_which_names_say_nothing(folder: Path, truth: np.ndarray) -> None:

@@ -152,7 +152,7 @@ def test_images_under_the_names_of_other_views(tiny_folder: Path, tiny: Tiny) ->
     assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)
     assert loaded.left_out is None
     (note,) = loaded.notes
-    assert names(note, "by what they show", "images/a b/2.png: a b/11.png")
+    assert names(note, "by their content", "images/a b/2.png: a b/11.png")
 
 
 # What does not fit
@@ -191,7 +191,7 @@ def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder
 
 
 def test_rows_in_order_are_known_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rows, "_PART", 4)
+    monkeypatch.setattr(rows, "_BLOCK", 4)
     ids = np.arange(11, dtype=np.int32)
     assert rows._counts_up(ids)
     for wrong in (0, 4, 10):

@@ -94,7 +94,7 @@ def test_files_of_the_same_bytes_are_one_scene(tmp_path: Path, tiny: Tiny, named
     for i in (1, 2):
         shutil.copy(folder / "0.ply", folder / f"{i}.ply")
     load = load_scene(folder, cameras=folder / "transforms.json" if named else None)
-    assert load.notes[0] == "3 files have the same bytes: 0.ply is read"
+    assert load.notes[0] == "3 files have the same bytes; 0.ply is read"
     np.testing.assert_array_equal(load.scene.gaussians.means, whole.gaussians.means)
     write_ply(folder / "2.ply", tiny.gaussians[::-1], overwrite=True)
     assert len(find_scene_files(folder).plys) == 3
