@@ -169,7 +169,8 @@ def _focal(values: Mapping[str, float], axis: str, side: float) -> float:
         return values[f"f{axis}"]
     if f"angle_{axis}" in values:
         half = 0.5 * values[f"angle_{axis}"]
-        return float(0.5 * side * cos(half) / sin(half))
+        with np.errstate(all="ignore"):  # an angle of 0 has no finite focal length, which is refused later
+            return float(0.5 * side * cos(half) / sin(half))
     return 0.0
 
 
