@@ -185,7 +185,7 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
 
     ``moved_px`` is the largest median error of the moved poses, pixels.
     """
-    if len(np.unique(pairs.views)) < 2:  # in a single view a shift of the picture cannot be told from a rotation
+    if len(np.unique(pairs.views)) < 2:  # in a single view a shift of the picture looks like a rotation
         return None
     with np.errstate(all="ignore"):
         places, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
