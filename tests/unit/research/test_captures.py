@@ -95,7 +95,7 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
         find_capture(tmp_path, "b")
     for photo in (tmp_path / "a" / "images_4").rglob("*.png"):
         photo.unlink()
-    with refuses(SceneError, tmp_path / "a" / "images_4", "images"):
+    with refuses(SceneError, tmp_path / "a" / "images_4", "photos", "none"):
         read(find_capture(tmp_path, "a"), [0])
     (tmp_path / "a" / "images_4").rename(tmp_path / "a" / "photos")
     with refuses(SceneError, tmp_path / "a" / "transforms.json", "photo"):

@@ -155,7 +155,7 @@ def test_frames_that_are_not_all_there(tmp_path: Path, tiny: Tiny) -> None:
     poses.write_text("\n".join((*lines[:2], "1 2 3")))
     with refuses(SceneError, poses.name, "line 3", "12 or 16"):
         read_gaussians(frames[2])
-    with refuses(SceneError, "frame_2.npz", "one frame", "results_output"):
+    with refuses(SceneError, "frame_2.npz", "a single frame", "results_output"):
         find_scene_files(frames[2])
     frames[1].unlink()
     with refuses(SceneError, "results_output", "number 1"):
