@@ -84,9 +84,9 @@ def test_counts_are_judged_by_views_that_nothing_was_fitted_to(bare: Path, tmp_p
 def test_settings_of_stages_that_are_left_out_are_named(bare: Path, tmp_path: Path, run: Any) -> None:
     words = ("--set", "fit_steps=50", "--set", "unseen=keep", "--levels", "3", "--set", "drop=floaters", "--k", "2")
     report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", *words)
-    assert noted(report["notes"], "not used", "unseen")
-    assert not noted(report["notes"], "not used", "fit_steps")
-    assert not noted(report["notes"], "not used", "k")
+    assert noted(report["notes"], "no effect", "unseen")
+    assert not noted(report["notes"], "no effect", "fit_steps")
+    assert not noted(report["notes"], "no effect", "k")
     assert len(report["levels"]) == 2
     assert all(level["choices"]["fidelity"]["psnr"] > 5 for level in report["levels"])
 
