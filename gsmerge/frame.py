@@ -1,8 +1,8 @@
 """Canonical frame of a scene, in which all arithmetic runs.
 
-It has its origin at the scene's middle and the median depth as its unit, so that float32 keeps its precision far from
-the world's origin and thresholds (near plane, floors) mean the same at every scale. The unit is a power of two: scaling
-there and back changes no bit.
+Its origin is the scene's middle, and its unit is the median depth. So float32 keeps its precision far from the world's
+origin, and thresholds (near plane, floors) mean the same at every scale. The unit is a power of two, so scaling to the
+frame and back changes no bit.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene, SceneT
 
-SAMPLE_GAUSSIANS = 65536  # Gaussians that the frame is measured on
+SAMPLE_GAUSSIANS = 65536  # Gaussians by which the frame is chosen
 ROWS = 65536  # Gaussians per task
-MAX_VIEWS = 32  # that the unit is taken from, where they have no Gaussians of their own
+MAX_VIEWS = 32  # most views by which the unit is chosen, if views have no Gaussians of their own
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,10 @@ class Frame:
 
 
 def scene_frame(scene: Scene) -> Frame:
-    """Choose the canonical frame: median mean (float64) and median depth; ValueError without Gaussians or views."""
+    """Choose the canonical frame by the median of the means and the median depth.
+
+    Raises ValueError without Gaussians or views.
+    """
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
     means = scene.gaussians.means[sample_rows(scene)].astype(np.float64)
@@ -72,7 +75,10 @@ def scene_frame(scene: Scene) -> Frame:
 
 
 def scene_depth(scene: Scene) -> float:
-    """Measure the median depth of sampled Gaussians in their own views, or in all views that see them; 0 if unseen."""
+    """Measure the median depth of sampled Gaussians in their own views, or else in all views that see them.
+
+    Returns 0 if no view sees any.
+    """
     rows = sample_rows(scene)
     means = scene.gaussians.means[rows].astype(np.float64)
     if scene.has_own_pixels:
@@ -87,7 +93,7 @@ def scene_depth(scene: Scene) -> float:
 
 
 def sample_rows(scene: Scene) -> np.ndarray:
-    """Choose evenly spread rows; raise ValueError if there is none."""
+    """Choose evenly spread rows of a scene; ValueError if it has none."""
     count = len(scene.gaussians)
     if count == 0:
         raise ValueError("expected at least one Gaussian, got none")

@@ -10,7 +10,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.holes import usual_opacity
 from gsmerge.facts.views import take_rows
 from gsmerge.frame import canonicalise
-from gsmerge.geometry import lies_inside, rgb_to_sh0, turn_by
+from gsmerge.geometry import euler_to_rotmat, lies_inside, rgb_to_sh0
 from gsmerge.raster import render_in_turn
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
@@ -27,7 +27,7 @@ def find_region(crop: str) -> Region:
     if shape == "sphere":
         return Region(numbers[:3], np.full(3, numbers[3]), np.eye(3), is_sphere=True)
     low, high, degrees = numbers[:3], numbers[3:6], np.pad(numbers[6:], (0, 9 - len(numbers)))
-    rotation = turn_by(degrees).T if degrees.any() else np.eye(3)
+    rotation = euler_to_rotmat(degrees).T if degrees.any() else np.eye(3)
     return Region((low + high) / 2, (high - low) / 2, rotation, is_sphere=False)
 
 

@@ -108,7 +108,7 @@ def _coarser(mask: np.ndarray) -> np.ndarray:
 
 
 def _cells_of(pixels: np.ndarray, shape: tuple[int, ...], level: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return the cell of each pixel ``[m]`` int32 of a picture ``[h,w]``, and the number of rows and columns of cells."""
+    """Return the cell of each pixel ``[m]`` int32 of a picture ``[h,w]``, and the numbers of cells down and across."""
     height, width = shape
     rows, columns = np.divmod(pixels, np.int32(width))
     wide = -(-width // (1 << level))

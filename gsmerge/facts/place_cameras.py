@@ -246,7 +246,10 @@ def _walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
 
 
 def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrix ``[4,4]``, OpenCV axes, of a camera at ``eye`` that looks in a ``direction``."""
+    """Return the world-to-camera matrix ``[4,4]``, OpenCV axes, of a camera at ``eye`` that looks along ``direction``.
+
+    ``direction`` has length 1.
+    """
     up = np.array([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = np.cross(up, direction)
     x /= np.sqrt((x * x).sum())

@@ -123,7 +123,7 @@ def _blend_layers(part: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _blurred_difference(first: np.ndarray, second: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Blur two pictures ``[h,w,3]`` with ``weights [h,w]``; return their mean difference over the channels ``[h,w]``."""
+    """Blur two pictures ``[h,w,3]`` with ``weights [h,w]``; return their difference ``[h,w]``, a mean over channels."""
     apart = np.abs(blur((first - second) * weights[..., None], BLUR))
     return (apart[..., 0] + apart[..., 1] + apart[..., 2]) / (3 * np.maximum(blur(weights, BLUR), np.float32(1e-6)))
 
