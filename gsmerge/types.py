@@ -407,7 +407,7 @@ class Scene:
 
     @property
     def protected(self) -> np.ndarray | None:
-        """Mask ``[v,h,w]`` of the pixels with at least half the importance of a protected one; None if there are none."""
+        """Mask ``[v,h,w]`` of the pixels with at least half the importance of a protected one; None if none has."""
         if self.images is None or self.importance is None:
             return None
         mask = self.importance >= PROTECTED / 2
