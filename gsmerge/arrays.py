@@ -1,4 +1,4 @@
-"""NumPy arrays, or torch tensors in their place; torch is imported only if tensors are asked for."""
+"""Functions on NumPy arrays or torch tensors; torch is imported only if tensors are asked for."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from gsmerge.errors import refuse_without_torch
 if TYPE_CHECKING:
     import torch
 
-Array = NDArray[Any]  # or a torch tensor where a docstring allows one, which type checkers do not see
+Array = NDArray[Any]  # or a torch tensor if a docstring allows one; type checkers do not see that
 
 
 def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> None:
-    """Raise ValueError unless an array has a shape; an axis that is named may have any length."""
-    ok = array.ndim == len(shape) and all(
-        isinstance(want, str) or want == have for want, have in zip(shape, array.shape, strict=True)
+    """Raise ValueError unless an array has a shape; an axis given by a name may have any length."""
+    fits = array.ndim == len(shape) and all(
+        isinstance(expected, str) or expected == length for expected, length in zip(shape, array.shape, strict=True)
     )
-    if not ok:
+    if not fits:
         raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
 
 
 def as_array(values: Array) -> np.ndarray:
-    """Return an array, or a tensor on any device, as a NumPy array without gradient; copied only if needed."""
+    """Return an array, or a tensor on any device, as a NumPy array without gradient; copy it only if needed."""
     return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
 
 
 def as_pictures(images: Array) -> np.ndarray:
-    """Return pictures ``[...,3]`` as sRGB in [0, 1], those of uint8 divided by 255.
+    """Return pictures ``[...,3]`` as sRGB in [0, 1]; pictures of uint8 are divided by 255.
 
-    Raises ValueError for numbers that are more than one level of 255 beyond.
+    Raises ValueError for values more than 1/255 outside [0, 1].
     """
     pictures = as_array(images)
     if pictures.dtype == np.uint8:
@@ -46,7 +46,7 @@ def as_pictures(images: Array) -> np.ndarray:
 
 
 def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor:
-    """Return an array or a tensor as a tensor on a device; on the CPU it shares the array's memory."""
+    """Return an array or a tensor as a tensor on a device; on the CPU the tensor shares the array's memory."""
     with refuse_without_torch():
         import torch
 
@@ -74,5 +74,5 @@ def concat_rows(parts: Sequence[Array], axis: int = 0) -> Any:
 
 
 def concat_columns(parts: Sequence[Array]) -> Array:
-    """Put the columns of arrays or of tensors side by side."""
+    """Concatenate the columns of arrays or tensors."""
     return concat_rows(parts, 1)

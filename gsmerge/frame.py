@@ -1,8 +1,8 @@
 """Move scenes into and out of their canonical frame, in which all computations run.
 
-The origin of the frame is the middle of the scene, and its unit is about the median depth. So float32 is precise also
-far from the world's origin, and thresholds (near plane, least scales) have the same meaning at every scale. The unit is
-a power of two, so scaling into the frame and back changes no bit.
+Its origin is the scene's middle, and its unit is the median depth. So float32 keeps its precision far from the world's
+origin, and thresholds (near plane, floors) mean the same at every scale. The unit is a power of two, so scaling to the
+frame and back changes no bit.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene, SceneT
 
-SAMPLE_GAUSSIANS = 65536  # Gaussians that the frame is measured on
+SAMPLE_GAUSSIANS = 65536  # Gaussians by which the frame is chosen
 ROWS = 65536  # Gaussians per task
-MAX_VIEWS = 32  # views that the unit is measured in, if views have no Gaussians of their own
+MAX_VIEWS = 32  # most views by which the unit is chosen, if views have no Gaussians of their own
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Frame:
 
 
 def scene_frame(scene: Scene) -> Frame:
-    """Choose the canonical frame: its origin is the median mean, its unit the power of two nearest the median depth.
+    """Choose the canonical frame by the median of the means and the median depth.
 
     Raises ValueError without Gaussians or views.
     """
@@ -75,7 +75,10 @@ def scene_frame(scene: Scene) -> Frame:
 
 
 def scene_depth(scene: Scene) -> float:
-    """Measure the median depth of sampled Gaussians in their own views, or in all views that see them; 0 if unseen."""
+    """Measure the median depth of sampled Gaussians in their own views, or else in all views that see them.
+
+    Returns 0 if no view sees any.
+    """
     rows = sample_rows(scene)
     means = scene.gaussians.means[rows].astype(np.float64)
     if scene.has_own_pixels:
@@ -90,7 +93,7 @@ def scene_depth(scene: Scene) -> float:
 
 
 def sample_rows(scene: Scene) -> np.ndarray:
-    """Sample rows at equal steps; raise ValueError without Gaussians."""
+    """Choose evenly spread rows of a scene; ValueError if it has none."""
     count = len(scene.gaussians)
     if count == 0:
         raise ValueError("expected at least one Gaussian, got none")

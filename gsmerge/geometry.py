@@ -1,4 +1,7 @@
-"""Quaternions, covariances, projection, harmonics, similarities, motions, medians, on batches; damped descent."""
+"""Geometry on batches: quaternions, covariances, projection, harmonics, similarities, motions, regions; medians.
+
+Also damped descent, by which small problems are solved.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,11 @@ from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
 
-State = TypeVar("State")  # what a descent moves
-MORTON_BITS = 21  # per axis: three fit into 63 bits
-DEPTH_SAMPLE = 50_000  # points that say how far away the middle of a view lies
-DIRECTIONS = 96  # in which harmonics are compared before and after a turn
-BRIGHT = np.float32(20.0)  # harmonic of degree 0 with which no colour is cut off below 0
+State = TypeVar("State")  # state that a descent changes
+MORTON_BITS = 21  # bits for each axis; three times as many fit into 63 bits
+DEPTH_SAMPLE = 50_000  # points by which the median depth in a view is measured
+DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
+BRIGHT = np.float32(20.0)  # harmonic of degree 0 so large that no colour is clipped at 0
 
 
 def quat_to_rotmat(quats: np.ndarray) -> np.ndarray:
@@ -39,7 +42,7 @@ def rotation_entries(w: Array, x: Array, y: Array, z: Array) -> list[Array]:
 
 def normalize(vectors: np.ndarray) -> np.ndarray:
     """Return vectors ``[...,d]`` scaled to length 1; zero stays zero."""
-    with np.errstate(over="ignore"):  # what is too long becomes zero
+    with np.errstate(over="ignore"):  # vectors whose length overflows become zero
         norms = _lengths(vectors)
     return vectors / np.maximum(norms, norms.dtype.type(1e-12))
 
@@ -47,7 +50,7 @@ def normalize(vectors: np.ndarray) -> np.ndarray:
 def rotmat_to_quat(rotations: np.ndarray) -> np.ndarray:
     """Return unit quaternions ``[n,4]`` wxyz of rotations, with a positive largest component (Shepperd 1978)."""
     a, b, c, d, e, f, g, h, i = rotations.reshape(-1, 9).T
-    ways = np.stack(
+    candidates = np.stack(  # the same quaternion four times, scaled by each of its components
         [
             np.stack([1 + a + e + i, h - f, c - g, d - b], -1),
             np.stack([h - f, 1 + a - e - i, b + d, c + g], -1),
@@ -56,8 +59,8 @@ def rotmat_to_quat(rotations: np.ndarray) -> np.ndarray:
         ],
         -2,
     )
-    best = np.diagonal(ways, axis1=-2, axis2=-1).argmax(-1)
-    return normalize(ways[np.arange(len(best)), best])
+    best = np.diagonal(candidates, axis1=-2, axis2=-1).argmax(-1)
+    return normalize(candidates[np.arange(len(best)), best])
 
 
 def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -79,8 +82,8 @@ def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
 def project(means: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Project points ``[n,3]`` into c cameras, in float64.
 
-    Returns ``[c,n,2]`` positions in pixels (pixel centres at +0.5; meaningless where the depth is
-    not positive) and ``[c,n]`` depths along z.
+    Returns positions ``[c,n,2]`` in pixels, with pixel centres at +0.5, and depths ``[c,n]`` along z. Positions mean
+    nothing for points whose depth is not positive.
     """
     with np.errstate(divide="ignore", invalid="ignore"):  # behind or on the plane of a camera
         return project_points(*(array.astype(np.float64) for array in (means, cameras.viewmats, cameras.Ks)))
@@ -89,8 +92,8 @@ def project(means: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray
 def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Project points ``[...,n,3]`` as :func:`project` does, for any leading shape and in their own precision.
 
-    ``viewmats [...,4,4]`` world to camera, ``Ks [...,3,3]`` pixels; returns positions ``[...,n,2]``
-    and depths ``[...,n]``.
+    ``viewmats [...,4,4]`` are world to camera, ``Ks [...,3,3]`` in pixels. Returns positions ``[...,n,2]`` and depths
+    ``[...,n]``.
     """
     camera = matmul(points, viewmats[..., :3, :3].swapaxes(-1, -2)) + viewmats[..., None, :3, 3]
     image = matmul(camera, Ks.swapaxes(-1, -2))
@@ -110,7 +113,10 @@ def camera_depths(points: np.ndarray, viewmats: np.ndarray) -> np.ndarray:
 
 
 def motion_matrices(vectors: np.ndarray) -> np.ndarray:
-    """Return rigid motions ``[v,4,4]`` float64 of ``[v,6]``: rotation vectors about the origin (radians), shifts."""
+    """Return rigid motions ``[v,4,4]`` float64 from ``[v,6]``: rotation vectors about the origin (radians), and shifts.
+
+    A motion rotates first.
+    """
     vectors = vectors.astype(np.float64)
     angles = _lengths(vectors[:, :3])
     shares = np.where(angles > 0, sin(angles / 2) / np.where(angles > 0, angles, 1), 0.5)
@@ -120,15 +126,16 @@ def motion_matrices(vectors: np.ndarray) -> np.ndarray:
     return out
 
 
-def turn_by(degrees: np.ndarray) -> np.ndarray:
+def euler_to_rotmat(degrees: np.ndarray) -> np.ndarray:
     """Return the rotation ``[3,3]`` about the axes x, y and z, in this order, by ``degrees [3]``."""
     about_x, about_y, about_z = motion_matrices(np.pad(np.diag(np.radians(degrees)), ((0, 0), (0, 3))))[:, :3, :3]
     return matmul(about_z, matmul(about_y, about_x))
 
 
-def angles_of(rotation: np.ndarray) -> np.ndarray:
-    """Return the ``degrees [3]`` about the axes x, y and z with which :func:`turn_by` makes ``rotation [3,3]``."""
-    cosine = np.sqrt(np.square(rotation[:2, 0]).sum())  # of the angle about y: near 0 the others turn about one axis
+def rotmat_to_euler(rotation: np.ndarray) -> np.ndarray:
+    """Return the ``degrees [3]`` about x, y and z with which :func:`euler_to_rotmat` makes ``rotation [3,3]``."""
+    # cosine of the angle about y; near 0, the other two angles have the same axis, and that about z is set to 0
+    cosine = np.sqrt(np.square(rotation[:2, 0]).sum())
     about_y = arctan2(-rotation[2, 0], cosine)
     if cosine < 1e-9:
         return np.asarray(np.degrees([arctan2(-rotation[1, 2], rotation[1, 1]), about_y, 0.0]))
@@ -147,7 +154,10 @@ def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[..., np.ndarray]) -> np.ndarray:
-    """Return viewmats ``end [v,4,4]`` without the common part (mean, median) of all motions since ``start``."""
+    """Return the viewmats ``end [v,4,4]`` without the common part of all motions since ``start``.
+
+    ``middle`` computes the common part: a mean or a median.
+    """
     common = middle(motion_vectors(start, end), axis=0)
     return matmul(end, invert(motion_matrices(common[None])))
 
@@ -157,14 +167,14 @@ def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
 
     Higher harmonics are not rotated: poses are off by a degree or two, which hardly changes the colours.
     """
-    g, of_views = scene.gaussians, scene.get_pixels().rows_of_views
+    g, view_rows = scene.gaussians, scene.get_pixels().rows_of_views
     motions = matmul(invert(viewmats), scene.cameras.viewmats.astype(np.float64))
-    turns, (means, quats) = rotmat_to_quat(motions[:, :3, :3]), (a.copy() for a in (g.means, g.quats))
+    rotations, means, quats = rotmat_to_quat(motions[:, :3, :3]), g.means.copy(), g.quats.copy()
 
     def move(view: int) -> None:
-        rows = of_views[view]
+        rows = view_rows[view]
         means[rows] = matmul(g.means[rows], motions[view, :3, :3].T) + motions[view, :3, 3]
-        quats[rows] = multiply_quats(turns[view], g.quats[rows])
+        quats[rows] = multiply_quats(rotations[view], g.quats[rows])
 
     parallel_map(move, range(len(scene)))
     gaussians = replace(g, means=means, quats=quats)
@@ -172,17 +182,17 @@ def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
 
 
 def camera_centres(viewmats: np.ndarray) -> np.ndarray:
-    """Return the centres ``[...,3]`` in the world of cameras with rigid viewmats ``[...,4,4]``."""
+    """Return the world-frame centres ``[...,3]`` of cameras with rigid viewmats ``[...,4,4]``."""
     return -(viewmats[..., :3, :3] * viewmats[..., :3, 3:]).sum(-2)
 
 
 def middle_depth(means: np.ndarray, camera: Cameras) -> float:
-    """Measure the median depth of the points ``[n,3]`` inside one camera's picture; 1 without any."""
+    """Measure the median depth of the points ``[n,3]`` inside one camera's picture; 1 if there are none."""
     return float(np.quantile(depths_inside(means, camera), 0.5))
 
 
 def depths_inside(means: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; 1 without any."""
+    """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; a 1 if there are none."""
     points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
     (pixels,), (depths,) = project(points, camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
@@ -192,13 +202,13 @@ def depths_inside(means: np.ndarray, camera: Cameras) -> np.ndarray:
 def step_outside(
     viewmat: np.ndarray, depth: float, back: float, azimuth: float = 0.0, elevation: float = 0.0
 ) -> np.ndarray:
-    """Return the viewmat ``[4,4]`` float64 of a camera that turns about the point in front of it and steps back.
+    """Return the viewmat ``[4,4]`` float64 of a camera that moves around the point in front of it and steps back.
 
-    It keeps looking at the point ``depth`` in front of it, world units. ``azimuth`` moves it to the right and
-    ``elevation`` upwards, in degrees; ``back`` is the step away from the point as a share of ``depth``.
+    The camera keeps looking at the point that is ``depth`` in front of it, in world units. ``azimuth`` moves it to the
+    right and ``elevation`` upwards, in degrees. ``back`` is the step away from the point, as a share of ``depth``.
     """
-    turns = np.radians([[0.0, azimuth, 0.0], [elevation, 0.0, 0.0]])
-    about_y, about_x = motion_matrices(np.concatenate([turns, np.zeros((2, 3))], 1))
+    angles = np.radians([[0.0, azimuth, 0.0], [elevation, 0.0, 0.0]])
+    about_y, about_x = motion_matrices(np.concatenate([angles, np.zeros((2, 3))], 1))
     pivot = np.eye(4)
     pivot[2, 3] = depth
     away = pivot.copy()
@@ -207,14 +217,14 @@ def step_outside(
 
 
 def pose_changes(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Measure how far cameras moved between viewmats ``[v,4,4]``: degrees ``[v]``, distances of centres ``[v]``."""
+    """Measure how far cameras moved between viewmats ``[v,4,4]``: angles ``[v]`` in degrees, and distances ``[v]``."""
     chords = (np.linalg.norm(end[:, :3, :3] - start[:, :3, :3], axis=(1, 2)) / np.sqrt(8)).clip(0, 1)
     distances = _lengths(camera_centres(end) - camera_centres(start))[:, 0]
     return np.degrees(2 * arctan2(chords, np.sqrt((1 - chords) * (1 + chords)))), distances
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
-    """Return the lengths ``[...,1]`` of vectors ``[...,d]``, column by column, since reducing short rows is slower."""
+    """Return the lengths ``[...,1]`` of vectors ``[...,d]``; summing column by column is faster for short rows."""
     columns = np.moveaxis(vectors * vectors, -1, 0)
     return np.asarray(np.sqrt(sum(columns, vectors.dtype.type(0))))[..., None]
 
@@ -226,25 +236,25 @@ def nearest_views(centres: np.ndarray, view: int) -> np.ndarray:
 
 
 def camera_distances(cameras: Cameras) -> np.ndarray:
-    """Compute distances ``[v,v]`` between cameras: between centres in canonical units, plus between directions."""
+    """Compute distances ``[v,v]`` between cameras: of their centres, canonical units, plus of their directions."""
     viewmats = cameras.viewmats.astype(np.float64)
-    both = (camera_centres(viewmats), viewmats[:, 2, :3])
-    differences = [vectors[:, None] - vectors[None] for vectors in both]
+    centres_and_directions = (camera_centres(viewmats), viewmats[:, 2, :3])
+    differences = [vectors[:, None] - vectors[None] for vectors in centres_and_directions]
     return np.asarray(sum(np.sqrt((vectors * vectors).sum(-1)) for vectors in differences))
 
 
 def order_others(distances: np.ndarray) -> np.ndarray:
-    """Return for each view, by distances ``[v,v]``, the other views ``[v,v-1]``, the nearest first."""
-    apart = distances.copy()
-    np.fill_diagonal(apart, -1)
-    return np.argsort(apart, axis=1, kind="stable")[:, 1:]
+    """Return the other views ``[v,v-1]`` of each view by their distances ``[v,v]``, the nearest first."""
+    ordered = distances.copy()
+    np.fill_diagonal(ordered, -1)  # each view is the nearest to itself
+    return np.argsort(ordered, axis=1, kind="stable")[:, 1:]
 
 
 def median(values: np.ndarray) -> float:
     """Return the median of ``values [n]``, n >= 1, without the checks of ``np.median``; no value may be NaN."""
     middle = len(values) // 2
-    parts = np.partition(values, (middle - 1, middle) if len(values) > 1 else 0)
-    return float(parts[middle] if len(values) % 2 else (parts[middle - 1] + parts[middle]) / 2)
+    ordered = np.partition(values, (middle - 1, middle) if len(values) > 1 else 0)
+    return float(ordered[middle] if len(values) % 2 else (ordered[middle - 1] + ordered[middle]) / 2)
 
 
 def lower_median(values: np.ndarray) -> np.ndarray:
@@ -260,7 +270,7 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def morton_codes(points: np.ndarray) -> np.ndarray:
-    """Return Morton codes ``[n]`` int64 of points ``[n,3]``: interleaved bits, an order along a space-filling curve."""
+    """Return Morton codes ``[n]`` int64 of points ``[n,3]``, by which they are ordered along a space-filling curve."""
     codes = np.zeros(len(points), np.int64)
     if len(points) == 0:
         return codes
@@ -272,16 +282,16 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
     return codes
 
 
-def turn_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def rotate_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Rotate spherical harmonics ``[n,k-1,3]`` by ``rotation [3,3]``, as their Gaussians rotate."""
     num = shN.shape[1]
     if num == 0 or len(shN) == 0:
         return shN
-    return apply_turn(shN, harmonics_turn(num, rotation))
+    return apply_harmonics_rotation(shN, harmonics_rotation(num, rotation))
 
 
-def harmonics_turn(num: int, rotation: np.ndarray) -> np.ndarray:
-    """Return the matrix ``[num,num]`` that rotates ``num`` harmonics; see :func:`apply_turn`.
+def harmonics_rotation(num: int, rotation: np.ndarray) -> np.ndarray:
+    """Return the matrix ``[num,num]`` that rotates ``num`` harmonics; see :func:`apply_harmonics_rotation`.
 
     Each degree is fitted to the same colours in rotated directions, which is exact.
     """
@@ -291,14 +301,14 @@ def harmonics_turn(num: int, rotation: np.ndarray) -> np.ndarray:
     return solve(matmul(after.T, after), matmul(after.T, before))
 
 
-def apply_turn(shN: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Multiply harmonics ``[n,k-1,3]`` by a matrix ``[k-1,k-1]``."""
-    rows = matmul(shN.swapaxes(1, 2).reshape(-1, len(turn)), turn.T)
-    return np.ascontiguousarray(rows.reshape(-1, 3, len(turn)).swapaxes(1, 2), shN.dtype)
+def apply_harmonics_rotation(shN: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Rotate harmonics ``[n,k-1,3]`` by a ``matrix [k-1,k-1]`` of :func:`harmonics_rotation`."""
+    rows = matmul(shN.swapaxes(1, 2).reshape(-1, len(matrix)), matrix.T)
+    return np.ascontiguousarray(rows.reshape(-1, 3, len(matrix)).swapaxes(1, 2), shN.dtype)
 
 
 def _harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:
-    """Evaluate the higher harmonics in directions ``[d,3]``: ``[d,num]`` float64."""
+    """Evaluate the higher harmonics in directions ``[d,3]``; return ``[d,num]`` float64."""
     means = directions.astype(np.float32)
     count = len(means)
     sh0 = np.full((count, 1, 3), BRIGHT)
@@ -317,7 +327,7 @@ def _harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:
 
 
 def sh0_to_rgb(sh0: np.ndarray) -> np.ndarray:
-    """Return the base colours of harmonics of degree 0: sRGB, within 0 to 1 if displayable."""
+    """Return the base colours (sRGB) of harmonics of degree 0; colours outside [0, 1] cannot be displayed."""
     return 0.5 + SH_C0 * sh0
 
 
@@ -327,7 +337,7 @@ def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
 
 
 def robust_weights(errors: np.ndarray, doubt: float, least: float, sizes: np.ndarray | float = 1.0) -> np.ndarray:
-    """Return Cauchy's weights ``[n]`` for reweighted least squares, small for errors far above the median.
+    """Return Cauchy's weights ``[n]`` for reweighted least squares; they are small for errors far above the median.
 
     The weights are 1 / (sizes^2 (1 + (errors / (doubt * median + least))^2)).
     """
@@ -336,14 +346,14 @@ def robust_weights(errors: np.ndarray, doubt: float, least: float, sizes: np.nda
 
 @dataclass(frozen=True)
 class Damping:
-    """Steps of :func:`descend`, and how their damping changes."""
+    """Limits of the steps of :func:`descend`, and changes of their damping."""
 
-    steps: int  # at most
-    first: float  # damping, a share of the curvature
-    ease: float  # factor on it after a step that helps
-    brake: float  # factor on it after one that does not
-    most: float  # damping beyond which no step is tried
-    min_gain: float  # share of the error that a step must take away for another one to follow
+    steps: int  # Most steps
+    first: float  # Damping of the first step, a share of the curvature
+    ease: float  # Factor on the damping after a step that lowers the error
+    brake: float  # Factor on the damping after a step that does not
+    most: float  # Damping beyond which no step is tried
+    min_gain: float  # Share of the error that a step must remove for another step to follow
 
 
 def descend(
@@ -351,7 +361,7 @@ def descend(
 ) -> State:
     """Take damped steps that each lower the error, by Levenberg and Marquardt's rule, and return the last state.
 
-    ``step`` moves a state with an amount of damping; None where it cannot.
+    ``step`` returns the next state with an amount of damping, or None if there is none.
     """
     state, amount = start, damping.first
     least = error(state)
@@ -377,11 +387,11 @@ def descend(
 class Similarity:
     """A map ``x_gaussians = scale * rotation @ x_cameras + shift`` between frames."""
 
-    rotation: np.ndarray  # ``[3,3]``
-    scale: float  # positive
-    shift: np.ndarray  # ``[3]``, units of the Gaussians
-    description: str = ""  # what it is, for people; empty where both frames are the same
-    # "same", "scaled", "shifted"; "first", "middle" or "upright" by which camera it was rotated; "other"
+    rotation: np.ndarray  # [3,3]
+    scale: float  # Positive
+    shift: np.ndarray  # [3] in units of the Gaussians
+    description: str = ""  # Text for people; empty if both frames are the same
+    # "same", "scaled", "shifted"; "first", "middle" or "upright", the camera by which it was rotated; "other"
     kind: str = "same"
 
     def move_points(self, points: np.ndarray) -> np.ndarray:
@@ -396,7 +406,7 @@ class Similarity:
             scales=(self.scale * g.scales).astype(g.scales.dtype),
             opacities=g.opacities,
             sh0=g.sh0,
-            shN=turn_harmonics(g.shN, self.rotation),
+            shN=rotate_harmonics(g.shN, self.rotation),
         )
 
     def move_viewmats(self, viewmats: np.ndarray) -> np.ndarray:
@@ -415,7 +425,7 @@ IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
 
 
 def move_region(region: Region, origin: np.ndarray, unit: float) -> Region:
-    """Move a region into a frame of another origin and unit, whose positions are float32."""
+    """Move a region into a frame with another origin and unit, in which positions are float32."""
     middle, half = (region.middle - origin) / unit, region.half / unit
     own = float(np.finfo(np.float32).eps) * float(np.abs(middle).max() + half.max())
     return replace(region, middle=middle, half=half, rounding=region.rounding / unit + own)
@@ -443,7 +453,7 @@ def clamp_inside(region: Region, points: np.ndarray) -> np.ndarray:
 
 
 def mean_pose_frame(viewmats: np.ndarray) -> Similarity:
-    """Compute the map into the mean pose of cameras ``[c,4,4]`` in which all lie within +-1, as Long-LRM moves them."""
+    """Compute the map into the mean pose of cameras ``[c,4,4]`` in which all centres lie within +-1, as in Long-LRM."""
     rotation, centres = np.empty((3, 3)), camera_centres(viewmats)
     rotation[2], down = normalize(viewmats[:, 2, :3].mean(0)), viewmats[:, 1, :3].mean(0)
     rotation[1] = normalize(down - (down * rotation[2]).sum() * rotation[2])

@@ -1,7 +1,7 @@
-"""The core types: frozen dataclasses of arrays, and nothing but indexing and moving.
+"""The core types: frozen dataclasses of arrays, which can be indexed, concatenated and moved to a device.
 
-Arrays are NumPy's. Gaussians and cameras may hold torch tensors instead, of one device, for :func:`gsmerge.render`,
-networks and training; this module does not import torch unless it is asked for tensors.
+Arrays are NumPy's. Gaussians and cameras may hold torch tensors of one device instead, for :func:`gsmerge.render`,
+networks and training; this module imports torch only if it is asked for tensors.
 
 One convention in memory (docs/reference/conventions.md): linear scales, opacities in [0, 1], unit quaternions wxyz that
 rotate local to world, world-to-camera matrices with OpenCV axes, pixel centres at +0.5, sRGB in [0, 1].
@@ -105,15 +105,15 @@ class Gaussians:
 
 
 class HasGaussians(Protocol):
-    """What :func:`gsmerge.compact` returns, as far as its Gaussians go."""
+    """An object with Gaussians, such as the result of :func:`gsmerge.compact`."""
 
     @property
     def gaussians(self) -> Gaussians:
-        """Its Gaussians."""
+        """The Gaussians."""
 
 
 def own_gaussians(value: HasGaussians | Gaussians) -> Gaussians:
-    """Return Gaussians unchanged, or those of a result."""
+    """Return Gaussians unchanged, or the Gaussians of a result."""
     return value if isinstance(value, Gaussians) else value.gaussians
 
 
@@ -180,13 +180,13 @@ NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 @dataclass(frozen=True, eq=False)
 class LargePhotos:
-    """Photos larger than the scene's views, read one at a time; their poses are those of the scene's cameras."""
+    """Photos larger than the scene's views, read one at a time; they have the poses of the scene's cameras."""
 
-    Ks: np.ndarray  # [v,3,3] intrinsics at their size
+    Ks: np.ndarray  # [v,3,3] intrinsics at the size of the photos
     width: int
     height: int
-    ids: tuple[int, ...]  # the number by which each view's photo is read
-    read: Callable[[int], np.ndarray]  # number -> [height,width,3] uint8 sRGB; several threads may call it
+    ids: tuple[int, ...]  # Number by which the photo of each view is read
+    read: Callable[[int], np.ndarray]  # Number -> [height,width,3] uint8 sRGB; several threads may call it
 
     def __getitem__(self, views: Sequence[int]) -> LargePhotos:
         """Return the photos of some views."""
@@ -198,9 +198,9 @@ class Views:
     """Cameras with their photos.
 
     Args:
-        cameras: v cameras, in the world of the Gaussians that they look at.
+        cameras: v cameras, in the world frame of the Gaussians that they see.
         images: ``[v,h,w,3]`` sRGB in [0, 1].
-        names: One for each view.
+        names: One name for each view.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -225,20 +225,20 @@ class Views:
         return Views(self.cameras[ids], self.images[ids], tuple(self.names[i] for i in ids))
 
 
-PROTECTED = np.float32(4)  # pixels that one counts as where a picture of --protect is white
+PROTECTED = np.float32(4)  # importance of a pixel that is white in a picture of --protect
 PER_PIXEL = ("images", "masks", "importance")  # arrays of a scene with a value for each pixel of its views
 
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """Which pixel each Gaussian belongs to, and which Gaussian each pixel shows.
+    """The pixel that each Gaussian belongs to, and the Gaussian that each pixel shows.
 
     Pixels are numbered over all views, ``(v·H + y)·W + x``.
 
     Args:
-        homes: ``[n]`` int, the pixel in which each Gaussian shows most; -1: no view sees it.
-        fronts: ``[v,h,w]`` int32, the Gaussian that is first in each pixel; -1: none.
-        own: Whether each view has Gaussians of its own, one or more for a pixel, with the colours of its photo.
+        homes: ``[n]`` int, the pixel in which each Gaussian is most visible; -1: no view sees it.
+        fronts: ``[v,h,w]`` int32, the Gaussian in front in each pixel; -1: none.
+        own: Each view has Gaussians of its own, one or more for a pixel, with the colours of its photo.
     """
 
     homes: np.ndarray
@@ -246,9 +246,9 @@ class Pixels:
     own: bool
 
     @staticmethod
-    def of_grid(there: np.ndarray) -> Pixels:
-        """Return those of Gaussians that are, in order, the pixels of the mask ``there [v,h,w]``."""
-        mask = np.asarray(there, bool)
+    def of_grid(has_gaussian: np.ndarray) -> Pixels:
+        """Return the pixels of Gaussians in the order of the pixels that are set in the mask ``[v,h,w]``."""
+        mask = np.asarray(has_gaussian, bool)
         count, small = mask.size, mask.size <= np.iinfo(np.int32).max
         homes = np.arange(count, dtype=np.int32 if small else np.int64)
         if mask.all():
@@ -259,7 +259,7 @@ class Pixels:
 
     @property
     def shown(self) -> np.ndarray:
-        """Mask ``[v,h,w]`` of the pixels that a Gaussian is first in."""
+        """Mask ``[v,h,w]`` of the pixels that show a Gaussian."""
         return np.asarray(self.fronts >= 0)
 
     @cached_property
@@ -275,47 +275,48 @@ class Pixels:
 
     def select(self, views: Sequence[int]) -> tuple[np.ndarray, Pixels]:
         """Return the rows ``[m]`` of the Gaussians of some views, view by view, and their pixels in these views."""
-        size, of_views = int(np.prod(self.fronts.shape[1:])), [self.rows_of_views[view] for view in views]
+        size, view_rows = int(np.prod(self.fronts.shape[1:])), [self.rows_of_views[view] for view in views]
         homes, fronts, first = [self.homes[:0]], list[np.ndarray](), 0
-        for place, (view, rows) in enumerate(zip(views, of_views, strict=True)):
-            homes.append(self.homes[rows] + self.homes.dtype.type((place - view) * size))
-            front, found = self.fronts[view], np.searchsorted(rows, self.fronts[view])
-            fronts.append(np.where(front >= 0, first + found, -1).astype(np.int32))
+        for new_view, (view, rows) in enumerate(zip(views, view_rows, strict=True)):
+            homes.append(self.homes[rows] + self.homes.dtype.type((new_view - view) * size))
+            front, places = self.fronts[view], np.searchsorted(rows, self.fronts[view])
+            fronts.append(np.where(front >= 0, first + places, -1).astype(np.int32))
             first += len(rows)
-        shape = len(of_views), *self.fronts.shape[1:]
-        rows = np.concatenate([np.zeros(0, np.int64), *of_views])
+        shape = len(view_rows), *self.fronts.shape[1:]
+        rows = np.concatenate([np.zeros(0, np.int64), *view_rows])
         return rows, Pixels(np.concatenate(homes), np.array(fronts, np.int32).reshape(shape), own=self.own)
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A box, which may be rotated, or a sphere. Both are convex, so means of points inside lie inside."""
+    """A box, which may be rotated, or a sphere; both are convex, so the mean of points inside is inside."""
 
     middle: np.ndarray  # [3]
-    half: np.ndarray  # [3] half of each side of a box; the radius of a sphere, in each of the three
+    half: np.ndarray  # [3] half of each side of a box; three times the same radius for a sphere
     axes: np.ndarray  # [3,3] rotation into the directions of the sides
     is_sphere: bool
-    rounding: float = 0.0  # of stored positions: clamped ones stay so far inside the border
+    rounding: float = 0.0  # Rounding of stored positions; clamped positions stay so far inside the border
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Gaussians, and the views that they were made from or that see them.
+    """Gaussians, and the views from which they were made or that see them.
 
-    Gaussians are those rows of a file that are there: finite, and drawn by something. Where reading shows which pixel
-    each row belongs to, the scene has its ``pixels``; elsewhere :func:`gsmerge.facts.pixels.find_pixels` finds them.
+    The Gaussians are the rows of a file that are finite and not empty. If reading finds the pixel of each row, the
+    scene has ``pixels``; otherwise :func:`gsmerge.facts.pixels.find_pixels` finds them later.
 
     Args:
         gaussians: n Gaussians, in the frame of the cameras.
-        cameras: The V views; none where none are known.
-        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None; runs take uint8, too, and refuse others.
+        cameras: The v views; no cameras if none are known.
+        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None. A run also accepts uint8, and no other type.
         pixels: The pixel of each Gaussian, and the Gaussian in front of each pixel; None: not known yet.
-        names: The views' names (image file names where known).
+        names: The views' names, which are the image file names if these are known.
         large_photos: The photos with more pixels than the views, or None.
-        masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. A view without a photo has none such.
-        importance: ``[v,h,w]`` float32, how many pixels a photo's pixel counts as in a fit; None: one everywhere.
-        filled: ``[n]`` bool, Gaussians that the file lacks and that fill holes; None: none.
-        region: Part of the space outside of which there is nothing, as after a crop; None: everywhere.
+        masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. It is False everywhere in a view without a
+            photo.
+        importance: ``[v,h,w]`` float32, weight of each pixel in a fit, as a number of pixels; None: one everywhere.
+        filled: ``[n]`` bool, Gaussians that are not in the file and fill holes; None: none.
+        region: Region outside of which the scene has nothing, as after a crop; None: everywhere.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -358,8 +359,13 @@ class Scene:
         own = ", of pixels" if self.has_own_pixels else ""
         return f"Scene({len(self.gaussians):,} Gaussians, {views}{images}{own})"
 
+    @staticmethod
+    def of(gaussians: Gaussians, cameras: Cameras) -> Scene:
+        """Make a scene of Gaussians and cameras alone; views are named by their numbers."""
+        return Scene(gaussians, cameras, None, None, tuple(f"view {view}" for view in range(len(cameras))))
+
     def numpy(self) -> Scene:
-        """Return the same scene with NumPy arrays in place of tensors, images in [0, 1]; ValueError for others."""
+        """Return the same scene with NumPy arrays and images in [0, 1]; ValueError for images of another range."""
         names = [name for name in PER_PIXEL if getattr(self, name) is not None]
         arrays: dict[str, Any] = {name: as_array(getattr(self, name)) for name in names}
         if self.images is not None:
@@ -368,17 +374,20 @@ class Scene:
 
     @property
     def has_own_pixels(self) -> bool:
-        """Whether it is known that each view has Gaussians of its own, with the colours of its photo."""
+        """Whether each view is known to have Gaussians of its own, with the colours of its photo."""
         return self.pixels is not None and self.pixels.own
 
     def get_pixels(self) -> Pixels:
-        """Return the pixels of a scene that has them, as every prepared one does; AssertionError for others."""
+        """Return the pixels of a scene; AssertionError if they are not known. Every prepared scene has them."""
         assert self.pixels is not None, "pixels are known"
         return self.pixels
 
     @property
     def covered(self) -> np.ndarray | None:
-        """Mask ``[v,h,w]`` of pixels with a Gaussian of their view's own and of the file; None where these are all."""
+        """Mask ``[v,h,w]`` of the pixels for which the file has a Gaussian of their view; None if that is all pixels.
+
+        It is also None if views have no Gaussians of their own.
+        """
         if self.pixels is None or not self.pixels.own or (self.filled is None and self.pixels.shown.all()):
             return None
         shown = self.pixels.shown
@@ -386,19 +395,19 @@ class Scene:
 
     @property
     def is_shown(self) -> bool:
-        """Whether photos, or the colours of Gaussians of the views' own, show what the views see."""
+        """Whether there are pictures of the views: photos, or the colours of the views' own Gaussians."""
         return self.has_own_pixels or self.images is not None
 
     @property
     def photo_views(self) -> list[int]:
-        """Views that have a photo which counts somewhere; none without photos."""
+        """Views with a photo that counts in some pixel; empty without photos."""
         if self.images is None or self.masks is None:
             return [] if self.images is None else list(range(len(self)))
         return [view for view, mask in enumerate(self.masks) if mask.any()]
 
     @property
     def protected(self) -> np.ndarray | None:
-        """Mask ``[v,h,w]`` of the pixels that count as at least half as many as protected ones; None if none do."""
+        """Mask ``[v,h,w]`` of the pixels with at least half the importance of a protected one; None if none has."""
         if self.images is None or self.importance is None:
             return None
         mask = self.importance >= PROTECTED / 2
@@ -426,7 +435,7 @@ def make_scene(gaussians: Gaussians, cameras: Cameras) -> Scene:
 
 
 def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:
-    """Add Gaussians to a scene, each in front of one of the pixels ``places [n]``, over all views, that show none."""
+    """Add Gaussians to a scene, one in each of the pixels ``places [n]``, numbered over all views, that show none."""
     first, before = len(scene.gaussians), scene.get_pixels()
     homes, fronts = before.homes, before.fronts.copy()
     fronts.reshape(-1)[places] = np.arange(first, first + len(added), dtype=np.int32)
@@ -438,10 +447,10 @@ def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:
 
 @dataclass(frozen=True)
 class PicturedScene(Scene):
-    """A scene that has a picture of every view: its photo, or what stands in for it.
+    """A scene with a picture of every view: its photo, or a picture that is used instead.
 
-    Pictures are black, and do not count for scores, where ``empty [v,h,w]``, a mask or shares: nothing may be there;
-    None: nowhere.
+    ``empty [v,h,w]`` marks pixels, by a mask or by shares, in which the scene may show nothing; pictures are black
+    there, and do not count for scores. None: no pixel.
     """
 
     images: np.ndarray
@@ -449,7 +458,7 @@ class PicturedScene(Scene):
 
     @staticmethod
     def with_pictures(scene: Scene, images: np.ndarray, masks: np.ndarray | None) -> PicturedScene:
-        """Return a scene with pictures ``[v,h,w,3]``, sRGB in [0, 1], and the masks of the pixels that count."""
+        """Return a scene with pictures ``[v,h,w,3]``, sRGB in [0, 1], and masks of the pixels that count."""
         columns = {field.name: getattr(scene, field.name) for field in fields(Scene)}
         return PicturedScene(**columns | {"images": images, "masks": masks})
 
@@ -477,8 +486,8 @@ class Segmentation:
     """Superpixels of a scene and the number of Gaussians to make of them."""
 
     groups: Groups  # Superpixels of every view
-    count: int  # Gaussians in the end; never more
-    exact: bool  # Whether that number was asked for as such, and is to be met
+    count: int  # Largest number of Gaussians in the result
+    exact: bool  # Exactly that number was asked for
 
 
 @dataclass(frozen=True)
@@ -491,12 +500,12 @@ class Matches:
 
 @dataclass(frozen=True)
 class FeatureGaussians:
-    """g Gaussians that each stand for a group of members, with facts about the group for later stages.
+    """g Gaussians that each represent a group of members, with facts about the group for later stages.
 
-    Everything that describes the group adds up over its members (weights, masses, extinctions) or
-    is an average with the weights, so merging Feature Gaussians is pooling again. Opacity is
-    derived when decoding: ``1 - exp(-gain * extinction / disc area)`` (integrated optical depth is
-    what blending conserves). In training, columns that networks change are tensors.
+    Columns that describe a group are sums over its members (weights, masses, extinctions), or means with these weights,
+    so merging Feature Gaussians is pooling again. The opacity is computed when they are decoded, as
+    ``1 - exp(-gain * extinction / disc area)``, because blending conserves the integrated optical depth. In training,
+    columns that networks change are tensors.
     """
 
     means: Array  # [g,3] float32
@@ -504,14 +513,14 @@ class FeatureGaussians:
     weights: np.ndarray  # [g] sum of the members' opacities
     masses: Array  # [g] opacity-weighted volume (paper eq. mass)
     extinctions: Array  # [g] optical depth integrated over the members' discs, world units squared
-    gains: np.ndarray  # [g] factor on the optical depth: 1, or what the other views' photos say
+    gains: np.ndarray  # [g] factor on the optical depth; less than 1 for groups that other views see through
     sh0: Array  # [g,1,3] base colour
     shN: np.ndarray  # [g,k-1,3]
     footprints: np.ndarray  # [g] size of one pixel at the group's depth, world units
-    views: np.ndarray  # [g] int64, the view of the group, -1 when it was merged from several
-    starts: np.ndarray  # [g+1] int64 into `members`
-    members: np.ndarray  # [m] int32 rows of the scene's Gaussians, group by group: as many as they are, in every copy
-    latents: Array  # [g,d] what the networks remember (paper section 4.2), a tensor in training; without them: d = 0
+    views: np.ndarray  # [g] int64, view of the group; -1 if it was merged from several views
+    starts: np.ndarray  # [g+1] int64, first member of each group in `members`
+    members: np.ndarray  # [m] int32, rows of the scene's Gaussians, group by group
+    latents: Array  # [g,d] latents of the networks (paper section 4.2), a tensor in training; d = 0 without networks
 
     def __post_init__(self) -> None:
         g = self.means.shape[0]
@@ -540,6 +549,6 @@ class Decoded:
 
     gaussians: Gaussians  # Canonical Gaussians
     count: int  # Number to which the fit may grow
-    exact: bool  # Whether that number is to be met
-    fixed: np.ndarray | None = None  # [n] bool, Gaussians that the fit leaves as they are; None: none
-    is_input: bool = False  # Whether these are all Gaussians of the scene, unchanged
+    exact: bool  # The result has to have exactly that number
+    fixed: np.ndarray | None = None  # [n] bool, Gaussians that the fit does not change; None: none
+    is_input: bool = False  # These are all Gaussians of the scene, unchanged

@@ -73,8 +73,8 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         if cameras is None and chosen.cameras == "needed":
             about = chosen.about.partition(":")[0]
             problem = f"expected a result's cameras inside or beside it for {about}, found none"
-            nearby = find_scene_files(options.inputs[0]).cameras if options.cameras != NONE else None
-            raise SceneError(options.inputs[0], problem, f"name them with --cameras {nearby or 'FILE'}")
+            camera_file = find_scene_files(options.inputs[0]).cameras if options.cameras != NONE else None
+            raise SceneError(options.inputs[0], problem, f"name them with --cameras {camera_file or 'FILE'}")
         count = len(gaussians)
         rows, left_out = _clean(gaussians, options, stored)
         gaussians = gaussians[rows]

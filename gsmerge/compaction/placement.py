@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
+from gsmerge.geometry import IDENTITY, Similarity, euler_to_rotmat, normalize
 from gsmerge.kernels.matrices import matmul
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.types import Cameras, Gaussians
@@ -33,7 +33,7 @@ def find_placement(options: PlacementOptions, cameras: Cameras | None, marked: s
         upward = _axis(marked or "-y") if cameras is None else -cameras.viewmats[:, 1, :3].sum(0)
         rotation = rotation_between(normalize(upward), _axis(options.up))
     if options.rotate is not None:
-        rotation = matmul(turn_by(np.array(parse_triple("rotate", options.rotate))), rotation)
+        rotation = matmul(euler_to_rotmat(np.array(parse_triple("rotate", options.rotate))), rotation)
     scale = 1.0 if options.scale is None else float(options.scale)
     return Similarity(rotation, scale, np.array(parse_triple("translate", options.translate)))
 

@@ -1,8 +1,8 @@
-"""Scene -> the same with photos that look as its Gaussians, without those that do not show it.
+"""Scene -> the scene with photos that look like its Gaussians, without photos that do not show it.
 
-Photos with red and blue in the wrong order and of another tone (linear light, exposure, gamma: a curve for each
-channel) are mended; those that do not show their views are left out. Where a photo then still differs from what the
-Gaussians of its own pixels show, whatever their depths are, their colours count: something covers the scene there.
+Photos with red and blue in the wrong order, or with another tone (linear light, exposure, gamma: a curve for each
+channel), are corrected. Photos that do not show their views are left out. If a pixel of a photo still differs from the
+Gaussians of this pixel, at any depth, something covers the scene there, and the Gaussians' colours are used instead.
 """
 
 from __future__ import annotations
@@ -42,63 +42,63 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
 from gsmerge.types import PicturedScene
 
-# Differences of single pixels are averaged over 5, with their signs. A blur of 1.5 pixels, as models have, then makes
+# Signed differences of single pixels are averaged over 5 x 5 pixels. Then a blur of 1.5 pixels, as by models, makes
 # 0.5 % of the pixels differ by a step.
 WINDOW = np.full(5, 1 / 5, np.float32)
-TONE_SAMPLE = 1 << 16  # pixels and Gaussians whose colours are compared, about
+TONE_SAMPLE = 1 << 16  # about so many pixels and Gaussians are compared by their colours
 FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
-STRAY_PHOTOS = "photos do not show what the Gaussians show"  # in the note on photos that are not used
+STRAY_PHOTOS = "photos do not show what the Gaussians show"  # part of the note on photos that are not used
 
 
 def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedScene, tuple[int, ...]]:
-    """Mend the photos of a canonical scene, and replace what does not show it.
+    """Correct the photos of a canonical scene, and replace photos, or parts of them, that do not show it.
 
-    Returns the scene and the views whose photos show it; there are none if most photos do not, or have another look.
-    With ``look`` "photos" all count as they are, with "scene" none. The record gets notes and the choices
-    ``photos_changed`` and ``photos_left_out``.
+    Returns the scene and the views whose photos show it. There are none if most photos do not show it, or if they have
+    another look. With ``look`` "photos" all photos count unchanged, with "scene" none counts. The record gets notes and
+    the choices ``photos_changed`` and ``photos_left_out``.
     """
     given = scene.photo_views
     if look != "auto" or not given:
         return scene, tuple(given) if look != "scene" else ()
     pairs = pair_photos(scene, scene.images)
-    order = find_orders(pairs, given)
-    pairs = pairs.with_photos(np.where(order[:, None, None, None], pairs.photos[..., ::-1], pairs.photos))
-    images = [photo[..., ::-1] if wrong else photo for photo, wrong in zip(scene.images, order, strict=True)]
-    right = find_matching_views(scene, given, images, pairs.shown)
-    if _has_other_look(scene, pairs, right or given, images):
-        problem = "the scene has another look than its photos: its own colours are kept"
-        note(f"{problem}; --set look=photos gives it that of the photos")
+    is_bgr = find_orders(pairs, given)
+    pairs = pairs.with_photos(np.where(is_bgr[:, None, None, None], pairs.photos[..., ::-1], pairs.photos))
+    images = [photo[..., ::-1] if swapped else photo for photo, swapped in zip(scene.images, is_bgr, strict=True)]
+    matching = find_matching_views(scene, given, images, pairs.shown)
+    if _has_other_look(scene, pairs, matching or given, images):
+        problem = "the scene has another look than its photos, so it keeps its own colours"
+        note(f"{problem}; --set look=photos gives it the look of the photos")
         return scene, ()
-    odd = [view for view in given if view not in right]
-    if odd and not _leave_out(scene, odd, given):
+    stray = [view for view in given if view not in matching]
+    if stray and not _leave_out(scene, stray, given):
         return scene, ()
-    _note_orders(scene, order, right)
-    tones = find_tones(pairs, right)
-    if pairs.shown.drawn and not have_other_tones(scene, images, right):
+    _note_orders(scene, is_bgr, matching)
+    tones = find_tones(pairs, matching)
+    if pairs.shown.drawn and not have_other_tones(scene, images, matching):
         tones = [None] * len(pairs)
-    changes = [PhotoChange(bool(wrong), curve) for wrong, curve in zip(order, tones, strict=True)]
-    _note_tones(scene, changes, right)
+    changes = [PhotoChange(bool(swapped), curve) for swapped, curve in zip(is_bgr, tones, strict=True)]
+    _note_tones(scene, changes, matching)
     hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
     if scene.has_own_pixels:
         hidden, pictures = _find_hidden(scene, changes)
-        _note_hidden(scene, hidden, right)
-    changed = [view for view in right if hidden[view].any() or changes[view]]
+        _note_hidden(scene, hidden, matching)
+    changed = [view for view in matching if hidden[view].any() or changes[view]]
     if changed:
         choose(photos_changed=[scene.names[view] for view in changed])
-    return _replace_others(scene, changes, hidden, pictures, right), tuple(right)
+    return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching)
 
 
 def find_orders(pairs: Pairs, views: Sequence[int]) -> np.ndarray:
-    """Find in which photos ``[v]`` of some views red and blue change places, whatever their tones are.
+    """Find the photos ``[v]`` bool of some views in which red and blue are exchanged, whatever their tones are.
 
-    Colours as they are and after tone curves have a say each: a change of tone hides in the ones, and curves of covered
-    photos fit either order.
+    The evidence comes from colours as they are and from colours after tone curves. The first may be misled by a change
+    of tone; the second says little about covered photos, to which curves fit in either order.
     """
-    swapped, wrong = pairs.with_photos(np.ascontiguousarray(pairs.photos[..., ::-1])), np.zeros(len(pairs), bool)
+    swapped, is_bgr = pairs.with_photos(np.ascontiguousarray(pairs.photos[..., ::-1])), np.zeros(len(pairs), bool)
     changes = [(cut_blocks(pairs), cut_blocks(swapped))]
-    some = [[view] for view in views if is_visible(changes[0][0].errors([view]))]
-    if some:  # else their order is right
-        changes += [(tone_blocks(pairs, some), tone_blocks(swapped, some))]
+    differing = [[view] for view in views if is_visible(changes[0][0].errors([view]))]
+    if differing:  # otherwise the order is right
+        changes += [(tone_blocks(pairs, differing), tone_blocks(swapped, differing))]
 
     def score(ids: Sequence[int]) -> float:
         scores = [signed_ranks(before.errors(ids) - after.errors(ids)) for before, after in changes]
@@ -106,37 +106,37 @@ def find_orders(pairs: Pairs, views: Sequence[int]) -> np.ndarray:
 
     scores = {view: score([view]) for view in views}
     if max(score(views), *scores.values()) > MARGIN:
-        wrong[[view for view in views if scores[view] > 0]] = True
-    return wrong
+        is_bgr[[view for view in views if scores[view] > 0]] = True
+    return is_bgr
 
 
 def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
     """Find the tone curves ``[3,256]`` from photos to their Gaussians; None for a photo whose tone is right.
 
-    Drawings have one curve for all photos. Where none is changed by a step, no curve counts, since models have a tone
-    of their own; nor does one with which Gaussians do not become more like their photos in turn: noise flattens what
-    they show, and is no tone.
+    Drawings have one curve for all photos. If no photo changes by a step, no curve counts, because models have a tone
+    of their own. A curve also has to work in the other direction, from Gaussians to photos; otherwise the cause is
+    noise, which flattens the colours of the Gaussians.
     """
-    curves, clear = list[np.ndarray | None]([None] * len(pairs)), False
+    curves, is_clear = list[np.ndarray | None]([None] * len(pairs)), False
     stored, groups = cut_blocks(pairs), _group(pairs, views)
     groups = [group for group in groups if is_visible(stored.errors(group))]
     toned, back = tone_blocks(pairs, groups), tone_blocks(pairs.exchange(), groups)
     for group in groups:
         before = stored.errors(group)
         if explains(before, toned.errors(group)) and stands_out(before - back.errors(group)):
-            clear |= bool(np.nanmedian(stored.distances(toned.photos, group)) > STEP)
+            is_clear |= bool(np.nanmedian(stored.distances(toned.photos, group)) > STEP)
             colors, targets = (each[group].reshape(-1, 3) for each in (pairs.photos, pairs.shown.pictures))
             curve = fit_tones(colors, targets, pairs.shown.weights[group].reshape(-1))
             for view in group:
                 curves[view] = curve
-    return curves if clear else [None] * len(pairs)
+    return curves if is_clear else [None] * len(pairs)
 
 
 def have_other_tones(scene: PicturedScene, photos: Sequence[np.ndarray], views: Sequence[int]) -> bool:
-    """Return whether the colours of Gaussians, seen from nowhere, have another tone than the ``photos`` of some views.
+    """Return whether the base colours of all Gaussians have another tone than the ``photos`` of some views.
 
-    Each has a colour of some photo, whatever hides it in drawings. So the tone of a drawing alone is that of what
-    stands in front where depth is wrong.
+    If depth is wrong, the tone of a drawing may be that of the Gaussians in front. The base colours come from the
+    photos, whatever hides a Gaussian in drawings, so they show whether the tone really differs.
     """
     solid = np.flatnonzero(scene.gaussians.opacities > FAINT)
     step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
@@ -151,17 +151,17 @@ def have_other_tones(scene: PicturedScene, photos: Sequence[np.ndarray], views: 
 
 
 def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
-    """Group views whose photos have one tone: all those of drawings, which show it less exactly."""
+    """Group views that share a tone curve: all views if their pictures are drawings, which show tones less exactly."""
     return [list(views)] if pairs.shown.drawn else [[view] for view in views]
 
 
 def find_matching_views(
     scene: PicturedScene, views: Sequence[int], photos: Sequence[np.ndarray], shown: ViewPictures
 ) -> list[int]:
-    """Find which of some views their ``photos [h,w,3]`` show; see :mod:`gsmerge.evidence.assign`.
+    """Find the views whose ``photos [h,w,3]`` show them; see :mod:`gsmerge.evidence.assign`.
 
-    None where all together are no more alike than wrong pairs. Layers of one camera have one photo. ``shown``:
-    small pictures of what the Gaussians show in all views; drawings serve again.
+    There are none if all photos together fit no better than wrong pairs. Layers of one camera share one photo.
+    ``shown``: small pictures of what the Gaussians show in all views; drawings are used again.
     """
     kinds = camera_kinds(scene.cameras)
     ids = sorted({kinds[view]: view for view in reversed(views)}.values())
@@ -178,16 +178,16 @@ def find_matching_views(
     if not (assigner.match_together(chosen) or on_rays.any()):
         return []
     sure |= on_rays
-    decided = zip(ids, sure, assigner.has_contrast, strict=True)  # but for views that show nothing to go by
-    right = {kinds[view] for view, stands, judged in decided if stands or not judged}
-    return [view for view in views if kinds[view] in right]
+    decided = zip(ids, sure, assigner.has_contrast, strict=True)
+    matching = {kinds[view] for view, is_sure, has_contrast in decided if is_sure or not has_contrast}
+    return [view for view in views if kinds[view] in matching]
 
 
 def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int], photos: Sequence[np.ndarray]) -> bool:
-    """Return whether a linear map of colours explains the Gaussians by their photos, or these by them: tones do not.
+    """Return whether a linear map of colours, but no tone curve, takes photos to their Gaussians, or the other way.
 
-    Grey photos show no colours, but follow from them. Photos of another scene are explained no better than by one
-    colour, or do not show their views even so.
+    The other way finds grey photos, which follow from coloured Gaussians. Photos of another scene are excluded: one
+    colour explains them as well as a map, or they do not show their views even after the map.
     """
     part = pairs[views]
     if _is_mapped(part):
@@ -205,32 +205,33 @@ def _is_mapped(pairs: Pairs) -> bool:
     if not is_visible(stored.errors()):
         return False
     toned, mapped = tone_blocks(pairs, _group(pairs, range(len(pairs)))), map_blocks(stored)
-    others = toned, plain_blocks(stored)
-    return is_visible(toned.errors()) and all(explains(other.errors(), mapped.errors()) for other in others)
+    simpler = toned, plain_blocks(stored)
+    return is_visible(toned.errors()) and all(explains(each.errors(), mapped.errors()) for each in simpler)
 
 
-def _leave_out(scene: PicturedScene, odd: Sequence[int], given: Sequence[int]) -> bool:
-    """Note which of the given photos do not show the scene; return whether the others are used."""
-    names = [scene.names[view] for view in odd]
+def _leave_out(scene: PicturedScene, stray: Sequence[int], given: Sequence[int]) -> bool:
+    """Note which of the given photos do not show the scene; return whether the other photos are used."""
+    names = [scene.names[view] for view in stray]
     choose(photos_left_out=names)
-    few, which = 2 * len(odd) <= len(given), list_some(names)
-    result = f" and are not used: {which}" if few else f", so none is used: {which}; check their names and order"
-    note(f"{len(odd)} of {len(given)} {STRAY_PHOTOS}{result}")
-    return few
+    are_few, listed = 2 * len(stray) <= len(given), list_some(names)
+    result = f" and are not used: {listed}"
+    if not are_few:
+        result = f", so no photo is used: {listed}; check their names and order"
+    note(f"{len(stray)} of {len(given)} {STRAY_PHOTOS}{result}")
+    return are_few
 
 
-def _note_orders(scene: PicturedScene, wrong: np.ndarray, views: Sequence[int]) -> None:
-    """Note in which of some photos red and blue change places."""
-    names = [scene.names[view] for view in views if wrong[view]]
+def _note_orders(scene: PicturedScene, is_bgr: np.ndarray, views: Sequence[int]) -> None:
+    """Note in which of some photos red and blue are exchanged."""
+    names = [scene.names[view] for view in views if is_bgr[view]]
     if len(names) == len(views):
-        note("red and blue are in the wrong order in the photos (BGR): they change places")
+        note("red and blue are in the wrong order in the photos (BGR) and are exchanged")
     elif names:
-        some = f"{len(names)} of {len(views)} photos: they change places: {list_some(names)}"
-        note(f"red and blue are in another order in {some}")
+        note(f"red and blue are in the wrong order in {len(names)} of {len(views)} photos: {list_some(names)}")
 
 
 def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Sequence[int]) -> None:
-    """Note by how much the tones of photos change."""
+    """Note by which factors the tones of photos change."""
     toned = {view: changes[view].tones for view in views if changes[view].tones is not None}
     if not toned:
         return
@@ -239,40 +240,40 @@ def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Seq
     factor = f"{least:.2f}" if most - least < 0.01 else f"{least:.2f} to {most:.2f}"
     note(
         f"{len(toned)} of {len(views)} photos have another tone than their Gaussians (exposure, gamma or linear"
-        f" light): compensated, middle grey times {factor}: {list_some([scene.names[view] for view in toned])}"
+        f" light), which is corrected; middle grey times {factor}: {list_some([scene.names[view] for view in toned])}"
     )
 
 
 def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int]) -> None:
-    """Note in which of some photos something covers the scene, ``hidden [v,h,w]``."""
+    """Note in which of some photos something covers the scene, at the pixels ``hidden [v,h,w]``."""
     with_hidden = [view for view in views if hidden[view].any()]
     if not with_hidden:
         return
     most = 100 * max(float(hidden[view].mean()) for view in with_hidden)
     note(
-        f"{len(with_hidden)} of {len(views)} photos show in part what their Gaussians do not (up to {most:.0f} % of a"
-        " photo: a mask, a mark, a finger, another look or camera?): the Gaussians' colours take its place,"
+        f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians (up to {most:.0f} % of a photo;"
+        " perhaps a mask, a mark, a finger, another look or camera): the Gaussians' colours are used there, with"
         f" --set look=scene everywhere: {list_some([scene.names[view] for view in with_hidden])}"
     )
 
 
 def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[np.ndarray, np.ndarray]:
-    """Find the pixels ``[v,h,w]`` where changed photos differ from their own rows, and what these show ``[v,h,w,3]``.
+    """Find the pixels ``[v,h,w]`` at which changed photos differ from their rows; also return the rows' pictures.
 
-    Pixels without a row are as the nearest with one. Only where the rows' base colours differ are each view's own
-    Gaussians drawn from its camera, which takes longer; a photo that looks as the drawing does not differ.
+    A pixel without a row takes the result of the nearest pixel with one. If the rows' base colours differ, each view's
+    own Gaussians are drawn from its camera, which takes longer; a photo that looks like the drawing does not differ.
     """
 
     def differ(view: int, picture: np.ndarray, known: np.ndarray) -> np.ndarray:
         weights = known.astype(np.float32)
-        away = (changes[view](scene.images[view]) - picture) * weights[..., None]
-        red, green, blue = np.moveaxis(np.abs(convolve(away, WINDOW, WINDOW)), -1, 0)
-        far = known & ((red + green + blue) / 3 > STEP * convolve(weights, WINDOW, WINDOW))
-        return fill_gaps(far[..., None], known)[..., 0]
+        difference = (changes[view](scene.images[view]) - picture) * weights[..., None]
+        red, green, blue = np.moveaxis(np.abs(convolve(difference, WINDOW, WINDOW)), -1, 0)
+        differs = known & ((red + green + blue) / 3 > STEP * convolve(weights, WINDOW, WINDOW))
+        return fill_gaps(differs[..., None], known)[..., 0]
 
     def differ_drawn(views: np.ndarray, rows: RowPicture) -> None:
         for view in views:
-            known = shown[view] & inside[view] & rows.known  # what spills over from beside says nothing
+            known = shown[view] & inside[view] & rows.known  # not where only neighbours' Gaussians reach into a pixel
             pictures[view] = rows.picture
             hidden[view] = differ(view, rows.picture, known) & differ(view, rows.drawing, known)
 
@@ -285,22 +286,23 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     return hidden, pictures
 
 
-def _replace_others(
+def _change_photos(
     scene: PicturedScene,
     changes: Sequence[PhotoChange],
     hidden: np.ndarray,
     pictures: np.ndarray | None,
     views: Sequence[int],
 ) -> PicturedScene:
-    """Change photos at both sizes; where ``hidden [v,h,w]`` and but in ``views`` they become what Gaussians show.
+    """Change photos at both sizes; use the Gaussians' colours at ``hidden [v,h,w]`` pixels, and in all other views.
 
-    That is ``pictures [v,h,w,3]``; None: drawings. What stands in for photos that do not exist counts.
+    ``views`` are those whose photos show the scene. The Gaussians' colours are ``pictures [v,h,w,3]``; None: drawings.
+    In views without a photo these colours count as a photo.
     """
-    others = sorted({*range(len(scene))} - {*views})
-    hidden[others] = True
+    other_views = sorted({*range(len(scene))} - {*views})
+    hidden[other_views] = True
     if scene.masks is not None:
         hidden |= ~scene.masks
-        absent = sorted({*others} - {*scene.photo_views})
+        absent = sorted({*other_views} - {*scene.photo_views})
         if absent:
             masks = scene.masks.copy()
             masks[absent] = True
@@ -310,12 +312,11 @@ def _replace_others(
         return scene
     changes = list(changes)
     if len(with_hidden):
-        drawn = (
-            render(scene.gaussians, scene.cameras[with_hidden]).images.clip(0, 1)
-            if pictures is None
-            else pictures[with_hidden]
-        )
-        for view, colors in zip(with_hidden, drawn, strict=True):
+        if pictures is None:
+            covers = render(scene.gaussians, scene.cameras[with_hidden]).images.clip(0, 1)
+        else:
+            covers = pictures[with_hidden]
+        for view, colors in zip(with_hidden, covers, strict=True):
             changes[view] = replace(changes[view], cover=hidden[view], colors=colors)
     images = np.stack([change(photo) for change, photo in zip(changes, scene.images, strict=True)])
     large = None if scene.large_photos is None else change_large(scene.large_photos, changes)

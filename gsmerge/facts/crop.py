@@ -1,4 +1,4 @@
-"""Scene -> the scene inside a crop: its Gaussians, and the pixels of photos that mostly show them."""
+"""Scene -> the scene inside a crop: the Gaussians inside, and masks of the pixels that mostly show them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.holes import usual_opacity
 from gsmerge.facts.views import take_rows
 from gsmerge.frame import canonicalise
-from gsmerge.geometry import lies_inside, rgb_to_sh0, turn_by
-from gsmerge.raster import render_in_batches
+from gsmerge.geometry import euler_to_rotmat, lies_inside, rgb_to_sh0
+from gsmerge.raster import render_in_turn
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import parse_crop
 from gsmerge.types import Region, Scene
 
-MOSTLY = 0.5  # of what a pixel shows, from which on it shows the inside more than the outside
+MOSTLY = 0.5  # share of a pixel's opacity above which it shows mostly the inside
 
 
 def find_region(crop: str) -> Region:
@@ -26,8 +26,9 @@ def find_region(crop: str) -> Region:
     numbers = np.array(parsed)
     if shape == "sphere":
         return Region(numbers[:3], np.full(3, numbers[3]), np.eye(3), is_sphere=True)
-    low, high, turn = numbers[:3], numbers[3:6], np.pad(numbers[6:], (0, 9 - len(numbers)))
-    return Region((low + high) / 2, (high - low) / 2, turn_by(turn).T if turn.any() else np.eye(3), is_sphere=False)
+    low, high, degrees = numbers[:3], numbers[3:6], np.pad(numbers[6:], (0, 9 - len(numbers)))
+    rotation = euler_to_rotmat(degrees).T if degrees.any() else np.eye(3)
+    return Region((low + high) / 2, (high - low) / 2, rotation, is_sphere=False)
 
 
 def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
@@ -36,21 +37,21 @@ def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
 
 
 def crop_scene(scene: Scene, crop: str) -> Scene:
-    """Return a scene of the Gaussians inside a crop, whose photos count where they mostly show these.
+    """Return the scene of the Gaussians inside a crop; its photos count only at pixels that mostly show these.
 
-    Counts, fit and scores are then those of what is left. UsageError if that is nothing.
+    Counts, fit and scores are then those of the crop. Raises UsageError if no Gaussian is inside.
     """
     means, region = scene.gaussians.means, find_region(crop)
     inside = lies_inside(region, means)
     count = int(inside.sum())
     if count == 0:
-        remedy = "gsmerge inspect says where the scene is"
+        remedy = "gsmerge inspect shows the extent of the scene"
         raise UsageError(f"crop: expected Gaussians of the scene in {crop}, found none; {remedy}")
     reach = float(np.abs(region.middle).max() + region.half.max())
     scene = replace(scene, region=replace(region, rounding=float(np.finfo(means.dtype).eps) * reach))
     if count == scene.num_gaussians:
         return scene
-    note(f"crop: {count:,} of {scene.num_gaussians:,} Gaussians are inside; counts, fit and scores are of these")
+    note(f"crop: {count:,} of {scene.num_gaussians:,} Gaussians are inside; counts, fit and scores refer to these")
     masks = scene.masks
     if scene.images is not None:
         shown = show_rows(scene, inside)
@@ -59,21 +60,15 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
 
 
 def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:
-    """Return a mask ``[v,h,w]`` of the pixels that show Gaussians of the mask ``rows [n]`` more than all else."""
+    """Return a mask ``[v,h,w]`` of the pixels that mostly show Gaussians of the mask ``rows [n]``."""
     canonical, _ = canonicalise(scene)
-    colors = np.ones((len(rows), 1, 3), np.float32)  # what is inside; all
+    colors = np.ones((len(rows), 1, 3), np.float32)  # red for Gaussians of the mask, green for all
     colors[~rows, :, 0] = 0
     gaussians = replace(canonical.gaussians, sh0=rgb_to_sh0(colors), shN=np.zeros((len(rows), 0, 3), np.float32))
+
+    def shows_rows(image: np.ndarray) -> np.ndarray:
+        of_mask, of_all = image[..., 0], image[..., 1]
+        return np.asarray(of_mask > MOSTLY * np.maximum(of_all, usual_opacity(of_all)))
+
     with use_threads() as threads:
-        return np.stack(
-            list(
-                render_in_batches(
-                    gaussians,
-                    canonical.cameras,
-                    at_once=threads,
-                    convert=lambda image: (
-                        image[..., 0] > MOSTLY * np.maximum(image[..., 1], usual_opacity(image[..., 1]))
-                    ),
-                )
-            )
-        )
+        return np.stack(list(render_in_turn(gaussians, canonical.cameras, at_once=threads, convert=shows_rows)))

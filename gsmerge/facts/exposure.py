@@ -1,16 +1,15 @@
-"""Scene -> the same in one exposure, where its photos and their Gaussians differ in it at random.
+"""Scene -> the scene in one exposure, if the exposures of its photos and Gaussians differ at random.
 
-Cameras that choose exposure and white balance for each photo, and models that copy them into their
-Gaussians, show one surface in several tones. Pixels of a view are looked up in the others, where
-these have Gaussians at the same depth; the median ratio of each channel is the pair's, and the
-gains of the views follow from all pairs by least squares, with a geometric mean of one.
+Cameras choose exposure and white balance for each photo, and models copy them into their Gaussians, so one surface has
+several tones. Pixels of a view are looked up in other views that have Gaussians at the same depth. The median ratio of
+each channel is the ratio of the pair of views. The gains of all views follow from all pairs by least squares, with a
+geometric mean of one.
 
-Gains are taken out where that brings the colours of the same surfaces clearly nearer, and where a new
-view tells nothing of its own gain, so that the mean of all is the best guess. It tells something in two
-cases, and photos stay as they are. A camera that meters light makes bright places darker, and does so in
-a new photo too: then photos of larger gains are not brighter. And exposure may drift along a video: then
-neighbours have nearly the same gain. A mean would be farther from new photos, in a video of a kitchen by
-1.5 dB.
+Gains are removed if that brings the colours of the same surfaces clearly nearer, and if nothing predicts the gain of a
+new view, so that the mean of all is the best guess. Photos stay unchanged in two cases in which it can be predicted. A
+camera that meters light makes bright places darker, in new photos, too; then photos of larger gains are not brighter.
+And exposure may drift along a video; then neighbours have nearly the same gain. In both cases the mean would be farther
+from new photos, by 1.5 dB in a video of a kitchen.
 """
 
 from __future__ import annotations
@@ -32,25 +31,26 @@ from gsmerge.settings.stages import Exposure
 from gsmerge.types import Cameras, PicturedScene, Scene
 
 SAMPLE_PIXELS = 2000  # pixels of a view that are looked up in the others
-SAME_DEPTH = 0.05  # logarithm of depths that are of one surface
+SAME_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LOW, HIGH = 0.05, 0.95  # colours in between are neither noise nor clipped
-MIN_PAIRS = 60  # pixels that two views must share; so many of each pair are compared again
-# When gains are taken out, on the plain exports of 15 captures. Root mean square of the logarithmic gains: above it in
-# nine of ten draws of random gains of 0.8 to 1.25 for five photos, and in six captures as they were taken.
+MIN_PAIRS = 60  # least number of pixels that two views share; so many of each pair are compared again
+# The following four bounds were chosen on the plain exports of 15 captures. Root mean square of the logarithmic gains:
+# above the bound in nine of ten draws of random gains of 0.8 to 1.25 for five photos, and in six unchanged captures
 DIFFERENT = 0.06
-# Differences between colours of the same surfaces, as a share of those before: 0.12 to 0.60 with random gains.
+# Differences between colours of the same surfaces after the correction, as a share of those before: 0.12 to 0.60 with
+# random gains
 NEARER = 0.75
-# How a photo's brightness grows with its gain, logarithms: by 0.61 to 1.11 with random gains of 0.5 to 2, by 0.41 at
-# most where a camera metered light and gains are 0.1 or more. Places that differ in brightness by more than the gains
-# bury that, so it counts only where both are opposed: there, their correlation is -0.67 to -0.99.
+# Slope of a photo's brightness over its gain, both as logarithms: 0.61 to 1.11 with random gains of 0.5 to 2, at most
+# 0.41 if a camera metered light and gains are 0.1 or more. If places differ in brightness by more than the gains, the
+# slope says little. So it counts only if gains and brightness are opposed, with a correlation of -0.67 to -0.99
 FOLLOWS, OPPOSED = 0.5, -0.6
-# Distance of a gain from the mean of its two nearest views', as a share of what random gains have: 0.71 to 1.22 with
-# gains of 0.5 to 2, 0.19 to 0.57 where exposure drifts and compensation loses 1.7 dB or more; 0.67 of four in a row.
+# Distance of a gain from the mean gain of its two nearest views, relative to that of random gains: 0.71 to 1.22 with
+# gains of 0.5 to 2; 0.19 to 0.57 if exposure drifts and compensation loses 1.7 dB or more; 0.67 for four views in a row
 UNEXPECTED = 0.69
-COARSE = 4  # pixels per side of those that one says the brightness of
+COARSE = 4  # every so many pixels per side are used to measure the brightness of a photo
 BRIGHT = 1.15  # gain from which on clipped pixels no longer count
 NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
-NEAREST, FARTHER = 6, 2  # views that one is compared with: of all others the nearest, and some at equal steps of rank
+NEAREST, FARTHER = 6, 2  # views that a view is compared with: the nearest ones, and some at equal steps of rank
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,13 @@ class _Pair:
 
     view: int
     other: int
-    ratios: np.ndarray  # [3] logarithm, their median
-    sample: np.ndarray  # [MIN_PAIRS,3] logarithms of single pixels
-    count: int
+    ratios: np.ndarray  # [3], median of the logarithms
+    sample: np.ndarray  # [MIN_PAIRS,3], logarithms of single pixels
+    count: int  # Number of pixels
 
 
 def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> PicturedScene:
-    """Divide each view's photo and its pixels' Gaussians by the exposure gain of the view, where needed.
+    """Divide each view's photo and its pixels' Gaussians by the exposure gain of the view, if that is needed.
 
     ``views`` are those whose photos show the scene; each has Gaussians of its own. Clipped pixels of brighter photos no
     longer count if another photo shows their surface unclipped. The record gets a note, and the choice ``exposure``:
@@ -87,23 +87,24 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
             return scene
         objection = _find_objection(scene, views, pairs, gains)
         if objection:
-            note(f"{differ} and stay as they are: {objection}; --set exposure=per-photo brings them to their mean")
+            remedy = "--set exposure=per-photo brings them to their mean"
+            note(f"{differ} and stay unchanged, because {objection}; {remedy}")
             return scene
     choose(exposure=factors.tolist())
-    note(f"{differ}: brought to their mean")
+    note(f"{differ} and are brought to their mean")
     return _divide(scene, factors)
 
 
 def _find_objection(scene: PicturedScene, views: Sequence[int], pairs: Sequence[_Pair], gains: np.ndarray) -> str:
-    """Return why photos should be left as they are, or an empty text."""
+    """Return why photos should stay unchanged, or an empty text."""
     view_gains, photos = gains[list(views)], [scene.images[view][::COARSE, ::COARSE] for view in views]
     brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
     if share_left(pairs, gains) > NEARER:
         return "other exposures do not bring the colours of the same surfaces clearly nearer"
     if is_metered(brightness, view_gains):
-        return "those of a longer exposure are not brighter, as where a camera chose it by what it saw"
+        return "photos of a longer exposure are not brighter, so the camera metered the light"
     if share_unexpected(view_gains, camera_distances(scene.cameras[list(views)])) < UNEXPECTED:
-        return "neighbouring ones have nearly the same exposure, so new views between them have it, too"
+        return "neighbouring photos have nearly the same exposure, so new views between them have it, too"
     return ""
 
 
@@ -121,7 +122,7 @@ def share_left(pairs: Sequence[_Pair], gains: np.ndarray) -> float:
 
 
 def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
-    """Return whether the gains come from metering, that is, offset the brightness of what each photo shows.
+    """Return whether the gains come from metering, that is, offset the brightness of the place that each photo shows.
 
     With fixed exposure, photos with larger gains are brighter; metering makes all photos equally bright.
     """
@@ -150,7 +151,7 @@ class _Pixels:
     valid: np.ndarray  # [v,h*w]
 
     def look_up(self, view: int, rows: np.ndarray, other: int) -> tuple[np.ndarray, np.ndarray]:
-        """Find which of the pixels ``rows`` of a view have the same surface in another view, and its pixels."""
+        """Find the pixels ``rows`` of a view whose surface another view shows; return their indices and its pixels."""
         poses = self.cameras.viewmats[other].astype(np.float64), self.cameras.Ks[other].astype(np.float64)
         return find_surfaces(
             self.means[view],
@@ -165,7 +166,7 @@ class _Pixels:
 
 
 def _pixels_of(scene: Scene) -> _Pixels:
-    """Collect the pixels of a scene and the Gaussians in front; those outside masks do not count."""
+    """Collect the pixels of a scene and the Gaussians in front; pixels outside masks do not count."""
     shape = len(scene), scene.pixels_per_view
     fronts = scene.get_pixels().fronts.reshape(shape)
     valid = fronts >= 0
@@ -197,9 +198,9 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
 
 
 def choose_partners(distances: np.ndarray) -> np.ndarray:
-    """Choose the views ``[v,p]``, rising, that each view is compared with: all others, or a selection of many.
+    """Choose the views ``[v,p]``, ascending, that each view is compared with: all others or, of many, a selection.
 
-    The nearest views share the most surfaces; views at equal steps of rank connect groups of cameras.
+    The nearest views share the most surfaces. Views at equal steps of rank connect groups of cameras.
     """
     order = order_others(distances)
     if order.shape[1] > NEAREST + FARTHER:
@@ -217,7 +218,7 @@ def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:
         ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, 1000))
         matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])
         right[ends] += weight * np.array([-pair.ratios, pair.ratios])
-    matrix[np.diag_indices(num_views)] += 1e-6  # of views without pairs
+    matrix[np.diag_indices(num_views)] += 1e-6  # views without pairs get a gain of one
     gains: np.ndarray = solve(matrix, right)
     return gains
 
@@ -225,25 +226,25 @@ def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:
 def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
     """Return a mask ``[v,h,w]`` of clipped pixels of brighter photos whose surface another photo shows unclipped.
 
-    Otherwise a surface that is clipped in all photos, such as a sky, would be masked in all of them.
+    A surface that is clipped in all photos, such as a sky, is not marked, because it would be masked in all of them.
     """
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT)).any(-1)
     pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
     order = order_others(camera_distances(scene.cameras))[:, :NEIGHBOURS]
 
     def confirm(view: int) -> np.ndarray:
-        left, shown = np.flatnonzero(flat[view] & pixels.valid[view]), np.zeros_like(flat[view])
+        rows, is_shown = np.flatnonzero(flat[view] & pixels.valid[view]), np.zeros_like(flat[view])
         for other in order[view]:
-            both, places = pixels.look_up(view, left, other)
-            shown[left[both[~flat[other, places]]]] = True
-            left = left[~shown[left]]
-        return shown
+            both, places = pixels.look_up(view, rows, other)
+            is_shown[rows[both[~flat[other, places]]]] = True
+            rows = rows[~is_shown[rows]]
+        return is_shown
 
     return np.stack(parallel_map(confirm, range(len(scene)))).reshape(clipped.shape)
 
 
 def _divide(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
-    """Divide photos and colours of Gaussians by the gains ``[v,3]``; clipped pixels are taken out of the masks."""
+    """Divide photos and colours of Gaussians by the gains ``[v,3]``; exclude clipped pixels from the masks."""
     factors = (1 / gains).astype(np.float32)
     levels = np.arange(256, dtype=np.float32) / np.float32(255)
     changes = [PhotoChange(tones=(factor[:, None] * levels).clip(0, 1)) for factor in factors]

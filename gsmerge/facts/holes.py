@@ -1,8 +1,8 @@
-"""Gaussians where views show none: exports have gaps.
+"""Fill the holes of an export: add Gaussians at pixels that no Gaussian covers.
 
-Exporters drop borders, far regions and faint rows, and voxels leave gaps. Each view is drawn from its own camera; a
-pixel that stays empty gets a Gaussian of its picture's colour. Its depth is that of the surface beside it or one beyond
-the view's farthest surface: the depth at which the pictures of the nearest other views agree best.
+Exporters drop borders, far regions and faint rows, and voxels have gaps. Each view is drawn from its own camera. A
+pixel that is empty then gets a Gaussian of its picture's colour. Its depth is that of the surface beside it, or a depth
+beyond the view's farthest surface: the one at which the pictures of the nearest other views agree best.
 """
 
 from __future__ import annotations
@@ -28,72 +28,82 @@ from gsmerge.types import Gaussians, PicturedScene, fill_pixels
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
-# share of the usual opacity of a view, which is low where rows are thin, below which a pixel shows nothing, and below
-# which there is nothing around it
+# Shares of the usual opacity of a view, which is low if the export has few rows. Below NOTHING a pixel shows nothing;
+# below SPARSE, on average around a pixel, there is nothing around it
 NOTHING, SPARSE = 0.5, 0.25
-LARGE, PART, RIM = 1 / 12, 0.12, 2  # of the longer side: squares in large parts that stay empty; their share
-# of the picture, at least; pixels beside them that do not
-GAP = 1 / 53  # of the longer side: beside large empty parts only narrower gaps in what is covered are filled
-MOST = 0.5  # share of empty pixels from which on the scene may be a part of what the photos show
-FACTORS = 2.0 ** np.linspace(0, 3, 13)  # of the depth of a view's farthest surface: depths that are tried
+# Parts that stay empty hold squares of this share of the picture's longer side, cover at least this share of the
+# picture, and are reduced by a rim of so many pixels
+LARGE, PART, RIM = 1 / 12, 0.12, 2
+GAP = 1 / 53  # beside large empty parts, only gaps narrower than this share of the longer side are filled
+MOST = 0.5  # share of empty pixels from which on the scene may be only a part of what the photos show
+FACTORS = 2.0 ** np.linspace(0, 3, 13)  # depths that are tried, relative to that of a view's farthest surface
 FARTHEST = 0.99  # quantile of the depths that counts as the farthest
-FARTHER = 0.001  # difference of colours, sRGB, that each next depth must gain
+FARTHER = 0.001  # least gain in the difference of colours (sRGB) for each step to a farther depth
 OTHERS = 3  # nearest views that a picture is compared with
-BLUR = 3.0  # standard deviation of the window over which differences are averaged, pixels
-LEAST = 1e-3  # weight in that window of the pixels that other views see
-SIZE, OPACITY = 0.75, 0.9  # of a new Gaussian: standard deviation in pixels
+BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
+LEAST = 1e-3  # least weight in that window of the pixels that other views see
+SIZE, OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
 BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
 
 
 def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = False) -> PicturedScene:
-    """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers, or leave large parts empty; add notes.
+    """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers, except in large empty parts.
 
-    ``shown [v,h,w]``: pixels whose picture says what is there. The new Gaussians follow the others. None is added where
-    most of the pixels are empty: the scene may be a part of what the photos show. Large connected parts of a view
-    without Gaussians stay empty, unless ``everywhere``: the scene was cut out, or its model left out the sky. Of a
-    cropped scene all stays empty that it does not cover.
+    ``shown [v,h,w]``: pixels whose picture shows what is there. The new Gaussians come after the others. None is added
+    if most of the pixels are empty, because the scene may be only a part of what the photos show. Large connected parts
+    of a view without Gaussians stay empty, because the scene may have been cut out, or its model may have left out the
+    sky; with ``everywhere`` they are filled, too. In a cropped scene, everything that it does not cover stays empty.
+    Notes say what was filled and what stays empty.
     """
     fronts, is_cropped = scene.get_pixels().fronts, scene.region is not None
     free, bare = shown & (fronts < 0), (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)
-    gaps = [
+    views = [
         view
         for view in range(len(scene))
         if is_cropped or free[view].any() or (not everywhere and large_parts(bare[view]).any())
     ]
-    if not gaps:
+    if not views:
         return scene
     holes, empty, edges = np.zeros_like(free), np.zeros_like(free), dict[int, _Edges]()
     gap = 2 * round(GAP * max(shown.shape[1:]) / 2) + 1
 
     def find(view: int, tiled: TiledView) -> None:
-        depths, left = blend_depths(tiled)
-        covered = left <= 1 - EMPTY
-        opacity = 1 - left
-        nothing = opacity < NOTHING * usual_opacity(opacity)
-        if is_cropped:
-            beside = np.ones((3, 3), np.uint8)  # no Gaussian ends between two pixels
-            empty[view] = cv2.erode((nothing & ~shown[view]).astype(np.uint8), beside) > 0
-        elif not everywhere:
-            sparse = blur(opacity, gap / 4) < SPARSE * usual_opacity(opacity)  # at the edges of what was cut out
-            empty[view] = large_parts(nothing & sparse)
+        depths, transmittance = blend_depths(tiled)
+        covered = transmittance <= 1 - EMPTY
+        if is_cropped or not everywhere:
+            empty[view] = _find_empty(1 - transmittance, shown[view], gap, is_cropped=is_cropped)
         bare[view] = ~covered & ~empty[view]
         holes[view] = free[view] & bare[view]
-        if empty[view].any():  # the edges of what was cut out are no holes
+        if empty[view].any():  # the edges of a scene that was cut out are no holes
             around = np.ones((gap, gap), np.uint8)
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, around) > 0
         if covered.any() and holes[view].any():
             beside = fill_gaps(depths[..., None], covered)[..., 0][holes[view]]
             edges[view] = _Edges(beside, float(np.quantile(depths[covered], FARTHEST)))
 
-    tile_views(scene, find, gaps)
+    tile_views(scene, find, views)
     filled = scene
-    if edges and np.count_nonzero(bare[gaps]) < MOST * np.count_nonzero(~empty[gaps]):
-        filled = _add_holes(scene, holes, edges)
+    if edges and np.count_nonzero(bare[views]) < MOST * np.count_nonzero(~empty[views]):
+        filled = _fill_views(scene, holes, edges)
     return _leave_empty(filled, empty)
 
 
+def _find_empty(opacity: np.ndarray, shown: np.ndarray, gap: int, *, is_cropped: bool) -> np.ndarray:
+    """Find the pixels ``[h,w]`` of a view that stay empty, from the ``opacity [h,w]`` of its drawing.
+
+    ``gap``: width in pixels of gaps that are filled.
+    """
+    usual = usual_opacity(opacity)
+    nothing = opacity < NOTHING * usual
+    if is_cropped:
+        beside = np.ones((3, 3), np.uint8)  # a Gaussian never ends exactly between two pixels
+        return np.asarray(cv2.erode((nothing & ~shown).astype(np.uint8), beside) > 0)
+    sparse = blur(opacity, gap / 4) < SPARSE * usual  # not at the edges of a scene that was cut out
+    return large_parts(nothing & sparse)
+
+
 def usual_opacity(opacity: np.ndarray) -> float:
-    """Return the mean of a picture's opacities where there is something to see: that weighted by themselves."""
+    """Return the mean of a picture's opacities, weighted by themselves, so that empty pixels do not count."""
     return float((opacity * opacity).sum() / max(float(opacity.sum()), 1e-6))
 
 
@@ -101,11 +111,11 @@ def usual_opacity(opacity: np.ndarray) -> float:
 class _Edges:
     """Depths in a view around its n holes."""
 
-    beside: np.ndarray  # [n] of the surface beside each
-    farthest: float  # of the view's farthest surface
+    beside: np.ndarray  # [n] depth of the surface beside each hole
+    farthest: float  # Depth of the view's farthest surface
 
 
-def _add_holes(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edges]) -> PicturedScene:
+def _fill_views(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edges]) -> PicturedScene:
     """Add Gaussians to a scene in the ``holes [v,h,w]`` of views with ``edges``, with a note."""
     views = sorted(edges)
     added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), views))
@@ -115,15 +125,15 @@ def _add_holes(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edg
         inside = lies_inside(scene.region, added.means)
         added, places = added[inside], places[inside]
     if len(places):
-        note(f"{len(added):,} pixels that Gaussians hardly cover, or not at all, get the colours of their pictures")
+        note(f"{len(added):,} pixels that no Gaussian covers enough get Gaussians with the colours of their pictures")
     return fill_pixels(scene, added, places)
 
 
 def large_parts(empty: np.ndarray) -> np.ndarray:
-    """Return the connected parts of a mask ``[h,w]`` that hold a large square, less a rim of some pixels.
+    """Return the connected parts of a mask ``[h,w]`` that hold a large square, reduced by a rim of some pixels.
 
-    There are none where such squares cover little of the picture. Borders that exporters leave out, and gaps, are
-    narrower, and the farthest tenth that Depth Anything 3 leaves out is less.
+    There are none if the squares cover little of the picture. Gaps, and borders that exporters leave out, are narrower
+    than the squares; the farthest tenth of the pixels, which Depth Anything 3 leaves out, is less.
     """
     if empty.mean() < PART:
         return np.zeros_like(empty)
@@ -133,14 +143,14 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
     if opened.mean() < PART:
         return np.zeros_like(empty)
     _, labels = cv2.connectedComponents(empty.astype(np.uint8), connectivity=4)
-    kept = np.isin(labels, labels[opened & empty])
-    return np.asarray(cv2.erode(kept.astype(np.uint8), rim) > 0)
+    is_large = np.isin(labels, labels[opened & empty])
+    return np.asarray(cv2.erode(is_large.astype(np.uint8), rim) > 0)
 
 
 def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
-    """Make pictures black and of no account for scores where they are to stay ``empty [v,h,w]``.
+    """Make pictures black, and do not score them, at pixels that stay ``empty [v,h,w]``.
 
-    A note says so of photos that counted there.
+    If photos counted there, a note says that they do not any more.
     """
     if not empty.any() or empty.all():
         return scene
@@ -149,8 +159,8 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
     if share:
         views = int(counted.any((1, 2)).sum())
         note(
-            f"the scene shows nothing in large parts of {views} of {len(empty)} views, {share} % of all pixels:"
-            " they stay empty, and photos do not count there; --set extent=photos fills them"
+            f"the scene shows nothing in large parts of {views} of {len(empty)} views, {share} % of all pixels;"
+            " these parts stay empty, and photos do not count there; --set extent=photos fills them"
         )
     images = np.where(empty[..., None], np.float32(0), scene.images)
     masks, large = ~empty if scene.masks is None else scene.masks & ~empty, scene.large_photos
@@ -168,7 +178,7 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
     rays = matmul(matmul(pixels, invert(cameras.Ks[view]).T), cameras.viewmats[view, :3, :3])  # to depth 1
     beside, beyond = edges.beside.astype(np.float64), edges.farthest * FACTORS[:, None]
     tried = np.concatenate([beside[None], np.maximum(beyond, beside)])
-    depth = _agreeing(scene, view, holes, rays, tried)
+    depth = _choose_depths(scene, view, holes, rays, tried)
     eye, size = cameras.centres[view], SIZE / cameras.Ks[view, 0, 0]
     return make_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
 
@@ -176,7 +186,10 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
 def make_gaussians(
     eye: np.ndarray, rays: np.ndarray, depths: np.ndarray, size: float, colors: np.ndarray, num_higher: int
 ) -> Gaussians:
-    """Make round Gaussians at ``depths [n]`` along ``rays [n,3]``, ``size`` large at depth 1, of ``colors [n,3]``."""
+    """Make round Gaussians at ``depths [n]`` along ``rays [n,3]`` from ``eye``, with ``colors [n,3]`` (sRGB).
+
+    ``size`` is their standard deviation at depth 1, ``num_higher`` the number of harmonics above degree 0.
+    """
     return Gaussians(
         means=(eye + depths[:, None] * rays).astype(np.float32),
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(rays), 1)),
@@ -187,23 +200,25 @@ def make_gaussians(
     )
 
 
-def _agreeing(scene: PicturedScene, view: int, holes: np.ndarray, rays: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Choose one of ``depths [d,n]`` along each of ``rays [n,3]``: where the nearest other views show the same colour.
+def _choose_depths(
+    scene: PicturedScene, view: int, holes: np.ndarray, rays: np.ndarray, depths: np.ndarray
+) -> np.ndarray:
+    """Choose one of ``depths [d,n]`` for each of ``rays [n,3]``: where the nearest other views show the same colour.
 
-    The differences of colours are averaged over the ``holes [h,w]`` around. In doubt it is the first depth.
+    Differences of colours are averaged over neighbouring ``holes [h,w]``. The first depth is chosen in doubt.
     """
     cameras, centres = scene.cameras, scene.cameras.centres
     others = [other for other in nearest_views(centres, view) if (centres[other] != centres[view]).any()][:OTHERS]
-    moves = []
+    moves = []  # each other picture, with the ray of each hole in it, in homogeneous pixels: start + depth * along
     for other in others:
-        K, (turn, shift) = cameras.Ks[other], np.split(cameras.viewmats[other, :3], [3], 1)
-        start = matmul(K, matmul(turn, centres[view]) + shift[:, 0])
-        along = np.ascontiguousarray(matmul(matmul(rays, turn.T), K.T).T)
+        K, (rotation, translation) = cameras.Ks[other], np.split(cameras.viewmats[other, :3], [3], 1)
+        start = matmul(K, matmul(rotation, centres[view]) + translation[:, 0])
+        along = np.ascontiguousarray(matmul(matmul(rays, rotation.T), K.T).T)
         moves.append((scene.images[other], along, start))
     colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
     chosen, least = depths[0], np.full(len(rays), np.inf, np.float32)
     for step, depth in enumerate(depths):
-        sums = np.zeros((*holes.shape, 2), np.float32)  # of differences, and their number
+        sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and their number
         for picture, along, start in moves:
             add_differences(picture, along, start, depth, colors, pixels, sums)
         total, number = blur(sums, BLUR).reshape(-1, 2)[pixels].T

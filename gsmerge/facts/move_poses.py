@@ -1,11 +1,10 @@
-"""Scene -> the same scene with cameras, and their pixels' Gaussians, moved to where the photos agree.
+"""Scene -> the scene with cameras, and their pixels' Gaussians, moved to where the photos agree.
 
-Poses that a network predicts are wrong by some pixels, and its Gaussians follow them: every view
-fits itself and none of the others. The pixels of a view, at their depths, are looked up in the
-photos of its neighbours, and all poses are moved at once until the greys agree: direct image
-alignment (Engel et al., "Direct Sparse Odometry", 2018) with fixed depths, by Gauss-Newton steps on
-small photos first. Scenes whose poses are right are left alone, bit for bit, after one step at the
-smallest size.
+Poses that a network predicts are wrong by some pixels, and its Gaussians have the same error, so every view agrees with
+itself but not with the others. The pixels of a view, at their depths, are looked up in the photos of its neighbours.
+All poses are moved at once until the greys agree. This is direct image alignment (Engel et al., "Direct Sparse
+Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos first. Scenes with right poses stay unchanged
+bit for bit, after one step at the smallest size.
 """
 
 from __future__ import annotations
@@ -23,26 +22,28 @@ from gsmerge.raster.photos import NEAR_PLANE, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene
 
-SIDES = (60, 120, 240)  # longer side of the photos, pixels, one after the other
-MIN_SIDE = 24  # pixels of the shorter side at the first size, below which photos say too little
+SIDES = (60, 120, 240)  # longer side of the photos in pixels, one size after the other
+MIN_SIDE = 24  # least number of pixels of the shorter side at the first size; smaller photos say too little
 OVERLAP_PIXELS = 400  # pixels of a view by which its neighbours are chosen
-BORDER = 2  # pixels that no lookup goes near
-SAMPLE_PIXELS = 1500  # pixels of a view that are looked up, those where the photo changes most
-FIRST_PIXELS, FIRST_STEPS = 600, 2  # the same, and the most steps, at the first size, which right poses pay for
-NEIGHBOURS = 4  # views that a view is looked up in
+BORDER = 2  # pixels at the borders in which nothing is looked up
+SAMPLE_PIXELS = 1500  # pixels of a view that are looked up, those at which the photo changes most
+FIRST_PIXELS, FIRST_STEPS = 600, 2  # the same, and the most steps, at the first size, which also right poses cost
+NEIGHBOURS = 4  # views in which a view is looked up
 MIN_OVERLAP = 0.2  # share of a view's pixels that a neighbour must see
 STEPS = 6  # most Gauss-Newton steps at each size
-DAMPING = 1e-3  # of the curvature
-EARLY_PX = 1.0  # motion after the first step up to which poses are taken for right
-TOGETHER = 16  # pairs of a task
-ENOUGH = 1e-4  # radians and canonical units: a smaller step ends them
-BLUR = 0.7  # of the photos, standard deviation in pixels
-PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0  # radians and canonical units a pose is thought to be off; weight
-LIMIT_PX = 1.5  # motion in the views, pixels, from which on poses count as wrong
-# Share of what disagrees that the motion must take away besides: of some view at every size, and in the end more of it,
-# or of all views. Wrong depth moves right views as well, for up to 0.14 of a view and 0.06 of all at the largest size,
-# and a depth camera's own track 0.28 and 0.18. Views half a degree off gain 0.22 of all and more, one alone 0.32 of
-# itself (14 captures). Those in between stay where they are: other photos of the scene are in the frame that was given.
+DAMPING = 1e-3  # damping of the steps, relative to the curvature
+EARLY_PX = 1.0  # motion in pixels after the first step up to which poses are considered right
+TOGETHER = 16  # pairs per task
+ENOUGH = 1e-4  # a step of less, in radians and canonical units, is the last
+BLUR = 0.7  # blur of the photos, standard deviation in pixels
+# Prior error of a pose, radians and canonical units, and the weight of this prior
+PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
+LIMIT_PX = 1.5  # motion in pixels of the views from which on poses count as wrong
+# Poses are moved only if that also removes a share of the disagreement: LEAST_GAIN of some view at every size, and at
+# the largest size VIEW_GAIN of some view or MEAN_GAIN of all. Wrong depth moves right views, too, and removes up to
+# 0.14 of one view and 0.06 of all at the largest size; the track of a depth camera removes 0.28 and 0.18. Views that
+# are half a degree off gain at least 0.22 of all, a single view 0.32 of itself (14 captures). Views with gains in
+# between are not moved, because other photos of the scene have poses in the given frame
 LEAST_GAIN, VIEW_GAIN, MEAN_GAIN = 0.1, 0.3, 0.2
 
 
@@ -50,33 +51,35 @@ LEAST_GAIN, VIEW_GAIN, MEAN_GAIN = 0.1, 0.3, 0.2
 class _Level:
     """Photos at one size, with the sampled pixels of each view."""
 
-    pictures: np.ndarray  # [v,h,w,3] float32: grey, and how it changes to the right and down
+    pictures: np.ndarray  # [v,h,w,3] float32, grey, and its slope to the right and down
     Ks: np.ndarray  # [v,3,3]
-    scale: float  # pixels of the views per pixel
-    points: np.ndarray  # [n,3] float64 of all views, in their cameras' frames
-    greys: np.ndarray  # [n] float32 of each
-    starts: np.ndarray  # [v+1] where those of each view start
-    depths: np.ndarray  # [v,h,w] of the Gaussians at the pixels' middles, canonical units; NaN where there is none
+    scale: float  # Pixels of the views per pixel
+    points: np.ndarray  # [n,3] float64, sampled points of all views, in their cameras' frames
+    greys: np.ndarray  # [n] float32, grey of each point
+    starts: np.ndarray  # [v+1] first point of each view
+    depths: np.ndarray  # [v,h,w] depths of the Gaussians at the pixels' middles, canonical units; NaN without one
     start: np.ndarray  # [v,4,4] poses as they were given
-    pairs: np.ndarray  # [p,2] a view, and one that it is looked up in
+    pairs: np.ndarray  # [p,2] a view, and the view in which it is looked up
 
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
     """Evidence from the pixels of the first view of p pairs about its pose relative to the second."""
 
-    curvatures: np.ndarray  # [p,6,6] of half the squared differences, by a motion of the second; the first's is its
-    slopes: np.ndarray  # [p,6]  # opposite, since only where one stands to the other counts
-    costs: np.ndarray  # [p] mean over the pixels of how much they disagree
-    flows: np.ndarray  # [p] median distance from where the given poses show them, pixels of the views
+    # Curvature and slope of half the squared differences for a motion of the second view. A motion of the first view
+    # has the opposite effect, because only the relative pose counts
+    curvatures: np.ndarray  # [p,6,6]
+    slopes: np.ndarray  # [p,6]
+    costs: np.ndarray  # [p] mean disagreement of the pixels
+    flows: np.ndarray  # [p] median distance from the places at which the given poses show them, pixels of the views
 
 
 def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = False) -> PicturedScene | None:
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
-    ``views`` are the views whose photos show the scene; other views stay. With ``always`` even small errors are
-    corrected. The median motion of the views is subtracted. Returns None if no pose is wrong, or if the photos cannot
-    decide.
+    ``views`` are the views whose photos show the scene; other views are not moved. With ``always`` even small errors
+    are corrected. The median motion of the views is subtracted. Returns None if no pose is wrong, or if the photos
+    cannot decide.
     """
     start = scene.cameras.viewmats.astype(np.float64)
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
@@ -92,8 +95,8 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
         before = first if side == sides[0] else _compare(level, start)
         if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, before, last, end=side == sides[-1])):
             return None
-    placed = np.unique(pairs)  # the others stay where they are
-    viewmats[placed] = without_common_motion(start[placed], viewmats[placed], np.median)
+    moved = np.unique(pairs)  # all other views keep their poses
+    viewmats[moved] = without_common_motion(start[moved], viewmats[moved], np.median)
     return move_views(scene, viewmats)
 
 
@@ -118,19 +121,19 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
 
 
 def _level_of(scene: PicturedScene, pairs: np.ndarray, level: float, samples: int) -> _Level:
-    """Shrink the photos by ``level``, and sample pixels of each where it changes most."""
+    """Shrink the photos by ``level``, and sample the pixels at which each of them changes most."""
     photos = photos_of(scene.images, scene.cameras, level)
     shape = photos.height, photos.width
     rows, columns = ((np.arange(n) + 0.5) / n for n in shape)
-    near = np.ix_((rows * scene.cameras.height).astype(int), (columns * scene.cameras.width).astype(int))
+    nearest = np.ix_((rows * scene.cameras.height).astype(int), (columns * scene.cameras.width).astype(int))
     means, fronts = scene.gaussians.means, scene.get_pixels().fronts
-    spread = 0.5 + np.random.default_rng(0).random(shape)  # or all pixels would be those of one edge
+    spread = 0.5 + np.random.default_rng(0).random(shape)  # so that the pixels do not all lie on one edge
     spread[:BORDER] = spread[-BORDER:] = spread[:, :BORDER] = spread[:, -BORDER:] = 0
 
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def sample_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         grey = blur(photos.images[view].mean(-1, dtype=np.float32), BLUR)
         down, right = np.gradient(grey)
-        rows = fronts[view][near]
+        rows = fronts[view][nearest]
         depth = camera_depths(means[rows], scene.cameras.viewmats[view])
         depth = np.where((rows >= 0) & (depth > NEAR_PLANE), depth, np.nan)
         score = np.where(np.isfinite(depth), np.sqrt(right * right + down * down) * spread, 0).ravel()
@@ -141,17 +144,18 @@ def _level_of(scene: PicturedScene, pairs: np.ndarray, level: float, samples: in
         points = matmul(pixels, invert(photos.Ks[view]).T) * depth.ravel()[chosen, None]
         return np.stack([grey, right, down], -1), points, grey.ravel()[chosen], depth
 
-    pictures, points, greys, depths = zip(*parallel_map(one_view, range(len(scene))), strict=True)
-    scale, start = scene.cameras.width / photos.width, scene.cameras.viewmats.astype(np.float64)
-    starts = np.cumsum([0, *map(len, greys)])
-    kept = np.concatenate(points), np.concatenate(greys), starts
-    return _Level(np.stack(pictures), photos.Ks.astype(np.float64), scale, *kept, np.stack(depths), start, pairs)
+    pictures, points, greys, depths = zip(*parallel_map(sample_view, range(len(scene))), strict=True)
+    return _Level(
+        np.stack(pictures), photos.Ks.astype(np.float64), scene.cameras.width / photos.width,
+        np.concatenate(points), np.concatenate(greys), np.cumsum([0, *map(len, greys)]),
+        np.stack(depths), scene.cameras.viewmats.astype(np.float64), pairs,
+    )  # fmt: skip
 
 
 def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, _Evidence, _Evidence]:
     """Improve poses by Gauss-Newton steps at one size; return the poses, and the evidence before and after.
 
-    With ``check`` there are few steps, and only one if it moves no view far.
+    ``check``: take few steps, and only one if it moves no view far.
     """
     prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
     first = now = _compare(level, viewmats)
@@ -176,33 +180,35 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
 
 
 def _compare(level: _Level, viewmats: np.ndarray) -> _Evidence:
-    """Compare the pixels of the first view of each pair with the second one's photo, for the given poses."""
+    """Compare the pixels of the first view of each pair with the photo of the second view, for the given poses."""
     count, most = len(level.pairs), int(np.diff(level.starts).max())
     now = _Evidence(np.empty((count, 6, 6)), np.empty((count, 6)), np.empty(count), np.empty(count))
 
-    def some(first: int) -> None:
+    def compare_some(first: int) -> None:
         compare_views(
             level.points, level.greys, level.starts, level.pairs, viewmats, level.start, level.Ks, level.pictures,
             level.depths, NEAR_PLANE, BORDER, level.scale, first, min(first + TOGETHER, count),
             np.empty((COLUMNS, most)), np.empty(most, np.int64), *vars(now).values(),
         )  # fmt: skip
 
-    parallel_map(some, range(0, count, TOGETHER))
+    parallel_map(compare_some, range(0, count, TOGETHER))
     return now
 
 
 def _flows(level: _Level, evidence: _Evidence) -> np.ndarray:
-    """Return the median motion ``[v]`` of the pixels of each view over its pairs, pixels."""
+    """Return the median motion ``[v]``, in pixels, of the pixels of each view over its pairs."""
     flows = [evidence.flows[(level.pairs == view).any(1)] for view in range(len(level.start))]
     return np.array([np.median(view_flows) if len(view_flows) else 0.0 for view_flows in flows])
 
 
 def _any_wrong(level: _Level, before: _Evidence, last: _Evidence, *, end: bool) -> bool:
-    """Return whether a view moved far and now agrees better with the others, at the ``end`` much better."""
-    far = _flows(level, last) > LIMIT_PX
-    costs = [np.bincount(level.pairs.ravel(), one.costs.repeat(2), len(far)) for one in (before, last)]  # of each view
-    gains = 1 - costs[1] / np.maximum(costs[0], 1e-9)
-    all_gain = 1 - costs[1].sum() / max(costs[0].sum(), 1e-9)
+    """Return whether a view moved far and now agrees better with the others; at the ``end``, much better."""
+    is_far = _flows(level, last) > LIMIT_PX
+    costs_before, costs = (
+        np.bincount(level.pairs.ravel(), evidence.costs.repeat(2), len(is_far)) for evidence in (before, last)
+    )
+    gains = 1 - costs / np.maximum(costs_before, 1e-9)
+    mean_gain = 1 - costs.sum() / max(costs_before.sum(), 1e-9)
     if end:
-        return bool((far & (gains > VIEW_GAIN)).any() or (far.any() and all_gain > MEAN_GAIN))
-    return bool((far & (gains > LEAST_GAIN)).any())
+        return bool((is_far & (gains > VIEW_GAIN)).any() or (is_far.any() and mean_gain > MEAN_GAIN))
+    return bool((is_far & (gains > LEAST_GAIN)).any())

@@ -1,4 +1,4 @@
-"""What makes a photo look as its Gaussians, applied to it at every size that it is read in."""
+"""Changes that make a photo look like its Gaussians, applied at every size at which it is read."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import numpy as np
 from gsmerge.evidence.colors import map_tones
 from gsmerge.types import LargePhotos
 
-CLIPPED = 0.985  # level from which on a pixel does not say how bright it is
+CLIPPED = 0.985  # level from which on a pixel may be clipped
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoChange:
-    """Change of one photo, in this order."""
+    """Changes of one photo, in this order."""
 
-    reversed: bool = False  # whether red and blue change places
-    tones: np.ndarray | None = None  # [3,256] float32: what each level of each channel becomes
-    cover: np.ndarray | None = None  # [h,w] bool: where `colors` take the photo's place
+    reversed: bool = False  # Exchange red and blue
+    tones: np.ndarray | None = None  # [3,256] float32, new value of each level of each channel
+    cover: np.ndarray | None = None  # [h,w] bool, pixels that get `colors`
     colors: np.ndarray | None = None  # [h,w,3] sRGB in [0, 1]
 
     def __bool__(self) -> bool:
@@ -42,7 +42,7 @@ class PhotoChange:
 
 
 def _enlarge(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Enlarge a picture in [0, 1] as whole numbers, which OpenCV resizes alike on every processor."""
+    """Enlarge a picture in [0, 1] as integers, which OpenCV resizes to the same values on every processor."""
     levels = np.rint(255 * picture.astype(np.float32).clip(0, 1)).astype(np.uint8)
     return np.asarray(cv2.resize(levels, shape[1::-1], interpolation=cv2.INTER_LINEAR) / np.float32(255))
 

@@ -1,7 +1,7 @@
 """Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel, by projection of centres.
 
-Each view is looked at in cells wider than its Gaussians are apart. What is behind the front of a cell is hidden, and a
-pixel without a centre of its own shows the front of its cell.
+Each view is divided into cells wider than the distance of its Gaussians. Gaussians behind the front of a cell are
+hidden, and a pixel without a centre of its own shows the front of its cell.
 """
 
 from __future__ import annotations
@@ -17,25 +17,26 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT
 
-# Share of the cells with a centre, of those beside others with one, from which on cells are wide enough. Of captures in
-# voxels six with .97 and more of their pixels show as much as by drawing, two with .93 and .95 lose 1.5 and 5 dB
+# Cells are wide enough if this share of them has a centre, among cells surrounded by cells with one. Of captures in
+# voxels, six with a share of .97 or more give the same result as drawing; two with .93 and .95 lose 1.5 and 5 dB
 COVERED = 0.96
-REACH = 4.0  # standard deviations of a Gaussian, from end to end, in which it shows nearly all that it shows
-SAMPLE = 10_000  # Gaussians whose size is looked at
-SAME_DEPTH = 1.05  # times the depth of a cell's front up to which a centre in the cell is on the same surface
+REACH = 4.0  # width of a Gaussian that shows nearly all of it, in standard deviations
+SAMPLE = 10_000  # Gaussians by which the median size is estimated
+SAME_DEPTH = 1.05  # depth, relative to that of a cell's front, up to which a centre is on the same surface
 
 
 def with_pixels(scene: SceneT) -> SceneT:
-    """Return a canonical scene with its pixels, found by projection where they are not known."""
+    """Return a canonical scene with its pixels; unknown pixels are found by projection."""
     return scene if scene.pixels is not None else replace(scene, pixels=find_pixels(scene))
 
 
 def find_pixels(scene: Scene) -> Pixels:
     """Find the pixel of each Gaussian of a canonical scene, and the front of each pixel.
 
-    A Gaussian's pixel is the one with the largest opacity x transmittance x area, pixels, or -1 if no view sees it; in
-    ties the first view counts. The front of a pixel is the Gaussian with the largest opacity x transmittance among
-    those with their centre in it, or in its cell, or -1 without any.
+    In each view, a Gaussian has a weight of opacity x transmittance x area in pixels. Its pixel is that of its centre
+    in the view with the largest weight, the first of equal ones; -1 if no view sees the Gaussian. The front of a pixel
+    is the Gaussian with the largest opacity x transmittance among those with their centre in the pixel or, if there are
+    none, in its cell; -1 if there are none either.
     """
     g, cameras, count = scene.gaussians, scene.cameras, len(scene)
     means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
@@ -46,11 +47,11 @@ def find_pixels(scene: Scene) -> Pixels:
     def weigh(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return _weigh_view(means, scales, opacities, viewmats[view], Ks[view], fronts[view])
 
-    of_views = in_turn(weigh, range(count)) if len(g) <= ONE_AT_A_TIME else map(weigh, range(count))
-    for view, (ids, places, weights) in enumerate(of_views):
-        better = weights > most[ids]
-        ids = ids[better]
-        most[ids], homes[ids] = weights[better], view * scene.pixels_per_view + places[better]
+    weighed = in_turn(weigh, range(count)) if len(g) <= ONE_AT_A_TIME else map(weigh, range(count))
+    for view, (ids, places, weights) in enumerate(weighed):
+        is_better = weights > most[ids]
+        ids = ids[is_better]
+        most[ids], homes[ids] = weights[is_better], view * scene.pixels_per_view + places[is_better]
     return Pixels(homes, fronts, own=False)
 
 
@@ -59,7 +60,7 @@ def _weigh_view(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weigh the Gaussians of one view in its cells, and write the fronts of its pixels ``[h,w]``.
 
-    Returns rows ``[m]``, their pixels ``[m]``, and their weights ``[m]``, pixels.
+    Returns rows ``[m]``, their pixels ``[m]``, and their weights ``[m]`` in pixels.
     """
     height, width = fronts.shape
     ids, pixels, depths, areas = project_centres(means, scales, viewmat, K, width, height, NEAR_PLANE)
@@ -81,10 +82,11 @@ def _weigh_view(
 
 
 def choose_level(shown: np.ndarray, widest: float) -> int:
-    """Choose how wide cells are, as a power of 2, from the mask ``shown [h,w]`` of pixels with a centre.
+    """Choose the level of cells, which are 2**level pixels wide, from the mask ``shown [h,w]`` of pixels with a centre.
 
-    They are twice as wide as those of which nearly all between others with a centre have one, too, or as pixels where
-    none up to ``widest``, pixels, are so: what a cell hides must not show through where a centre is missing.
+    The smallest cells are found of which nearly all have a centre, among cells surrounded by cells with one. The result
+    is one level above these, so that hidden surfaces do not show through at a missing centre. It is 1 if there are none
+    up to ``widest`` pixels.
     """
     fine, level = shown, 0
     while 2**level <= max(widest, 1.0):
@@ -98,7 +100,7 @@ def choose_level(shown: np.ndarray, widest: float) -> int:
 
 
 def _coarser(mask: np.ndarray) -> np.ndarray:
-    """Return which squares of 2 x 2 of a mask ``[h,w]`` hold something."""
+    """Return a mask of the squares of 2 x 2 pixels of a mask ``[h,w]`` that are not empty."""
     height, width = mask.shape
     even = np.pad(mask, ((0, height % 2), (0, width % 2)))
     lines = even[::2] | even[1::2]
@@ -106,7 +108,7 @@ def _coarser(mask: np.ndarray) -> np.ndarray:
 
 
 def _cells_of(pixels: np.ndarray, shape: tuple[int, ...], level: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return the cell of each pixel ``[m]`` int32 of a picture ``[h,w]``, and how many lines and columns there are."""
+    """Return the cell of each pixel ``[m]`` int32 of a picture ``[h,w]``, and the numbers of cells down and across."""
     height, width = shape
     rows, columns = np.divmod(pixels, np.int32(width))
     wide = -(-width // (1 << level))

@@ -1,4 +1,4 @@
-"""Scene -> cameras that it lacks, in all of it or between its views, and renders in place of photos."""
+"""Place cameras: for a scene without cameras, or between and around its views; render pictures in place of photos."""
 
 from __future__ import annotations
 
@@ -18,30 +18,31 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
-NUM_VIEWS = 24
-MAX_SCORED, SCORED_SIZE = 8, 512  # views that judge a result, and their pixels per side, at most
-FITTED = 16  # views that a fit without cameras sees of each kind, and half of it on a walk
-FITTED_LONG, LONG = 48, 600  # the same of a long fit, and steps of it from which on it is one
-FEWER = 3  # of the candidates every third is tried where views only judge
-SAMPLE_GAUSSIANS = 40_000  # Gaussians that candidates are judged by
-EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
+NUM_VIEWS = 24  # most cameras that are placed
+MAX_SCORED, SCORED_SIZE = 8, 512  # views that results are scored on, and their pixels per side, at most
+FITTED = 16  # views of each kind for a fit without cameras, and half as many on a walk
+FITTED_LONG, LONG = 48, 600  # the same for a long fit, and the steps from which on a fit is long
+FEWER = 3  # every third candidate is tried for views that results are only scored on
+SAMPLE_GAUSSIANS = 40_000  # Gaussians in the pictures by which candidates are chosen
+EXTENT = (0.05, 0.95)  # quantiles of the positions along each axis between which the scene is assumed to lie
 AROUND = 40  # candidate cameras around the scene
-ABOVE = -0.25  # height of the ring of cameras to look from, in its radii: y points down
-FAR_RADII, NEAR_RADII = 2.0, 1.2  # distance of cameras around the scene, in its radii
-INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
-WALKED = 0.6  # share of the longest half axis, on both sides of the median, that a walk leads along
-GOLDEN = np.pi * (1 + math.sqrt(5))  # turn after which directions spread evenly
-LOOKS = 8  # directions of a camera inside
+ABOVE = -0.25  # height of the ring of viewpoints, in its radii; y points down
+FAR_RADII, NEAR_RADII = 2.0, 1.2  # distances of cameras around the scene, in its radii
+INSIDE = (0.0, -0.5, 0.5)  # positions of cameras inside, along each axis, as a share of half the extent
+WALKED = 0.6  # length of a walk to both sides of the median, as a share of the longest half axis
+GOLDEN = np.pi * (1 + math.sqrt(5))  # angle between successive directions that spreads them evenly
+DIRECTIONS = 8  # directions of a camera inside
 FIELD = 1.0  # width of the image over the focal length
-PROBE = 96  # pixels per side of the pictures that candidates are judged by
+PROBE = 96  # pixels per side of the pictures by which candidates are chosen
 SMALLEST, LARGEST = 96, 640  # pixels per side
 CLEAR = 0.02  # near plane, as a share of the scene's radius
-ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
-PAIRS, MIDDLE = 2, 0.5  # nearest other views, and how far on the way to them a camera stands
-WIDEST = np.pi / 4  # turn between two views from which on what lies between them is not known
-FEW_VIEWS = 24  # up to which a fit to renders also sees what lies between them: of more it learns none by heart
-OUTSIDE, MOST_OUTSIDE = 0.5, 24  # of their number look from outside, at most
-# Least and most step back of these, as a share of the depth, and turns to the sides, and up or down, degrees
+ENOUGH = 1.0  # blending weight, summed over pixels, at which a Gaussian counts as seen
+PAIRS, MIDDLE = 2, 0.5  # nearest other views, and the position of a camera on the way to them
+WIDEST = np.pi / 4  # angle between two views from which on the space between them is unknown
+# Views up to which a fit to renders also gets views between them; with more views, it learns none by heart
+FEW_VIEWS = 24
+OUTSIDE, MOST_OUTSIDE = 0.5, 24  # views from outside, as a share of all views, and at most
+# Least and largest step back of these, as a share of the depth, and rotations to the sides, and up or down, degrees
 NEAREST, FARTHEST = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
 
 
@@ -55,7 +56,7 @@ NO_VIEWS = (
 def add_views(scene: Scene, *, shown: bool = False) -> Scene:
     """Keep the finite Gaussians, at least one, and place cameras if there are none, with a note.
 
-    ``shown``: to look at, half of them from around the scene (:func:`place_viewpoints`).
+    ``shown``: the views are for people to look at, so half of them are around the scene (:func:`place_viewpoints`).
     """
     scene = keep_finite(scene)
     if len(scene) == 0:
@@ -65,11 +66,12 @@ def add_views(scene: Scene, *, shown: bool = False) -> Scene:
 
 
 def place_viewpoints(gaussians: Gaussians) -> Cameras:
-    """Place cameras to look from: on a ring around the scene, which may be an object, then inside: it may be a room."""
+    """Place cameras for people to look from: first on a ring around the scene, for objects, then inside, for rooms."""
     inside = place_cameras(gaussians, NUM_VIEWS // 2)
     centre, half = _extent(thin_out(gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64))
-    turns = 2 * np.pi * np.arange(len(inside)) / len(inside)
-    ring = np.stack([sin(turns), np.full(len(turns), ABOVE), -cos(turns)], 1)  # the first where most models look from
+    angles = 2 * np.pi * np.arange(len(inside)) / len(inside)
+    # the first camera sees the front of most models
+    ring = np.stack([sin(angles), np.full(len(angles), ABOVE), -cos(angles)], 1)
     around = replace(inside, viewmats=_around(centre, half, FAR_RADII, normalize(ring)))
     return concat_cameras(around, inside)
 
@@ -79,9 +81,9 @@ def keep_finite(scene: Scene) -> Scene:
     g = scene.gaussians
     finite = np.ones(len(g), bool)
     for array in vars(g).values():
-        each = np.isfinite(array)
-        if not each.all():  # seldom, and row by row it takes ten times as long
-            finite &= each.reshape(len(g), -1).all(1)
+        is_finite = np.isfinite(array)
+        if not is_finite.all():  # rare; row by row the test takes ten times as long
+            finite &= is_finite.reshape(len(g), -1).all(1)
     count = int((~finite).sum())
     if count == len(g):
         raise ValueError("expected at least one finite Gaussian, got none")
@@ -92,23 +94,25 @@ def keep_finite(scene: Scene) -> Scene:
 
 
 def _with_cameras(scene: Scene, cameras: Cameras) -> Scene:
+    """Return a scene of the same Gaussians with placed cameras, without pictures."""
     return Scene(scene.gaussians, cameras, None, None, tuple(f"placed {view}" for view in range(len(cameras))))
 
 
 def placed_views(steps: int) -> int:
-    """Return how many views of each of three kinds are placed for a fit of so many steps."""
+    """Return how many views of each of three kinds are placed for a fit of ``steps`` steps."""
     return FITTED_LONG if steps >= LONG else FITTED
 
 
 def count_placed(count: int) -> int:
-    """Return how many views :func:`draw_placed` adds."""
+    """Return how many views :func:`draw_placed` adds for a ``count``."""
     return 3 * count + count // 2
 
 
 def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
-    """Add renders of a canonical scene: ``count`` each from afar, near by and where most shows, half of it on a walk.
+    """Add renders of a canonical scene from placed views, which come last.
 
-    They come last. What a background shows through the renders is their ``empty``.
+    ``count`` views each are far away, near by, and where most of the scene is visible; half as many are on a walk. The
+    transmittance of the renders becomes their ``empty``.
     """
     means = thin_out(scene.gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64)
     centre, half = _extent(means)
@@ -126,7 +130,7 @@ def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
 
 
 def add_scored_views(scene: Scene) -> Scene:
-    """Add a few small views on which results of a scene without views are judged."""
+    """Add a few small views on which results of a scene without views are scored."""
     return _with_cameras(scene, place_cameras(scene.gaussians, MAX_SCORED, largest=SCORED_SIZE, step=FEWER))
 
 
@@ -142,7 +146,10 @@ def draw_pictures(scene: Scene) -> PicturedScene:
 
 
 def draw_around(scene: PicturedScene) -> PicturedScene:
-    """Add renders of a scene of several views from outside and, if they are few, from between them; these come last."""
+    """Add renders of a scene of several views from outside its views and, if these are few, from between them.
+
+    The renders come last.
+    """
     means, views = scene.gaussians.means, len(scene)
     if views == 1:
         return scene
@@ -156,10 +163,10 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
 
 
 def between_cameras(cameras: Cameras, *further: float) -> Cameras:
-    """Place cameras half way from each of two views or more to the nearest others.
+    """Place cameras half way from each of two or more views to the nearest other views.
 
-    Others follow for each view, ``further`` of the way to its nearest. A camera moves along the screw from one pose to
-    the other, so it keeps looking at what both look at.
+    For each of the shares ``further``, each view gets one more camera at this share of the way to its nearest view. A
+    camera moves along the screw from one pose to the other, so it keeps looking at what both look at.
     """
     viewmats = cameras.viewmats.astype(np.float64)
     nearest = [nearest_views(cameras.centres, view)[:PAIRS] for view in range(len(cameras))]
@@ -167,8 +174,8 @@ def between_cameras(cameras: Cameras, *further: float) -> Cameras:
     beside = [((v, others[0]), part) for part in further for v, others in enumerate(nearest)]
     pairs, parts = (np.array(column) for column in zip(*middle.items(), *beside, strict=True))
     motions = motion_vectors(viewmats[pairs[:, 0]], viewmats[pairs[:, 1]])
-    near = (motions[:, :3] ** 2).sum(1) <= WIDEST**2
-    first, moves = pairs[near, 0], motion_matrices((parts[:, None] * motions)[near])
+    is_narrow = (motions[:, :3] ** 2).sum(1) <= WIDEST**2
+    first, moves = pairs[is_narrow, 0], motion_matrices((parts[:, None] * motions)[is_narrow])
     return replace(cameras, viewmats=matmul(viewmats[first], moves), Ks=cameras.Ks[first])
 
 
@@ -178,10 +185,10 @@ def place_cameras(
     """Place cameras that see as much of the scene as possible.
 
     Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it, looking in all
-    directions. They are chosen one by one: each time the candidate that shows the most opacity not shown yet, in
-    pictures of a sample of the Gaussians. There are at most ``num_views``, with square images that grow with the number
-    of Gaussians up to ``largest`` pixels per side. Only every ``step``-th candidate is tried, on a smaller sample.
-    Raises ValueError if there is no Gaussian.
+    directions. They are chosen one by one; each is the candidate that shows the most opacity not shown yet, in pictures
+    of a sample of the Gaussians. There are at most ``num_views``. Images are square and grow with the number of
+    Gaussians up to ``largest`` pixels per side. Only every ``step``-th candidate is tried, on a smaller sample. Raises
+    ValueError if there is no Gaussian.
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
@@ -195,11 +202,12 @@ def place_cameras(
 
 
 def _lens(size: int) -> np.ndarray:
+    """Return the intrinsics ``[3,3]`` of a placed camera with images of ``size`` pixels per side."""
     return np.array([[size / FIELD, 0, size / 2], [0, size / FIELD, size / 2], [0, 0, 1]])
 
 
 def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre ``[3]`` and half sides ``[3]`` of the box that contains most Gaussians."""
+    """Return centre ``[3]`` and half sides ``[3]`` of the box that contains most of the means ``[n,3]``."""
     low, high = np.quantile(means, EXTENT, axis=0)
     half = (high - low) / 2
     widest = float(half.max()) if half.max() > 0 else 1.0
@@ -209,35 +217,39 @@ def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _sphere(count: int) -> np.ndarray:
     """Return directions ``[count,3]`` spread evenly over the sphere (golden spiral)."""
     i = np.arange(count) + 0.5
-    height, turn = 1 - 2 * i / count, GOLDEN * i
-    ring = np.sqrt(1 - height**2)
-    return np.stack([ring * cos(turn), height, ring * sin(turn)], 1)
+    height, angle = 1 - 2 * i / count, GOLDEN * i
+    radius = np.sqrt(1 - height**2)
+    return np.stack([radius * cos(angle), height, radius * sin(angle)], 1)
 
 
 def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
-    inside = [_look(centre + place * half, direction) for place in grid for direction in _sphere(LOOKS)]
+    inside = [_look(centre + place * half, direction) for place in grid for direction in _sphere(DIRECTIONS)]
     return np.concatenate([_around(centre, half, FAR_RADII, _sphere(AROUND)), inside])
 
 
 def _around(centre: np.ndarray, half: np.ndarray, radii: float, directions: np.ndarray) -> np.ndarray:
-    """Return world-to-camera matrices ``[c,4,4]`` of cameras in directions ``[c,3]`` that look at a scene's centre."""
+    """Return world-to-camera matrices ``[c,4,4]`` of cameras in ``directions [c,3]`` that look at a scene's centre."""
     distance = radii * float(np.sqrt((half * half).sum()))
-    return np.stack([_look(centre + distance * away, -away) for away in directions])
+    return np.stack([_look(centre + distance * direction, -direction) for direction in directions])
 
 
 def _walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
     """Return the world-to-camera matrices ``[count,4,4]`` of cameras on the longest axis that look to all sides."""
     _, side, along = np.eye(3)[np.argsort(half, kind="stable")]
     steps = 2 * (np.arange(count) + 0.5) / count - 1
-    turns = GOLDEN * np.arange(count)
-    looks = cos(turns)[:, None] * along + sin(turns)[:, None] * side
-    return np.stack([_look(middle + s * WALKED * half.max() * along, d) for s, d in zip(steps, looks, strict=True)])
+    angles = GOLDEN * np.arange(count)
+    directions = cos(angles)[:, None] * along + sin(angles)[:, None] * side
+    pairs = zip(steps, directions, strict=True)
+    return np.stack([_look(middle + step * WALKED * half.max() * along, direction) for step, direction in pairs])
 
 
 def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrix, OpenCV axes, of a camera position and a viewing direction."""
+    """Return the world-to-camera matrix ``[4,4]``, OpenCV axes, of a camera at ``eye`` that looks along ``direction``.
+
+    ``direction`` has length 1.
+    """
     up = np.array([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = np.cross(up, direction)
     x /= np.sqrt((x * x).sum())
@@ -251,15 +263,15 @@ def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.nda
     """Measure how much of each Gaussian's opacity each candidate shows, ``[c,n]`` float32."""
     splats, K = make_splats(sample), _lens(PROBE)
 
-    def one_view(viewmat: np.ndarray) -> np.ndarray:
+    def view_shares(viewmat: np.ndarray) -> np.ndarray:
         sums, _ = contributions(tile_view(splats, viewmat, K, PROBE, PROBE, near=near))
         return np.minimum(sums / np.float32(ENOUGH), 1) * splats.opacities
 
-    return np.stack(parallel_map(one_view, viewmats))
+    return np.stack(parallel_map(view_shares, viewmats))
 
 
 def _most_seen(shares: np.ndarray, num_views: int) -> list[int]:
-    """Choose candidates one by one, each time the one that adds the most seen opacity; at least one."""
+    """Choose at least one candidate; each is the one that adds most to the opacity that earlier ones show."""
     seen = np.zeros(shares.shape[1], np.float32)
     chosen: list[int] = []
     for _ in range(num_views):

@@ -38,18 +38,18 @@ FLAT = 2 / 255  # range of the colours of a picture that shows one
 
 @dataclass(frozen=True)
 class Reference:
-    """Which of a canonical scene's pictures a result is fitted to and measured against."""
+    """Pictures of a canonical scene that a result is fitted to and scored on."""
 
-    name: str  # What the pictures are: "photos", or what stands in for them
+    name: str  # What the pictures are: "photos", or what is used instead
     fit_views: tuple[int, ...]  # Views whose pictures a fit may use
-    score_views: tuple[int, ...]  # Views whose pictures say how good a result is
-    placed: bool = False  # Whether these are views that the scene lacks, for judging alone
-    # [v,h,w,3] photos of the input scene as their files have them, where the run changed some
+    score_views: tuple[int, ...]  # Views whose pictures results are scored on
+    placed: bool = False  # The scene has no views: these were placed, only for scores
+    # [v,h,w,3] photos of the input scene as their files have them, if the run changed some
     photo_files: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
     def of_views(self) -> bool:
-        """Whether the scene's own views have pictures, other than renders of it, for the fit and for the scores."""
+        """Whether the scene's own views have pictures other than renders of it, for the fit and for the scores."""
         return bool(self.fit_views) and self.name != RENDERS
 
 
@@ -57,16 +57,16 @@ class Reference:
 class Prepared:
     """A scene in its canonical frame, as the stages use it, with facts about it."""
 
-    input_scene: Scene  # The scene as it was given, in its own world frame, with photos that look as its Gaussians
-    # The canonical scene with pixels: every view once, photos that do not show it replaced, Gaussians that are seen,
-    # or all if none is set aside
+    input_scene: Scene  # The scene as it was given, in its own world frame, with photos that look like its Gaussians
+    # The canonical scene with pixels. Every view is there once, and photos that do not show the scene are replaced. It
+    # has all Gaussians except `unseen`
     scene: PicturedScene
     frame: Frame  # The canonical frame
-    reference: Reference  # What the pictures are for
-    repeated: tuple[int, ...]  # Place in the scene of every given view
-    moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
-    unseen: Gaussians  # Canonical Gaussians that no view sees, if they are kept
-    agreement: Agreement | None = None  # How far views confirm each other's depth; None of one view
+    reference: Reference  # Use of the pictures
+    repeated: tuple[int, ...]  # Index in the canonical scene of every given view
+    moved: bool  # Views were moved to where their photos agree, before a fit or by it
+    unseen: Gaussians  # Canonical Gaussians that no view sees, if the options keep them
+    agreement: Agreement | None = None  # How far views confirm each other's depth; None if they cannot be compared
 
     @property
     def size(self) -> SceneSize:
@@ -74,28 +74,32 @@ class Prepared:
         measured = self.input_scene if self.reference.placed else self.scene
         reference = self.reference
         size = measure_size(measured, "photos" if reference.of_views else "renders")
-        # Gaussians that fill holes are not the file's
+        # Gaussians that fill holes are not in the file and do not count
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 
     @cached_property
     def doubt(self) -> str | None:
-        """Why no score of the scene or of a result says anything, in one sentence; None where scores do."""
+        """Why scores of the scene and of its results mean nothing, in one sentence; None if they mean something."""
+        unlike = unlike_captures(self.scene.gaussians[sample_rows(self.scene)])
+        if unlike is not None:
+            return unlike
         views = list(self.reference.score_views)
-        flat = self.reference.name == RENDERS and all(np.ptp(self.scene.images[view]) < FLAT for view in views)
-        one = "the views show one flat colour, so nothing says how near a result is to it"
-        return unlike_captures(self.scene.gaussians[sample_rows(self.scene)]) or (one if flat and views else None)
+        if views and self.reference.name == RENDERS and all(np.ptp(self.scene.images[view]) < FLAT for view in views):
+            return "the views show one flat colour, so no score can say how near a result is to the scene"
+        return None
 
     @cached_property
     def scene_around(self) -> PicturedScene:
-        """The canonical scene with renders of it around its views besides, which a fit to renders needs."""
+        """The canonical scene with additional renders of it from around its views, which a fit to renders needs."""
         return draw_around(self.scene)
 
     @cached_property
     def _placed(self) -> dict[int, PicturedScene]:
+        """Scenes with placed views that were drawn already, by their number."""
         return {}
 
     def scene_placed(self, views: int) -> PicturedScene:
-        """Return the canonical scene with renders of it from placed views besides, drawn once for each number."""
+        """Return the canonical scene with additional renders of it from placed views, drawn once for each number."""
         if views not in self._placed:
             self._placed[views] = draw_placed(self.scene, views)
         return self._placed[views]
@@ -107,11 +111,11 @@ class Prepared:
         return replace(self, scene=replace(self.scene, cameras=cameras), moved=True)
 
     def result_views(self) -> Scene:
-        """Return the input scene with the photos that a result should match: mended and in a common exposure."""
+        """Return the input scene with the photos that a result should match: corrected and in a common exposure."""
         return _with_photos(self.input_scene, self.scene, self.repeated)
 
     def final_cameras(self) -> Cameras:
-        """Return the input views' cameras in the world, as the fit has moved them."""
+        """Return the input views' cameras in the world, with the poses that the fit has moved."""
         cameras = self.input_scene.cameras
         if not self.moved:
             return cameras
@@ -124,12 +128,12 @@ def prepare(
 ) -> Prepared:
     """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
 
-    ``frame``: canonical frame; None: the scene's own. ``fill``: add Gaussians where only pictures show something.
-    Raises ValueError if there is no finite Gaussian, or if there are images without cameras.
+    ``frame``: canonical frame; None: the scene's own. ``fill``: add Gaussians at pixels that only pictures show. Raises
+    ValueError if there is no finite Gaussian, or if there are images without cameras.
     """
     options = options or PrepareOptions()
-    given, (scene, repeated, said) = scene, without_repeats(scene)
-    for text in said:
+    given, (scene, repeated, notes) = scene, without_repeats(scene)
+    for text in notes:
         note(text)
     scene, frame = canonicalise(add_views(scene), frame)
     prepared = _with_references(given, with_pixels(scene), frame, tuple(repeated), options)
@@ -145,7 +149,7 @@ def prepare(
 
 
 def _photos_before(given: Scene, prepared: Prepared) -> np.ndarray | None:
-    """Return the photos of a given scene if those that results are scored by were changed where they count."""
+    """Return the photos of a given scene if any pixel that results are scored on was changed; otherwise None."""
     photos, scored = prepared.scene.images, prepared.reference.score_views
     if given.images is None or prepared.reference.name != PHOTOS or photos is given.images:
         return None
@@ -159,10 +163,10 @@ def _photos_before(given: Scene, prepared: Prepared) -> np.ndarray | None:
 
 
 def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
-    """Return a copy with Gaussians also where the photos show something and no Gaussian is, but in large parts."""
-    scene, views = prepared.scene, prepared.reference.score_views  # whose photos show the scene
+    """Return a copy with Gaussians added at pixels that photos show and no Gaussian covers, except in large parts."""
+    scene, views = prepared.scene, prepared.reference.score_views  # the views whose photos show the scene
     shown = np.zeros(scene.images.shape[:3], bool)
-    by_rows = prepared.reference.name == ROW_COLORS  # the gaps in their pictures have the colours beside
+    by_rows = prepared.reference.name == ROW_COLORS  # gaps in these pictures have the colours beside them
     shown[list(views)] = True if by_rows or scene.masks is None else scene.masks[list(views)]
     filled = fill_holes(scene, shown, everywhere=options.extent == "photos")
     reference = prepared.reference
@@ -177,7 +181,8 @@ def _with_references(
 ) -> Prepared:
     """Prepare a scene with pixels: choose the pictures that results are fitted to.
 
-    Without photos that show it they are the colours of the views' own Gaussians, or renders where views have none.
+    They are the photos that show the scene; without such photos, the colours of the views' own Gaussians; if views have
+    no Gaussians of their own, renders.
     """
     own = canonical.has_own_pixels
     stand_in = partial(add_row_colors, given=canonical.images is not None) if own else blank_pictures
@@ -190,13 +195,13 @@ def _with_references(
     elif own:
         reference = Reference(ROW_COLORS, every, every)
     else:
-        none = "no photos" if given.images is None else "photos do not count"
-        note(f"{none}: views rendered from the scene itself stand in for them")
+        reason = "no photos" if given.images is None else "photos do not count"
+        note(f"{reason}: renders of the scene itself are used instead")
         scene = draw_pictures(scene)
-        shown = tuple(view for view in every if scene.images[view].any())  # any result looks like an empty view
+        shown = tuple(view for view in every if scene.images[view].any())  # any result equals an empty view
         return Prepared(given, scene, frame, Reference(RENDERS, every, shown or every), repeated, False, unseen)
     given, moved = _with_photos(given, scene, repeated), None
-    if own:  # whose exposure and pose each view's Gaussians have
+    if own:  # each view's Gaussians have the exposure and the pose of the view
         scene = equalise_exposure(scene, reference.score_views, options.exposure)
         fixed, always = options.poses == "fixed", options.poses == "free"
         moved = None if fixed else move_poses(scene, reference.score_views, always=always)
@@ -206,7 +211,10 @@ def _with_references(
 def _with_pictures(
     scene: Scene, stand_in: Callable[[Scene], PicturedScene], look: Look
 ) -> tuple[PicturedScene, tuple[int, ...]]:
-    """Return a scene with pictures, made by ``stand_in`` if no photo shows it, and the views whose photos show it."""
+    """Return a scene with pictures, and the views whose photos show it.
+
+    If there are no such views, ``stand_in`` makes the pictures.
+    """
     if scene.images is not None:
         pictured, views = compare_photos(PicturedScene.with_pictures(scene, scene.images, scene.masks), look)
         if views:
@@ -215,32 +223,33 @@ def _with_pictures(
 
 
 def without_repeats(scene: Scene) -> tuple[Scene, list[int], list[str]]:
-    """Return a scene with each of its views once, the place there of every view, and a note on those that repeat."""
+    """Return a scene with each of its views once, the index in it of every view, and notes on repeated views."""
     views, repeated = distinct_views(scene)
     count = len(scene) - len(views)
     if not count:
         return scene, repeated, []
-    what = "1 view repeats another" if count == 1 else f"{count} views repeat others"
-    return subset(scene, views), repeated, [f"{what} in every pixel and count{'s' * (count == 1)} once"]
+    if count == 1:
+        return subset(scene, views), repeated, ["1 view repeats another in every pixel and counts once"]
+    return subset(scene, views), repeated, [f"{count} views repeat others in every pixel and count once"]
 
 
 def views_notes(scene: Scene) -> list[str]:
-    """Return the notes of a run on repeated views, and on what replaces missing ones, without comparing colours."""
+    """Return the notes of a run on repeated views, and on missing views or photos, without comparing colours."""
     if len(scene) == 0:
         return [NO_VIEWS]
     return [*without_repeats(scene)[2], *([NO_PHOTOS] if _lacks_photos(scene) else [])]
 
 
 def _lacks_photos(scene: Scene) -> bool:
-    """Return whether the rows' own colours stand in for photos."""
+    """Return whether the rows' own colours are used instead of photos."""
     return scene.images is None and scene.is_shown and len(scene) > 0
 
 
-def judged_pictures(scene: Scene) -> tuple[Scene, bool]:
-    """Return a scene with the pictures that results are judged by, and whether :func:`prepare` changes its photos.
+def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
+    """Return a scene with the pictures that results are scored on, and whether :func:`prepare` changes its photos.
 
-    Pictures of a scene with pixels are its rows' own colours where photos are missing, have another look, or do not
-    show it, as :func:`prepare` has it.
+    As in :func:`prepare`, the pictures of a scene with pixels are its rows' own colours if photos are missing, have
+    another look, or do not show the scene.
     """
     has_colors = scene.has_own_pixels and len(scene) > 0
     if len(scene) == 0 or len(scene.gaussians) == 0 or not (has_colors or scene.images is not None):
@@ -259,15 +268,15 @@ def judged_pictures(scene: Scene) -> tuple[Scene, bool]:
 
 @stage("prepare")
 def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
-    """Bring a scene without views into its canonical frame, and add pictures on which results are judged.
+    """Bring a scene without views into its canonical frame, and add pictures on which results are scored.
 
-    Nothing is fitted to these pictures. Raises ValueError if there is no finite Gaussian.
+    These pictures are not used for a fit. Raises ValueError if there is no finite Gaussian.
     """
     finite = keep_finite(scene)
     note(NO_VIEWS)
-    judged, frame = canonicalise(add_scored_views(finite))
-    reference = Reference(RENDERS, (), tuple(range(len(judged))), placed=True)
-    return Prepared(scene, draw_pictures(judged), frame, reference, (), moved=False, unseen=finite.gaussians[:0])
+    scored, frame = canonicalise(add_scored_views(finite))
+    reference = Reference(RENDERS, (), tuple(range(len(scored))), placed=True)
+    return Prepared(scene, draw_pictures(scored), frame, reference, (), moved=False, unseen=finite.gaussians[:0])
 
 
 def _with_photos(given: Scene, canonical: PicturedScene, repeated: Sequence[int]) -> Scene:
@@ -280,7 +289,7 @@ def _with_photos(given: Scene, canonical: PicturedScene, repeated: Sequence[int]
 
 
 def _split_unseen(scene: PicturedScene) -> tuple[PicturedScene, Gaussians]:
-    """Split a scene into seen Gaussians and those that no view sees; if none is seen, keep all together."""
+    """Split a scene into Gaussians that views see and those that no view sees; if none is seen, all stay in it."""
     seen = seen_weights(scene) > 0
     num_unseen = int((~seen).sum())
     note(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")

@@ -1,8 +1,9 @@
-"""Scene without photos -> the same with its own colours in their place, where each view has Gaussians of its own.
+"""Scene without photos -> the scene with the colours of its rows as photos; each view needs Gaussians of its own.
 
 Feed-forward models start the colour of a pixel's Gaussian from the photo. These colours are compared with a drawing of
-the view's own Gaussians from its own camera, both blurred. Where the two disagree, or the Gaussians of a pixel are so
-faint that their colours mean little, the drawing takes their place if it is solid. Pixels without either do not count.
+the view's own Gaussians from its own camera, after both were blurred. If the two disagree, or if the Gaussians of a
+pixel are so faint that their colours mean little, the drawing is used instead, if it is solid. Pixels without either do
+not count.
 """
 
 from __future__ import annotations
@@ -24,23 +25,25 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
 
-OWN_PHOTOS = "the scene's own photos"  # that a fit has seen, in messages
-PHOTOS = "photos"  # what results are fitted to and measured against, in messages
-ROW_COLORS = "the model's own pixels"  # the same where there are none
-RENDERS = "renders of the input"  # and where the rows belong to no pixels either
-NO_PHOTOS = f"no photos: {ROW_COLORS} stand in for them; photos are named with --images"
+OWN_PHOTOS = "the scene's own photos"  # photos that a fit has seen, in messages
+# What results are fitted to and measured against, in messages: photos; without photos, the rows' colours; if rows
+# belong to no pixels either, renders
+PHOTOS = "photos"
+ROW_COLORS = "the model's own pixels"
+RENDERS = "renders of the input"
+NO_PHOTOS = f"no photos: {ROW_COLORS} are used instead; name photos with --images"
 FAINT = 0.1  # opacity of a pixel's Gaussians below which their colours mean little
-# Colours that are the photos' differ from drawings by .18 at most after this blur, in exports of nine captures; by .39
-# after one of 2 pixels, where Gaussians of wrong depth hide others.
-BLUR = 8.0  # standard deviation, pixels
-DISAGREE = 0.2  # mean difference of blurred colours over the channels, sRGB, from which on the drawing is taken
+# Standard deviation in pixels. After this blur, colours from photos differ from drawings by at most .18 in exports of
+# nine captures. After a blur of 2 pixels they differ by .39, where Gaussians of wrong depth hide others
+BLUR = 8.0
+DISAGREE = 0.2  # mean difference of blurred colours over the channels (sRGB) from which on the drawing is used
 T = TypeVar("T")
 
 
 def add_row_colors(scene: Scene, *, given: bool = False) -> PicturedScene:
     """Use the colours of each view's own Gaussians as the photos of a canonical scene, with a note.
 
-    ``given``: whether there are photos, which do not count.
+    ``given``: there are photos, but they do not count.
     """
     shape = len(scene), scene.cameras.height, scene.cameras.width
     images, masks = np.zeros((*shape, 3), np.float32), np.full(shape, False)
@@ -52,23 +55,26 @@ def add_row_colors(scene: Scene, *, given: bool = False) -> PicturedScene:
     num_drawn = sum(picture_rows(scene, keep))
     share = num_drawn / masks.size
     detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE else ""
-    if detail or not given:  # else a note has said it
-        note((f"photos do not count: {ROW_COLORS} stand in for them" if given else NO_PHOTOS) + detail)
+    if detail or not given:  # otherwise an earlier note has said that photos do not count
+        note((f"photos do not count: {ROW_COLORS} are used instead" if given else NO_PHOTOS) + detail)
     return PicturedScene.with_pictures(scene, images, None if masks.all() else masks)
 
 
 @dataclass(frozen=True, eq=False)
 class RowPicture:
-    """Picture that the Gaussians of a camera's own pixels make from there."""
+    """Picture of the Gaussians of a camera's own pixels, from this camera."""
 
-    picture: np.ndarray  # [h,w,3] their colours, or the drawing where it takes the place of these
-    known: np.ndarray  # [h,w] pixels that one of the two shows
-    by_drawing: np.ndarray  # [h,w] pixels of the drawing
-    drawing: np.ndarray  # [h,w,3] before black
+    picture: np.ndarray  # [h,w,3] their colours, or the drawing at the pixels `by_drawing`
+    known: np.ndarray  # [h,w] bool, pixels with a colour or a drawing
+    by_drawing: np.ndarray  # [h,w] bool, pixels at which the drawing is used
+    drawing: np.ndarray  # [h,w,3] drawing before black
 
 
 def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T], wanted: np.ndarray | None = None) -> list[T]:
-    """Return ``use(views, picture)`` for every camera, or those with views in ``wanted [v]``; its views are layers."""
+    """Return ``use(views, picture)`` for every camera; views with the same camera are its layers.
+
+    ``wanted [v]``: only for cameras with a view in this mask.
+    """
     kinds = camera_kinds(scene.cameras)
     groups = [np.flatnonzero(kinds == kind) for kind in range(kinds.max() + 1)]
     groups = [views for views in groups if wanted is None or wanted[views].any()]
@@ -79,27 +85,27 @@ def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
     """Draw the Gaussians of all ``views`` of one camera, and choose between the drawing and their colours."""
     part = subset(scene, views.tolist())
     if len(part.gaussians) == 0:
-        nowhere = np.zeros((scene.cameras.height, scene.cameras.width), bool)
-        black = np.zeros((*nowhere.shape, 3), np.float32)
-        return RowPicture(black, nowhere, nowhere, black)
+        no_pixel = np.zeros((scene.cameras.height, scene.cameras.width), bool)
+        black = np.zeros((*no_pixel.shape, 3), np.float32)
+        return RowPicture(black, no_pixel, no_pixel, black)
     tiled = tile_view(make_splats(part.gaussians), **blank_photos(part.cameras).camera(0))
-    seen = view_colors(tiled)
-    drawing, transmittance = blend(tiled, seen, np.zeros(3, np.float32))
+    tiled_colors = view_colors(tiled)
+    drawing, transmittance = blend(tiled, tiled_colors, np.zeros(3, np.float32))
     colors = sh0_to_rgb(part.gaussians.sh0[:, 0])
-    colors[tiled.ids] = seen
-    own, opacity = _front(part, colors.clip(0, 1))
+    colors[tiled.ids] = tiled_colors
+    row_picture, opacity = _blend_layers(part, colors.clip(0, 1))
     alpha = 1 - transmittance
     drawn = (drawing / np.maximum(alpha, np.float32(1e-3))[..., None]).clip(0, 1)
-    agree = _blurred_difference(own, drawn, np.minimum(opacity, alpha)) < DISAGREE
+    agree = _blurred_difference(row_picture, drawn, np.minimum(opacity, alpha)) < DISAGREE
     solid = transmittance < COVERED
     by_row = (opacity > 0) & ~(solid & ((opacity < FAINT) | ~agree))
     known = by_row | solid
-    picture = fill_gaps(np.where(by_row[..., None], own, drawn), known)
+    picture = fill_gaps(np.where(by_row[..., None], row_picture, drawn), known)
     return RowPicture(picture, known, known & ~by_row, drawing.clip(0, 1))
 
 
-def _front(part: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Blend the layers of one camera, the nearest first: colours ``[h,w,3]`` and opacities ``[h,w]``."""
+def _blend_layers(part: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Blend the layers of one camera, the nearest first; return colours ``[h,w,3]`` and opacities ``[h,w]``."""
     rows = part.get_pixels().fronts
     opacities = np.where(rows >= 0, part.gaussians.opacities[rows], 0).astype(np.float32)
     layers = colors[rows].astype(np.float32)
@@ -107,17 +113,17 @@ def _front(part: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return layers[0], opacities[0]
     means, shape = part.gaussians.means[rows].astype(np.float64), rows.shape
     order = np.argsort(camera_depths(means, part.cameras.viewmats[0]), axis=0, kind="stable")
-    left, total = np.ones(shape[1:], np.float32), np.zeros((*shape[1:], 3), np.float32)
+    transmittance, total = np.ones(shape[1:], np.float32), np.zeros((*shape[1:], 3), np.float32)
     for layer in order:
-        weight = left * np.take_along_axis(opacities, layer[None], 0)[0]
+        weight = transmittance * np.take_along_axis(opacities, layer[None], 0)[0]
         total += weight[..., None] * np.take_along_axis(layers, layer[None, ..., None], 0)[0]
-        left -= weight
-    opacity = 1 - left
+        transmittance -= weight
+    opacity = 1 - transmittance
     return total / np.maximum(opacity, np.float32(1e-6))[..., None], opacity
 
 
 def _blurred_difference(first: np.ndarray, second: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Blur two pictures ``[h,w,3]`` by ``weights [h,w]``; return their difference ``[h,w]``, a mean of the channels."""
+    """Blur two pictures ``[h,w,3]`` with ``weights [h,w]``; return their difference ``[h,w]``, a mean over channels."""
     apart = np.abs(blur((first - second) * weights[..., None], BLUR))
     return (apart[..., 0] + apart[..., 1] + apart[..., 2]) / (3 * np.maximum(blur(weights, BLUR), np.float32(1e-6)))
 

@@ -1,4 +1,4 @@
-"""Scene -> the sizes of it that decide a plan."""
+"""Scene -> the sizes on which a plan depends."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from gsmerge.facts.views import camera_kinds
 from gsmerge.types import Gaussians, Scene
 
-# Of Gaussians that captures have: median largest scale as a share of twice the median distance from the middle, which
-# a far sky does not stretch, and of the diagonal of the box that holds most; median coefficient of the base colours; of
-# fewer nothing is said
+# Bounds for the Gaussians of captures. The median largest scale is at least TINY times twice the median distance from
+# the middle, which a far sky does not stretch, and at most LARGE times the diagonal of the box that holds most of them.
+# The median coefficient of the base colours is at most BRIGHT. Fewer than FEWEST Gaussians are not tested
 TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
-DENSE = 0.5  # Gaussians for each pixel
-FLAT, FAINT = 0.01, 1 / 255  # range of the base colours' coefficients, and median opacity, at least
-SAMPLE_GAUSSIANS = 65536  # Gaussians that these are measured on
-Pictures = Literal["photos", "renders"]  # photos or what stands in for them; drawings of the scene itself
+DENSE = 0.5  # Gaussians per pixel from which on a scene is dense
+FLAT, FAINT = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
+SAMPLE_GAUSSIANS = 65536  # Gaussians that these bounds are tested on
+Pictures = Literal["photos", "renders"]  # photos, or row colours instead; or drawings of the scene itself
 
 
 @dataclass(frozen=True)
@@ -26,16 +26,16 @@ class SceneSize:
 
     num_gaussians: int
     num_views: int
-    height: int  # pixels
+    height: int  # Pixels
     width: int
-    has_own_pixels: bool  # whether each view has Gaussians of its own
-    pictures: Pictures  # what results are fitted to
-    num_cameras: int = 2  # views at different places; 1: one camera took all
+    has_own_pixels: bool  # Each view has Gaussians of its own
+    pictures: Pictures  # What results are fitted to
+    num_cameras: int = 2  # Number of different cameras; 1: all views have the same camera
     sh_degree: int = 0
 
     @property
     def rendered(self) -> bool:
-        """Whether results are measured against renders of the input, for lack of photos and of pixels."""
+        """Whether results are measured against renders of the input, because there are neither photos nor pixels."""
         return self.pictures == "renders"
 
     @property
@@ -45,12 +45,12 @@ class SceneSize:
 
     @property
     def is_dense(self) -> bool:
-        """Whether there are about as many Gaussians as pixels, so that a share of them is enough to show these."""
+        """Whether there are about as many Gaussians as pixels, so that a share of them is enough to show the photos."""
         return self.has_own_pixels or self.num_gaussians >= DENSE * self.num_views * self.pixels_per_view > 0
 
 
 def measure_size(scene: Scene, pictures: Pictures | None = None) -> SceneSize:
-    """Return the sizes of a scene; ``pictures`` None: as they are before photos are compared with the Gaussians."""
+    """Return the sizes of a scene; ``pictures`` None: photos if there are any, whether they show the scene or not."""
     if pictures is None:
         pictures = "photos" if scene.is_shown else "renders"
     cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
@@ -62,9 +62,9 @@ def measure_size(scene: Scene, pictures: Pictures | None = None) -> SceneSize:
 
 
 def unlike_captures(gaussians: Gaussians) -> str | None:
-    """Say in which way finite Gaussians are as those of no capture, in one sentence; None where nothing is odd.
+    """Say in one sentence how finite Gaussians differ from those of all captures; None if they do not.
 
-    Bounds are in docs/reference/conventions.md.
+    The bounds are in docs/reference/conventions.md.
     """
     if len(gaussians) < FEWEST:
         return None
@@ -88,4 +88,4 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
         problem = f"half of the Gaussians are at least {size / max(diagonal, 1e-30):.2g} times as large as the scene"
     else:
         return None
-    return f"{problem}, as in no capture: are they stored otherwise? nothing is scored"
+    return f"{problem}, unlike in any capture; the file may store them in another way; nothing is scored"

@@ -1,8 +1,8 @@
-"""Gaussians and cameras -> support: in how many views each Gaussian takes part.
+"""Gaussians and cameras -> support: the number of views that show each Gaussian.
 
-A fit fills what no photo shows with guesses: behind what stands in front, beyond the borders of the pictures. From the
-photos' cameras nobody sees them; who steps back takes them for surface. So results can say which these are, leave them
-out, or show them faintly.
+Where no photo shows the scene, behind other surfaces and beyond the borders of the pictures, the Gaussians of a fit are
+guesses. They are invisible from the photos' cameras, but from farther away they look like surfaces. So results can mark
+these Gaussians, leave them out, or show them faintly.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
-from gsmerge.types import Cameras, Gaussians, make_scene
+from gsmerge.types import Cameras, Gaussians
 
-LEAST = FitOptions().min_contribution  # blending weight of a pixel from which on a view shows a Gaussian, as for a fit
-LEVEL, SIDE = 2, 480  # pictures are that much smaller, as where a fit looks for Gaussians, and at most so wide
-# Colours, sRGB, of what no view and what one view shows, and their share in a picture; the rest keeps its own
+LEAST = FitOptions().min_contribution  # least blending weight in a pixel of a Gaussian that a view shows, as in a fit
+LEVEL, SIDE = 2, 480  # factor by which pictures are smaller, as in a fit's search for Gaussians; their largest width
+# Colours (sRGB) of Gaussians that no view or one view shows, and the weight of these colours; others keep their own
 TINTS, TINT = {0: (230, 40, 40), 1: (255, 190, 0)}, 0.7
 
 
 def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """Count the views that show each of n canonical Gaussians, ``[n]`` int32.
 
-    A view shows a Gaussian that has a blending weight of at least 1/255 in some pixel, the least that a fit keeps.
+    A view shows a Gaussian that has a blending weight of at least 1/255 in some pixel, the least weight that a fit
+    keeps.
     """
     splats = make_splats(gaussians)
     pictures = blank_photos(cameras, max(LEVEL, max(cameras.width, cameras.height) / SIDE))
@@ -43,13 +44,13 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
 
 def count_views_in_world(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
-    """Count the views, at least one, that show each of n Gaussians of their own world, ``[n]`` int32."""
-    frame = scene_frame(make_scene(gaussians, cameras))
+    """Count the views that show each of n Gaussians in their own world, ``[n]`` int32; there is at least one view."""
+    frame = scene_frame(Scene.of(gaussians, cameras))
     return count_views(frame.enter(gaussians), frame.enter_cameras(cameras))
 
 
 def tint(gaussians: Gaussians, counts: np.ndarray) -> Gaussians:
-    """Colour what one view and what no view shows, by the ``counts [n]`` of :func:`count_views`."""
+    """Tint the Gaussians that one view or no view shows, by the ``counts [n]`` of :func:`count_views`."""
     sh0, shN = gaussians.sh0.copy(), gaussians.shN.copy()
     for count, color in TINTS.items():
         rows = counts == count

@@ -1,4 +1,4 @@
-"""Choice of views: given, held out (the paper's rule, supplement A, "View sampling"), and scored; their cameras."""
+"""Choose views: given, held out (the paper's rule, supplement A, "View sampling"), and scored; select their cameras."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from gsmerge.types import PER_PIXEL, Cameras, Pixels, Scene, SceneT
 
-MAX_SCORED_VIEWS = 24  # views by which whole scenes are judged where something depends on it
-REPORT_VIEWS = 4  # views that input and result are scored on for the report alone
-BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of scenes with a part for each view
+MAX_SCORED_VIEWS = 24  # most scored views of a scene if a decision depends on the score
+REPORT_VIEWS = 4  # most scored views if only the report needs the score
+BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of a scene with one part for each view
 
 
 def even_views(num_views: int, count: int) -> list[int]:
@@ -34,7 +34,7 @@ def scored_views(num_views: int) -> list[int]:
 
 
 def pick_views(num_views: int, most: int) -> list[int]:
-    """Return at most ``most`` evenly spread view ids, where possible without the first and the last view."""
+    """Return at most ``most`` evenly spread view ids, if possible without the first and the last view."""
     count = min(num_views, most)
     return [int((i + 0.5) * num_views / count) for i in range(count)]
 
@@ -61,13 +61,13 @@ def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
     A view repeats another if camera, photo and Gaussians are equal; it then has the index of that view.
     """
     kinds = camera_kinds(scene.cameras)
-    kept, places = list[int](), list[int]()
+    distinct, places = list[int](), list[int]()
     for view, kind in enumerate(kinds):
-        equal = (i for i, other in enumerate(kept) if kinds[other] == kind and _equal_views(scene, other, view))
-        places.append(next(equal, len(kept)))
-        if places[-1] == len(kept):
-            kept.append(view)
-    return kept, places
+        equal = (i for i, other in enumerate(distinct) if kinds[other] == kind and _equal_views(scene, other, view))
+        places.append(next(equal, len(distinct)))
+        if places[-1] == len(distinct):
+            distinct.append(view)
+    return distinct, places
 
 
 def _equal_views(scene: Scene, first: int, second: int) -> bool:
@@ -82,9 +82,9 @@ def _equal_views(scene: Scene, first: int, second: int) -> bool:
 
 
 def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
-    """Return the scene with only the views ``view_ids``, and their Gaussians where each has its own.
+    """Return the scene with only the views ``view_ids``, and only their Gaussians if views have Gaussians of their own.
 
-    Elsewhere all Gaussians stay, and their pixels are to be found again.
+    Otherwise all Gaussians stay, and their pixels are unknown.
     """
     ids = list(view_ids)
     parts = {name: value[ids] for name, value in vars(scene).items() if name in BY_VIEW and value is not None}
@@ -98,7 +98,7 @@ def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
 
 
 def take_rows(scene: SceneT, rows: np.ndarray) -> SceneT:
-    """Return the scene with only the Gaussians ``rows [m]``, ascending; pixels that showed others show none."""
+    """Return the scene with only the Gaussians ``rows [m]``, ascending; pixels of other Gaussians show none."""
     filled = None if scene.filled is None else scene.filled[rows]
     part = replace(scene, gaussians=scene.gaussians[rows], filled=filled, pixels=None)
     if not scene.has_own_pixels:

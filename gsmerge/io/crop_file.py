@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import angles_of
+from gsmerge.geometry import rotmat_to_euler
 from gsmerge.io.bounds import read_table
 from gsmerge.settings.stages import parse_crop
 
@@ -42,7 +42,7 @@ def _list_box(table: Mapping[str, Any]) -> list[float]:
     keys = _check_keys(table)
     if "matrix" in keys:
         middle, halves, rotation = _parse_matrix(table)
-        return [*(middle - halves), *(middle + halves), *angles_of(rotation)]
+        return [*(middle - halves), *(middle + halves), *rotmat_to_euler(rotation)]
     rotate = _parse_numbers(table, "rotate") if "rotate" in table else np.zeros(3)
     if "min" in keys:
         return [*_parse_numbers(table, "min"), *_parse_numbers(table, "max"), *rotate]

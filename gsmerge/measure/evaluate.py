@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gsmerge.arguments import check_arguments
 from gsmerge.arrays import as_pictures
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import judged_pictures
+from gsmerge.facts.prepare import scored_pictures
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.facts.views import pick_views
 from gsmerge.frame import scene_frame
@@ -224,7 +224,7 @@ def evaluate(
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
     given = scene if scene.images is None else replace(scene, images=as_pictures(scene.images))
-    scene, mended = judged_pictures(given)
+    scene, mended = scored_pictures(given)
     inputs, after = scene.file_gaussians, {name: own_gaussians(value).numpy() for name, value in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_pictures(targets.images))

@@ -11,6 +11,7 @@ from gsmerge.geometry import (
     camera_centres,
     clamp_inside,
     covariances,
+    euler_to_rotmat,
     lies_inside,
     lower_median,
     middle_depth,
@@ -20,7 +21,6 @@ from gsmerge.geometry import (
     quat_to_rotmat,
     rotmat_to_quat,
     step_outside,
-    turn_by,
 )
 from gsmerge.types import Cameras, Region
 
@@ -114,7 +114,7 @@ def test_points_are_clamped_to_the_nearest_inside(seed: int, is_sphere: bool, or
     """In any frame: no other point of the region is nearer, and what is inside stays."""
     rng = np.random.default_rng(seed)
     half = np.full(3, 1.5) if is_sphere else rng.uniform(0.5, 3, 3)
-    axes = np.eye(3) if is_sphere else turn_by(rng.uniform(-180, 180, 3))
+    axes = np.eye(3) if is_sphere else euler_to_rotmat(rng.uniform(-180, 180, 3))
     world = Region(rng.normal(size=3), half, axes, is_sphere)
     region, points = move_region(world, np.full(3, origin), unit), rng.normal(size=(40, 3)) * 4
     inside = lies_inside(world, points)

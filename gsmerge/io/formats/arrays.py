@@ -9,7 +9,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from gsmerge.arrays import Array, as_array
-from gsmerge.geometry import apply_turn, harmonics_turn, morton_codes, multiply_quats, rotmat_to_quat, sh0_to_rgb
+from gsmerge.geometry import (
+    apply_harmonics_rotation,
+    harmonics_rotation,
+    morton_codes,
+    multiply_quats,
+    rotmat_to_quat,
+    sh0_to_rgb,
+)
 from gsmerge.io.bounds import ReadBudget
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
@@ -306,14 +313,14 @@ def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns
         return lambda columns: columns
     sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())  # a mirrored ellipsoid is a turned one
     quat = rotmat_to_quat(sign * rotation[None])[0]
-    turn = harmonics_turn(num_higher, rotation) if num_higher else np.zeros((0, 0))
+    turn = harmonics_rotation(num_higher, rotation) if num_higher else np.zeros((0, 0))
     turn = np.where(np.abs(turn - np.round(turn)) < _EXACT, np.round(turn), turn)
     signs = np.diagonal(turn)[:, None] if np.array_equal(turn, np.diag(np.diagonal(turn))) else None  # of half turns
     return lambda columns: replace(
         columns,
         means=matmul(columns.means, rotation.T),
         quats=multiply_quats(quat, columns.quats),
-        harmonics=apply_turn(columns.harmonics, turn) if signs is None else columns.harmonics * signs,
+        harmonics=apply_harmonics_rotation(columns.harmonics, turn) if signs is None else columns.harmonics * signs,
     )
 
 

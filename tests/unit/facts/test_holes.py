@@ -125,9 +125,7 @@ def test_rows_without_pixels_are_followed_by_new_ones() -> None:
     before, after = (render(some.gaussians, some.cameras).alphas for some in (scene, filled))
     assert (before < 0.5).mean() > 0.3
     assert (after > 0.5).mean() > 0.99
-    assert noted(
-        record.notes, f"{len(filled.gaussians) - count:,} pixels that Gaussians hardly cover, or not at all, get"
-    )
+    assert noted(record.notes, f"{len(filled.gaussians) - count:,} pixels that no Gaussian covers enough get")
 
 
 def test_a_part_of_what_the_photos_show_stays_one() -> None:
@@ -170,7 +168,7 @@ def test_dropped_pixels_are_filled_with_cameras(tmp_path: Path, photos: bool) ->
     assert np.array_equal(np.flatnonzero(scene.pixels.shown.reshape(-1)), da3_rows(tiny))
     with record_run() as record:
         prepared = prepare(scene)
-    assert noted(record.notes, "pixels that Gaussians hardly cover")
+    assert noted(record.notes, "pixels that no Gaussian covers enough")
     alphas = render(prepared.scene.gaussians, prepared.scene.cameras).alphas
     assert (alphas > 0.5).mean() > 0.99
     assert np.array_equal(prepared.input_scene.pixels.shown, scene.pixels.shown)

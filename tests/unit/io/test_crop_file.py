@@ -14,11 +14,11 @@ from messages import refuses
 from gsmerge.cli.parameters import Args
 from gsmerge.errors import SceneError
 from gsmerge.facts.crop import inside_crop
-from gsmerge.geometry import angles_of, turn_by
+from gsmerge.geometry import euler_to_rotmat, rotmat_to_euler
 from gsmerge.io.crop_file import read_crop
 from gsmerge.settings.stages import CleanOptions, parse_crop
 
-TURN = turn_by(np.array([20.0, -50.0, 110.0]))
+TURN = euler_to_rotmat(np.array([20.0, -50.0, 110.0]))
 
 
 def crop(folder: Path, **table: Any) -> str:
@@ -56,8 +56,8 @@ def test_both_forms_of_a_sphere(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("degrees", [(0, 0, 0), (20, -50, 110), (-170, 89, 3), (30, 90, 40), (0, -90, 0), (180, 0, 0)])
 def test_angles_are_those_of_the_turn(degrees: tuple[float, ...]) -> None:
-    rotation = turn_by(np.array(degrees, float))
-    np.testing.assert_allclose(turn_by(angles_of(rotation)), rotation, atol=1e-8)
+    rotation = euler_to_rotmat(np.array(degrees, float))
+    np.testing.assert_allclose(euler_to_rotmat(rotmat_to_euler(rotation)), rotation, atol=1e-8)
 
 
 def test_the_command_line_reads_crops_from_files(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from former_formats import spz4_bytes
 from slow_readers import corners
 
 from gsmerge import Gaussians
-from gsmerge.geometry import covariances, turn_harmonics
+from gsmerge.geometry import covariances, rotate_harmonics
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.read import file_notes
 from gsmerge.io.formats.spz import AXES, gzip_bytes, spz_bytes
@@ -118,7 +118,7 @@ def test_axes_are_turned_to_those_of_a_ply(
     signs = np.array([[-1.0], [1], [-1]])  # degree 1 is a vector: -y, z and -x
     before, after = ((g.shN[:, :3] * signs)[:, [2, 0, 1]] for g in (plain, turned))
     np.testing.assert_allclose(after, turn @ before, atol=1e-5)
-    np.testing.assert_allclose(turned.shN, turn_harmonics(plain.shN, turn), atol=1e-5)
+    np.testing.assert_allclose(turned.shN, rotate_harmonics(plain.shN, turn), atol=1e-5)
     assert bool(file_notes(ply.info)) == (axes != "RDF")
     assert all(axes in note for note in file_notes(ply.info))
 
