@@ -94,7 +94,7 @@ def of_spz() -> dict[str, Damage]:
         "version 1 of version 3": either(header(version=1)),
         "another degree": refused(header(degree=4), 552, 174),
         "a fraction of 200 bits": refused(header(fraction=200), "version 1 to 4"),
-        "none": refused(header(count=0), "none promised"),
+        "none": refused(header(count=0), "a count of 0"),
         "2^32 - 1": refused(header(count=2**32 - 1), "64 MB"),
         "one more": refused(header(count=len(SOME) + 1), 203, 174),
         "1,000,001 equal ones": refused(content(equal_bytes(1_000_001)), "1,000,001"),
@@ -122,7 +122,7 @@ def of_spz4() -> dict[str, Damage]:
         "15 bytes": refused(of_bytes(lambda data: data[:15]), "end of file"),
         "60 bytes": refused(of_bytes(lambda data: data[:60]), "end of file"),
         "three bytes less": refused(of_bytes(lambda data: data[:-3]), "truncated"),
-        "none": refused(at(PLACE_OF_COUNT, "<I", 0), "none promised"),
+        "none": refused(at(PLACE_OF_COUNT, "<I", 0), "a count of 0"),
         "2^32 - 1": refused(at(PLACE_OF_COUNT, "<I", 2**32 - 1), "64 MB"),
         "degree 5": refused(at(12, "B", 5), "degree 5"),
         "three streams": refused(at(15, "B", 3), "columns"),
@@ -131,7 +131,7 @@ def of_spz4() -> dict[str, Damage]:
         "a stream that unpacks to 2^40": refused(at(SIZES.start + 8, "<Q", 2**40), "columns"),
         "no stream": refused(at(SIZES.stop, "4s", b"none"), "Zstandard"),
         "a frame of another size": refused(at(SIZES.stop, f"{len(frame)}s", frame), "Zstandard"),
-        "a longer stream": refused(of_bytes(stream), "another size"),
+        "a longer stream": refused(of_bytes(stream), "sizes of its table"),
     }
 
 
@@ -208,7 +208,7 @@ def of_glb() -> dict[str, Damage]:
             damages[f"{part} of {value}"] = either(place("nodes", 0, part, value=[value] * 3))
     accessor, view = ("accessors", 2), ("bufferViews", 0)
     return damages | {
-        "another length in the header": refused(at(8, "<I", 2**32 - 1), "cut"),
+        "another length in the header": refused(at(8, "<I", 2**32 - 1), "truncated"),
         "the same document": read(of_bytes(lambda data: document(data)[1](document(data)[0]))),
         "no splats": refused(primitive(lambda p: p["extensions"].clear()), SPLATTING, "mesh"),
         "linear colours": refused(splats(colorSpace="lin_rec709_display"), "lin_rec709_display"),
@@ -220,9 +220,9 @@ def of_glb() -> dict[str, Damage]:
         ),
         "another file": refused(place("buffers", 0, "uri", value="b.bin"), "another file"),
         "sparse values": refused(place(*accessor, "sparse", value={}), "sparse"),
-        "a count of 10^12": refused(place(*accessor, "count", value=10**12), "cut"),
+        "a count of 10^12": refused(place(*accessor, "count", value=10**12), "truncated"),
         "a count of 400 digits": refused(place("accessors", 0, "count", value=10**400), "count"),
-        "a count of 10^9": refused(place("accessors", 0, "count", value=10**9), "cut"),
+        "a count of 10^9": refused(place("accessors", 0, "count", value=10**9), "truncated"),
         "fewer of one attribute": refused(place(*accessor, "count", value=5), "others"),
         "a length of 2^62": either(place(*view, "byteLength", value=2**62)),
         "a stride of 2^62": either(place(*view, "byteStride", value=2**62)),
@@ -240,11 +240,11 @@ def of_glb() -> dict[str, Damage]:
 def of_glb_of_spz() -> dict[str, Damage]:
     view = ("bufferViews", 0)
     return {
-        "a length of 10^9": refused(place(*view, "byteLength", value=10**9), "cut"),
-        "a negative offset": refused(place(*view, "byteOffset", value=-900), "cut"),
+        "a length of 10^9": refused(place(*view, "byteLength", value=10**9), "truncated"),
+        "a negative offset": refused(place(*view, "byteOffset", value=-900), "truncated"),
         "an offset of 4": refused(edit(lambda d: d["bufferViews"][0].update(byteOffset=4, byteLength=100)), "gzip"),
         "forty .spz in one": refused(many_spz, slow=True),
-        "another buffer": refused(place(*view, "buffer", value=1), "cut"),
+        "another buffer": refused(place(*view, "buffer", value=1), "truncated"),
     }
 
 
