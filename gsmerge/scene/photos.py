@@ -463,7 +463,7 @@ def describe_assignment(
     for kind, files in changes.items():
         if files:
             names = list_some(files)
-            notes.append(f"{len(files)} of {count} photos are {kind} in their views relative to their tags: {names}")
+            notes.append(f"{len(files)} of {count} photos are {kind} relative to their orientation tags: {names}")
     moved = [
         f"{camera_file.names[view]}: {_inside(proposal.pool[each.photo], proposal)}"
         for view, each in enumerate(chosen)

@@ -94,7 +94,7 @@ def of_spz() -> dict[str, Damage]:
         "version 1 of version 3": allow(edit_header(version=1)),
         "another degree": refuse(edit_header(degree=4), 552, 174),
         "a fraction of 200 bits": refuse(edit_header(fraction=200), "version 1 to 4"),
-        "none": refuse(edit_header(count=0), "none promised"),
+        "none": refuse(edit_header(count=0), "a count of 0"),
         "2^32 - 1": refuse(edit_header(count=2**32 - 1), "64 MB"),
         "one more": refuse(edit_header(count=len(SOME) + 1), 203, 174),
         "1,000,001 equal ones": refuse(write(equal_bytes(1_000_001)), "1,000,001"),
@@ -122,7 +122,7 @@ def of_spz4() -> dict[str, Damage]:
         "15 bytes": refuse(edit_bytes(lambda data: data[:15]), "end of file"),
         "60 bytes": refuse(edit_bytes(lambda data: data[:60]), "end of file"),
         "three bytes less": refuse(edit_bytes(lambda data: data[:-3]), "truncated"),
-        "none": refuse(pack_at(PLACE_OF_COUNT, "<I", 0), "none promised"),
+        "none": refuse(pack_at(PLACE_OF_COUNT, "<I", 0), "a count of 0"),
         "2^32 - 1": refuse(pack_at(PLACE_OF_COUNT, "<I", 2**32 - 1), "64 MB"),
         "degree 5": refuse(pack_at(12, "B", 5), "degree 5"),
         "three streams": refuse(pack_at(15, "B", 3), "columns"),
@@ -131,7 +131,7 @@ def of_spz4() -> dict[str, Damage]:
         "a stream that unpacks to 2^40": refuse(pack_at(SIZES.start + 8, "<Q", 2**40), "columns"),
         "no stream": refuse(pack_at(SIZES.stop, "4s", b"none"), "Zstandard"),
         "a frame of another size": refuse(pack_at(SIZES.stop, f"{len(frame)}s", frame), "Zstandard"),
-        "a longer stream": refuse(edit_bytes(lengthen_stream), "another size"),
+        "a longer stream": refuse(edit_bytes(lengthen_stream), "sizes of its table"),
     }
 
 
@@ -208,7 +208,7 @@ def of_glb() -> dict[str, Damage]:
             damages[f"{part} of {value}"] = allow(set_json("nodes", 0, part, value=[value] * 3))
     accessor, view = ("accessors", 2), ("bufferViews", 0)
     return damages | {
-        "another length in the header": refuse(pack_at(8, "<I", 2**32 - 1), "cut"),
+        "another length in the header": refuse(pack_at(8, "<I", 2**32 - 1), "truncated"),
         "the same document": accept(edit_bytes(lambda data: document(data)[1](document(data)[0]))),
         "no splats": refuse(edit_primitive(lambda p: p["extensions"].clear()), SPLATTING, "mesh"),
         "linear colours": refuse(edit_splats(colorSpace="lin_rec709_display"), "lin_rec709_display"),
@@ -220,9 +220,9 @@ def of_glb() -> dict[str, Damage]:
         ),
         "another file": refuse(set_json("buffers", 0, "uri", value="b.bin"), "another file"),
         "sparse values": refuse(set_json(*accessor, "sparse", value={}), "sparse"),
-        "a count of 10^12": refuse(set_json(*accessor, "count", value=10**12), "cut"),
+        "a count of 10^12": refuse(set_json(*accessor, "count", value=10**12), "truncated"),
         "a count of 400 digits": refuse(set_json("accessors", 0, "count", value=10**400), "count"),
-        "a count of 10^9": refuse(set_json("accessors", 0, "count", value=10**9), "cut"),
+        "a count of 10^9": refuse(set_json("accessors", 0, "count", value=10**9), "truncated"),
         "fewer of one attribute": refuse(set_json(*accessor, "count", value=5), "others"),
         "a length of 2^62": allow(set_json(*view, "byteLength", value=2**62)),
         "a stride of 2^62": allow(set_json(*view, "byteStride", value=2**62)),
@@ -240,11 +240,11 @@ def of_glb() -> dict[str, Damage]:
 def of_glb_of_spz() -> dict[str, Damage]:
     view = ("bufferViews", 0)
     return {
-        "a length of 10^9": refuse(set_json(*view, "byteLength", value=10**9), "cut"),
-        "a negative offset": refuse(set_json(*view, "byteOffset", value=-900), "cut"),
+        "a length of 10^9": refuse(set_json(*view, "byteLength", value=10**9), "truncated"),
+        "a negative offset": refuse(set_json(*view, "byteOffset", value=-900), "truncated"),
         "an offset of 4": refuse(edit_json(lambda d: d["bufferViews"][0].update(byteOffset=4, byteLength=100)), "gzip"),
         "forty .spz in one": refuse(write_many_spz, slow=True),
-        "another buffer": refuse(set_json(*view, "buffer", value=1), "cut"),
+        "another buffer": refuse(set_json(*view, "buffer", value=1), "truncated"),
     }
 
 

@@ -1,1 +1,1 @@
-"""File formats of Gaussians, one module each."""
+"""Read and write the file formats of Gaussians, each in its own module."""

@@ -1,4 +1,4 @@
-"""Gaussians in the units of most file formats: :class:`Columns` to write, :class:`StoredRows` as read."""
+"""Convert Gaussians to and from the units of most file formats: :class:`Columns`, :class:`StoredRows`, comments."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
 
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
-LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
-RESULT_COMMENT = "gsmerge result"  # in its place in results of commands; as long, so that sizes stay the same
-RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
-NEW_VIEWS_COMMENT = "gsmerge new views"  # and the PSNR that new views of the input and of the result have, dB
+LOGIT_COMMENT = "opacity: logit"  # the encoding of files that gsmerge writes is stated, not guessed
+RESULT_COMMENT = "gsmerge result"  # instead of it in results of commands; of equal length, so that sizes are equal
+RENDER_COMMENT = "SplatRenderMode"  # written by Brush, with the mode of rendering
+NEW_VIEWS_COMMENT = "gsmerge new views"  # followed by the PSNR (dB) of new views of the input and of the result
 MAX_COPIED = 100  # characters of a comment that is copied to other files
-MIP, FLAT = "mip", "2dgs"  # modes of rendering that are not plain: with a filter of their own; 2D Gaussians
+MIP, FLAT = "mip", "2dgs"  # special modes of rendering: antialiased; 2D Gaussians
 MIP_COMMENT, FLAT_COMMENT = f"{RENDER_COMMENT}: {MIP}", f"{RENDER_COMMENT}: {FLAT}"
-_MODE = re.compile(rf"{RENDER_COMMENT}: (\w+)|antialiased ([01])")  # Brush's and Postshot's
-_VERTICAL = re.compile(r"Vertical axis: [+-]?[xyz]", re.IGNORECASE)  # Brush's, of the file's frame
+_MODE = re.compile(rf"{RENDER_COMMENT}: (\w+)|antialiased ([01])")  # Brush's and Postshot's comments
+_VERTICAL = re.compile(r"Vertical axis: [+-]?[xyz]", re.IGNORECASE)  # Brush's comment on the file's frame
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
-PLAIN_COLORS = (("red", "green", "blue"), ("r", "g", "b"))  # instead of the former, in nerfstudio's files and 4DGT's
+PLAIN_COLORS = (("red", "green", "blue"), ("r", "g", "b"))  # instead of SH0, in files of nerfstudio and of 4DGT
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
-FILTER = "filter_3D"  # of Mip-Splatting: the standard deviation by which scales grow
-PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of a compressed PLY instead
+FILTER = "filter_3D"  # of Mip-Splatting: standard deviation of the filter that is added to all scales
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # instead of these in compressed PLYs
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
-MAX_STRAY = 0.01  # share of a column's values that may contradict the rest: roundings and damage
-_EXACT = 1e-5  # by which a number that turns harmonics may differ from a whole one that it is
+MAX_STRAY = 0.01  # share of a column's values that may contradict the rest, because of roundings and damage
+_EXACT = 1e-5  # largest rounding error of a whole number in a matrix that turns harmonics
 _UNPACKING = 16_000_000  # bytes of the blocks that are unpacked at a time
-GAUSSIAN_BYTES = 4 * len(REQUIRED) + 1  # in memory, without higher harmonics, and whether it is finite
+GAUSSIAN_BYTES = 4 * len(REQUIRED) + 1  # in memory, without higher harmonics, with its flag of validity
 
 
 def sh_degree(num_higher: int) -> int:
@@ -55,7 +55,7 @@ def sh_degree(num_higher: int) -> int:
 def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
     """Return the header comments that copies of a file keep: how to render the Gaussians, and which axis is vertical.
 
-    Of several that say the same thing, the last one counts.
+    Of several comments on the same thing, the last one counts.
     """
     mode = render_mode(comments)
     vertical = [line for line in comments if is_of_frame(line)]
@@ -68,19 +68,22 @@ def is_of_frame(comment: object) -> bool:
 
 
 def upward_axis(comments: Sequence[object]) -> str | None:
-    """Return the axis that header comments call vertical, such as "z"; None without.
+    """Return the axis that header comments call vertical, such as "z" or "-z"; None without such a comment.
 
-    None of y, too: there programs mean -y, which is usual, by it.
+    None for "y" as well, since programs write it for the usual axis, which is -y.
     """
     axes = [str(comment).split()[-1].lower().removeprefix("+") for comment in comments if is_of_frame(comment)]
     return axes[-1] if axes and axes[-1] != "y" else None
 
 
 def render_mode(comments: Sequence[object]) -> str | None:
-    """Return how header comments ask viewers to render the Gaussians, ``MIP`` or ``FLAT``; None: plainly."""
+    """Return the mode of rendering that header comments ask for, ``MIP`` or ``FLAT``; None for the plain mode."""
     lines = (line for line in comments if isinstance(line, str) and len(line) <= MAX_COPIED)
-    said = [match for match in map(_MODE.fullmatch, lines) if match is not None]
-    mode = (said[-1][1] or (MIP if said[-1][2] == "1" else "")).lower() if said else ""
+    matches = [match for match in map(_MODE.fullmatch, lines) if match is not None]
+    if not matches:
+        return None
+    mode, antialiased = matches[-1].groups()
+    mode = (mode or (MIP if antialiased == "1" else "")).lower()
     return mode if mode in (MIP, FLAT) else None
 
 
@@ -89,10 +92,10 @@ class ExpectedScores:
     """PSNR (dB) that new views of a scene are expected to have.
 
     Args:
-        before: Rendered from the input.
-        after: From the result.
-        low: Least that they are expected to gain: of ten results one gains less.
-        high: Most that they are expected to gain: of ten results one gains more.
+        before: When rendered from the input.
+        after: When rendered from the result.
+        low: Lower bound of the expected gain; one of ten results gains less.
+        high: Upper bound of the expected gain; one of ten results gains more.
     """
 
     before: float
@@ -102,18 +105,18 @@ class ExpectedScores:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Least and most that new views are expected to gain, dB."""
+        """Lower and upper bound of the expected gain of new views, dB."""
         return self.low, self.high
 
 
 def new_views_comment(scores: ExpectedScores) -> str:
-    """Return the header comment of a result that says what new views are expected to gain, dB."""
+    """Return the header comment of a result on the expected scores of new views."""
     gain = f"gain {scores.low:.2f} to {scores.high:.2f} dB"
     return f"{NEW_VIEWS_COMMENT}: {scores.before:.2f} to {scores.after:.2f} dB, {gain}"
 
 
 def read_new_views(comments: Sequence[object]) -> ExpectedScores | None:
-    """Read what new views of the input and of a result are expected to have from header comments; None without."""
+    """Read the expected scores of new views from header comments; None without such a comment."""
     number = r"(-?\d{1,3}\.\d\d)"
     pattern = re.compile(f"{re.escape(NEW_VIEWS_COMMENT)}: {number} to {number} dB, gain {number} to {number} dB")
     matches = (pattern.fullmatch(comment) for comment in comments if isinstance(comment, str))
@@ -122,13 +125,13 @@ def read_new_views(comments: Sequence[object]) -> ExpectedScores | None:
 
 
 def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
-    """Return the column names of the base colour: ``f_dc_*``, or those of plain colours where a file has none."""
+    """Return the column names of the base colour: ``f_dc_*``, or plain colours if a file has only these."""
     plain = (colors for colors in PLAIN_COLORS if set(colors) <= set(names or ()))
     return SH0 if names is None or SH0[0] in names else next(plain, SH0)
 
 
 def are_logarithms(scales: np.ndarray) -> bool:
-    """Return whether stored scales are logarithms: of standard deviations hardly any is negative."""
+    """Return whether stored scales are logarithms, which are often negative, while standard deviations never are."""
     return bool(np.count_nonzero(scales < 0) > MAX_STRAY * scales.size)
 
 
@@ -136,8 +139,8 @@ def are_logarithms(scales: np.ndarray) -> bool:
 class Columns:
     """Columns of n Gaussians as files store them.
 
-    ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]``, ``sh0
-    [n,3]``, ``harmonics [n,k-1,3]``.
+    The fields are ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]`` in [0, 1],
+    ``sh0 [n,3]`` and ``harmonics [n,k-1,3]``.
     """
 
     means: np.ndarray
@@ -152,11 +155,11 @@ class Columns:
 
     @property
     def colors(self) -> np.ndarray:
-        """Base colours ``[n,3]``, 0 to 1 where they can be displayed."""
+        """Base colours ``[n,3]``; only values from 0 to 1 can be displayed."""
         return sh0_to_rgb(self.sh0)
 
     def along_curve(self) -> Columns:
-        """Sort the rows along a space-filling curve, so that neighbours in space are near in the file."""
+        """Return the rows in the order of a space-filling curve, so that neighbours in space are near in the file."""
         return self.take(curve_order(self.means))
 
     def take(self, rows: np.ndarray) -> Columns:
@@ -170,22 +173,22 @@ def curve_order(means: np.ndarray) -> np.ndarray:
 
 
 def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:
-    """Concatenate rows with ``num_higher`` harmonics above degree 0; missing ones become zeros."""
+    """Concatenate rows with ``num_higher`` harmonics above degree 0; missing harmonics become zeros."""
     if len(parts) == 1 and parts[0].harmonics.shape[1] == num_higher:
         return parts[0]
 
     def widen(harmonics: np.ndarray) -> np.ndarray:
         return np.pad(harmonics, ((0, 0), (0, num_higher - harmonics.shape[1]), (0, 0)))
 
-    even = [replace(part, harmonics=widen(part.harmonics)) for part in parts]
-    return Columns(*(np.concatenate([vars(part)[f.name] for part in even]) for f in fields(Columns)))
+    widened = [replace(part, harmonics=widen(part.harmonics)) for part in parts]
+    return Columns(*(np.concatenate([vars(part)[f.name] for part in widened]) for f in fields(Columns)))
 
 
 @dataclass(frozen=True)
 class Packed:
     """``count`` Gaussians as a file packs them; ``unpack``, which is thread-safe, returns a block of them.
 
-    All at once would take several times the memory of both the file and the result.
+    To unpack all at once would take several times the memory of both the file and the result.
     """
 
     count: int
@@ -206,7 +209,7 @@ class PackedRows:
     def __getitem__(self, block: slice) -> np.ndarray:
         start, stop, _ = block.indices(len(self))
         num_higher, first, columns = _num_rest(self.dtype) // 3, 0, []
-        with np.errstate(all="ignore"):  # a scale of 0 is a value, what is not finite is set aside later
+        with np.errstate(all="ignore"):  # the reader accepts scales of 0, and sets aside rows that are not finite
             for part in self.parts:
                 inside = slice(max(start - first, 0), min(stop - first, part.count))
                 columns += [part.unpack(inside)] if inside.start < inside.stop else []
@@ -228,18 +231,18 @@ def _to_table(columns: Columns) -> np.ndarray:
 
 @dataclass(frozen=True)
 class StoredRows:
-    """Gaussians as a file stores them; ``rows``, once adapted, has the columns of a PLY file, at least ``REQUIRED``."""
+    """Gaussians as a file stores them; after ``adapt``, ``rows`` have at least the PLY columns ``REQUIRED``."""
 
     rows: np.ndarray | PackedRows
-    layout: str  # for people
+    layout: str  # the name of the layout for people
     format: str
-    encoding: str | None  # of the opacities: "logit", "raw", or None where the file does not say
+    encoding: str | None  # of the opacities: "logit", "raw", or None if the file does not say
     sizes: dict[str, int]  # bytes by attribute
     comments: tuple[str, ...] = ()
     extra_elements: tuple[str, ...] = ()
-    bytes_beside: int = 0  # of other files that the rows are in
-    notes: tuple[str, ...] = ()  # what was adapted, one sentence each, without a full stop
-    adapt: Callable[[np.ndarray], np.ndarray] | None = None  # gives a block of rows the scales that it should have
+    bytes_beside: int = 0  # of further files that hold rows
+    notes: tuple[str, ...] = ()  # how the content was adapted, one sentence each, without a full stop
+    adapt: Callable[[np.ndarray], np.ndarray] | None = None  # converts a block of rows to the usual columns
 
 
 def pack_rows(parts: Sequence[Packed]) -> PackedRows:
@@ -250,7 +253,10 @@ def pack_rows(parts: Sequence[Packed]) -> PackedRows:
 
 
 def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], mode: str | None = None) -> StoredRows:
-    """Describe packed Gaussians as a file's content; ``sizes``: bytes by attribute, ``mode``: of rendering."""
+    """Make the content of a file from packed Gaussians.
+
+    ``name``: name of the format. ``sizes``: bytes by attribute. ``mode``: mode of rendering, see :func:`render_mode`.
+    """
     rows = pack_rows(parts)
     return StoredRows(
         rows=rows,
@@ -263,14 +269,15 @@ def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], mode: s
 
 
 def most_in_memory(file_bytes: int) -> int:
-    """Return the size in bytes from which arrays are mapped: harmonics may be many times the size of the file."""
+    """Return the bytes above which arrays are mapped, since harmonics may be many times as large as the file."""
     return max(1 << 25, 8 * file_bytes)
 
 
 def check_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
-    """Raise SceneError if the file is too small for ``count`` Gaussians of ``packed_bytes`` each."""
-    beside = min(12 * num_higher * count, most_in_memory(budget.file_bytes)) + _UNPACKING
-    budget.check_memory(count * (packed_bytes + GAUSSIAN_BYTES) + beside, f"{count:,} Gaussians")
+    """Raise SceneError if the file is too small for ``count`` Gaussians, of which each takes ``packed_bytes``."""
+    harmonics = min(12 * num_higher * count, most_in_memory(budget.file_bytes))  # bytes in memory
+    num_bytes = count * (packed_bytes + GAUSSIAN_BYTES) + harmonics + _UNPACKING
+    budget.check_memory(num_bytes, f"{count:,} Gaussians")
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
@@ -278,7 +285,7 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
 
     def check(values: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):
-            bad = np.argwhere(~np.isfinite(values.astype(np.float32)))  # as no format holds larger numbers
+            bad = np.argwhere(~np.isfinite(values.astype(np.float32)))  # no format holds larger numbers
         if len(bad):
             raise ValueError(f"expected finite Gaussians, got NaN or inf in row {first_row + int(bad[0, 0])}")
         return values
@@ -290,7 +297,7 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
     quats = array(gaussians.quats)
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     quats = np.where(length == 0, (1.0, 0.0, 0.0, 0.0), quats) / np.where(length == 0, 1, length)
-    # scales of 0 are clipped, negative ones refused
+    # Scales of 0 are clipped; negative scales become NaN and are refused
     log_scales = np.clip(log(array(gaussians.scales)), -MAX_LOG_SCALE, MAX_LOG_SCALE)
     return Columns(
         means=array(gaussians.means),
@@ -303,19 +310,21 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
 
 
 def turn_half(columns: Columns) -> Columns:
-    """Turn Gaussians by half a turn about z, from y down to y up."""
+    """Rotate Gaussians by half a turn about z, from y down to y up."""
     return turner(np.diag([-1.0, -1.0, 1.0]), columns.harmonics.shape[1])(columns)
 
 
 def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
-    """Return a function that turns Gaussians by an orthogonal matrix ``[3,3]``, which may mirror them."""
+    """Return a function that rotates Gaussians by an orthogonal matrix ``[3,3]``, which may mirror them."""
     if np.array_equal(rotation, np.eye(3)):
         return lambda columns: columns
-    sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())  # a mirrored ellipsoid is a turned one
+    # Its determinant: a mirrored ellipsoid is the same as one turned by the negative matrix
+    sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())
     quat = rotmat_to_quat(sign * rotation[None])[0]
     turn = harmonics_rotation(num_higher, rotation) if num_higher else np.zeros((0, 0))
     turn = np.where(np.abs(turn - np.round(turn)) < _EXACT, np.round(turn), turn)
-    signs = np.diagonal(turn)[:, None] if np.array_equal(turn, np.diag(np.diagonal(turn))) else None  # of half turns
+    is_diagonal = np.array_equal(turn, np.diag(np.diagonal(turn)))  # as for half turns
+    signs = np.diagonal(turn)[:, None] if is_diagonal else None
     return lambda columns: replace(
         columns,
         means=matmul(columns.means, rotation.T),
@@ -339,9 +348,9 @@ def from_smallest_three(largest: np.ndarray, smallest: np.ndarray) -> np.ndarray
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split unit quaternions ``[n,4]`` into the index ``[n]`` of the largest part and the others ``[n,3]``.
+    """Split unit quaternions ``[n,4]`` into the index ``[n]`` of the largest component and the other three ``[n,3]``.
 
-    The sign is chosen so that the largest part is positive and need not be stored.
+    The sign is chosen so that the largest component is positive. Therefore it need not be stored.
     """
     largest, rows = np.abs(quats).argmax(1), np.arange(len(quats))
     quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]

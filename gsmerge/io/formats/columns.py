@@ -1,4 +1,4 @@
-"""Columns of a PLY file beside those of Gaussians: which change what is drawn, and what becomes of them."""
+"""Recognise columns of a PLY file besides those of Gaussians: ignore them, name them in a note, or refuse the file."""
 
 from __future__ import annotations
 
@@ -12,29 +12,33 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.formats import arrays
 
-UNUSED = "not used: "  # how the note of a file begins
-_MOST_NAMES, _LONGEST = 6, 60  # names that a note lists of one kind, and characters of each
+UNUSED = "not used: "  # start of the note
+_MAX_NAMES, _MAX_CHARACTERS = 6, 60  # names in a list of columns, and characters of each
 _MOMENT = "save one moment as a .ply, with positions, rotations and opacities of that time"
 
 
 @dataclass(frozen=True)
 class ColumnKind:
-    """Columns of one meaning."""
+    """Columns with one meaning."""
 
-    what: str  # they hold; empty: they change nothing that is drawn
-    names: str  # a pattern
-    effect: str = ""  # of leaving them out
-    remedy: str = ""  # files with them are refused, and this is what to do; empty: a note names them
+    what: str  # their content; empty: they do not change renders
+    names: str  # a pattern of their names
+    effect: str = ""  # the effect of leaving them out
+    remedy: str = ""  # for the error by which files with them are refused; empty: a note names the columns
 
 
-# In the order of trial; a column of floats that is in none is named as unknown
+# Kinds are tried in this order; the note lists columns of floats without a kind as unknown
 COLUMN_KINDS = (
     ColumnKind(
         "when each Gaussian appears",
         r"trbf_.*|(scale|scaling)_?t(_\d+)?|t_scale|(log_)?(life_?(time|span)|duration).*|(opacity|cov|sigma)_t(_\d+)?",
-        remedy=_MOMENT,  # of all times at once they are the scene at no time
+        remedy=_MOMENT,  # Gaussians of all times together are the scene at no time
     ),
-    ColumnKind("anchors, of which a network makes Gaussians", r"f_(offset|anchor).*", remedy="save its Gaussians"),
+    ColumnKind(
+        "anchors, from which a network makes Gaussians",
+        r"f_(offset|anchor).*",
+        remedy="save the Gaussians of that network as .ply",
+    ),
     ColumnKind(
         "time and motion",
         r"t|t_?\d+|time(stamp)?|(mu|mean|center)_t|motion.*|omega.*|rot_?[lr](_\d+)?|(angular_)?(velocity|vel|acceleration"
@@ -75,10 +79,10 @@ def _find_kind(name: str) -> ColumnKind | None:
 
 
 def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
-    """Return a note on columns, and elements that are ``layers``, that are not used and change what is drawn.
+    """Return a note on unused columns and elements that would change renders; empty if there are none.
 
-    It is alone, or there is none. SceneError for columns without which the file is no scene, and for whole
-    numbers in the place of floats.
+    ``layers``: names of elements with more Gaussians. SceneError for columns without which the file is no scene, and
+    for columns of Gaussians that are whole numbers.
     """
     _check_types(path, row)
     by_kind: dict[ColumnKind | None, list[str]] = {}
@@ -90,7 +94,7 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
             by_kind.setdefault(kind, []).append(name)
     for kind, names in by_kind.items():
         if kind is not None and kind.remedy:
-            problem = f"expected Gaussians to be drawn as they are stored, found {list_names(names)}: {kind.what}"
+            problem = f"expected complete Gaussians, found columns {list_names(names)} ({kind.what})"
             raise SceneError(path, problem, kind.remedy)
     known = [(kind, names) for kind, names in by_kind.items() if kind and kind.what]
     parts = [f"{list_names(names)} ({kind.what}: {kind.effect})" for kind, names in known]
@@ -100,23 +104,24 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
 
 
 def _check_types(path: Path, row: np.dtype[np.void]) -> None:
-    """Raise SceneError if the columns of Gaussians are whole numbers, but for plain colours of bytes."""
+    """Raise SceneError if columns of Gaussians are whole numbers; plain colours may be bytes."""
     colors = arrays.color_columns(row.names)
     for name in row.names or ():
         number, used = row[name], name in (*arrays.REQUIRED, *colors, arrays.FILTER) or name.startswith("f_rest_")
         if used and number.kind != "f" and not (number == np.uint8 and name in colors and colors != arrays.SH0):
             kind = _NUMBERS[number.kind][number.itemsize // 2]
-            problem = f"expected {name} as float, found {kind}, as which some write half floats or places in a codebook"
+            problem = f"expected {name} as float, found {kind}, which may be half floats or indices of a codebook"
             raise SceneError(path, problem, "export it with floats")
 
 
 def describes_places(name: str) -> bool:
-    """Return whether a column may hold places or directions, such as a motion; labels and weights do not."""
+    """Return whether a column may hold positions or directions, such as a motion; labels and weights do not."""
     kind = _find_kind(name)
     return kind is None or bool(kind.what)
 
 
 def list_names(names: Sequence[str]) -> str:
-    """List the names of columns, of many the first ones."""
-    more = len(names) - _MOST_NAMES
-    return ", ".join(name[:_LONGEST] for name in names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+    """List the names of columns for a message: the first six, and the number of the others."""
+    num_more = len(names) - _MAX_NAMES
+    listed = ", ".join(name[:_MAX_CHARACTERS] for name in names[:_MAX_NAMES])
+    return listed + (f" and {num_more} more" if num_more > 0 else "")

@@ -1,7 +1,8 @@
-"""Compressed PLY (PlayCanvas, SuperSplat, gsplat): four packed words per Gaussian, ranges per chunk of 256.
+"""Read compressed PLY files (PlayCanvas, SuperSplat, gsplat): four packed words per Gaussian, ranges per chunk of 256.
 
-The layout is that of PlayCanvas' reader: positions and scales 11-10-11 bits between a chunk's minimum and maximum,
-rotations as their three smaller components at 10 bits, colours and opacity at 8 bits, harmonics as bytes in ``sh``.
+The layout is that of PlayCanvas' reader. Positions and scales have 11, 10 and 11 bits between a chunk's minimum and
+maximum. Rotations are their three smaller components at 10 bits, colours and opacities have 8 bits, and harmonics are
+bytes in the element ``sh``.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
     vertex, chunk = data["vertex"], data["chunk"]
     for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
         dtypes = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
-        odd = next((name for name in needed if dtypes.get(name) not in types), None)
-        if odd is not None:
-            where, kind = f"in element '{element.name}' of a compressed file", dtypes.get(odd, "none")
-            raise SceneError(path, f"expected {odd} {where} as {types[0]}, found {kind}")
+        wrong = next((name for name in needed if dtypes.get(name) not in types), None)
+        if wrong is not None:
+            where, kind = f"in element '{element.name}' of a compressed file", dtypes.get(wrong, "none")
+            raise SceneError(path, f"expected {wrong} {where} as {types[0]}, found {kind}", "export it again")
     count, num_chunks = vertex.count, -(-vertex.count // CHUNK)
     if count == 0:
-        raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
+        raise SceneError(path, "expected at least one Gaussian, found 0 vertices", "export it again")
     if chunk.count < num_chunks:
         problem = f"expected {num_chunks} chunks for {count} Gaussians, found {chunk.count}"
         raise SceneError(path, problem, "export it again")
@@ -60,7 +61,7 @@ def _unpack(data: PlyData, num_higher: int, block: slice) -> arrays.Columns:
         means=_between(_shares(words["packed_position"], (11, 10, 11)), chunk, RANGES[:6], ids),
         quats=arrays.from_smallest_three(largest, smallest * np.sqrt(2.0)),
         log_scales=_between(_shares(words["packed_scale"], (11, 10, 11)), chunk, RANGES[6:], ids),
-        opacities=log(alpha) - log1p(-alpha),  # infinite for 0 and 1, which the reader takes as such
+        opacities=log(alpha) - log1p(-alpha),  # infinite for 0 and 1, which the reader accepts
         sh0=rgb_to_sh0(_between(colors, chunk, COLORS, ids)),
         harmonics=_HARMONICS[codes.reshape(len(vertex), 3, num_higher).transpose(0, 2, 1)],
     )
@@ -72,12 +73,17 @@ def _num_rest(path: Path, data: PlyData, count: int) -> int:
     names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}
     number = len(names)
     if number not in (9, 24, 45) or names != {f"f_rest_{i}" for i in range(number)} or data["sh"].count != count:
-        raise SceneError(path, f"expected 9, 24 or 45 harmonics for {count} Gaussians in element 'sh', found others")
+        problem = f"expected 9, 24 or 45 harmonics of {count} Gaussians in element 'sh', found others"
+        raise SceneError(path, problem, "export it again")
     return number
 
 
 def _between(shares: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...], ids: np.ndarray) -> np.ndarray:
-    """Return ``[n,3]`` numbers from shares between the least and largest values of chunks, or shares without these."""
+    """Interpolate between the minima and maxima of chunks to numbers ``[n,3]``; without ranges, return the shares.
+
+    ``shares``: three arrays ``[n]`` in [0, 1]. ``ranges``: names of the columns with the minima, then of the maxima.
+    ``ids``: the chunk of each Gaussian.
+    """
     if all(name in (chunk.dtype.names or ()) and chunk.dtype[name].kind == "f" for name in ranges):
         ends = [chunk[name][ids].astype(np.float32) for name in ranges]
         shares = [low * (1 - share) + high * share for share, low, high in zip(shares, ends, ends[3:], strict=False)]
@@ -85,7 +91,7 @@ def _between(shares: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...
 
 
 def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
-    """Unpack numbers between 0 and 1 from words; the last number is in the lowest bits."""
+    """Unpack numbers from 0 to 1 from words; ``bits`` are their widths, and the last number is in the lowest bits."""
     out = []
     for i, width in enumerate(bits):
         shifted = words >> np.uint32(sum(bits[i + 1 :]))

@@ -1,8 +1,9 @@
-"""Depth maps with poses and images, which models without Gaussians leave, read as one Gaussian for each pixel.
+"""Read depth maps with poses and images, the output of models without Gaussians, as one Gaussian per pixel.
 
-``results.npz`` of Depth Anything 3, ``predictions.npz`` of VGGT and ``views.npz`` with depths have all views;
-``results_output/frame_N.npz`` of DA3-Streaming one each, in one world (:mod:`gsmerge.io.cameras.pose_lines`). Depth is
-along z. Nothing but position and colour is known of a pixel: its Gaussian is a ball of ``SIGMA`` pixels.
+``results.npz`` of Depth Anything 3, ``predictions.npz`` of VGGT and ``views.npz`` with depths have all views. Each
+``results_output/frame_N.npz`` of DA3-Streaming has one view, and all are in one world
+(:mod:`gsmerge.io.cameras.pose_lines`). Depth is measured along z. Only position and colour of a pixel are known, so its
+Gaussian is a ball with a standard deviation of ``SIGMA`` pixels.
 """
 
 from __future__ import annotations
@@ -40,18 +41,18 @@ from gsmerge.runtime.threads import parallel_map
 PLACES = (  # in a folder, besides the frames
     "exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "predictions.npz", "views.npz",
 )  # fmt: skip
-SIGMA, OPACITY = 0.6, 0.7  # of a Gaussian: pixels, 0 to 1
+SIGMA, OPACITY = 0.6, 0.7  # standard deviation (pixels) and opacity of each Gaussian
 _GREY = 128
-_SAMPLE_PIXELS = 1000  # of a view that are looked up in the next one
-_SAME = 0.05  # relative difference of depths that agree
-# With right poses 1.9 times as many pixels agree, or more, as with wrong ones, on each of 15 captures
-_AGREE, _MORE = 0.2, 1.5
-_PIXEL_BYTES = 11  # that are kept of a pixel until it is unpacked, at most: a float64 and three colours
-_KEPT_BYTES = 128 << 20  # of images; more are read at each use
+_SAMPLE_PIXELS = 1000  # pixels of a view whose depths are compared with those of the next view
+_SAME = 0.05  # largest relative difference of depths that agree
+# With right poses at least 1.9 times as many pixels agree as with wrong poses, on each of 15 captures
+_MIN_AGREEMENT, _MIN_RATIO = 0.2, 1.5
+_PIXEL_BYTES = 11  # of a pixel before it is unpacked, at most: a float64 and three colours
+_KEPT_BYTES = 128 << 20  # of images in memory; if there are more, they are read at each use
 
 
 def find_depth_maps(folder: Path) -> list[Path]:
-    """Find the files of a folder's depth maps: one file of all views, or a file per view in order; else empty.
+    """Find the files of a folder's depth maps: one file of all views, or one file per view in order; empty without any.
 
     SceneError if a frame is missing.
     """
@@ -67,16 +68,16 @@ def holds_depth_maps(path: Path) -> bool:
 def read_rows(path: Path) -> StoredRows:
     """Read the depth maps of a file as Gaussians, view by view and row by row of pixels.
 
-    A depth that is not positive and finite gives a row that is not finite; without images, as of Depth Anything 3's
-    ``mini_npz``, Gaussians are grey. SceneError if the file is damaged, lacks an array, or images and depth maps differ
-    in size.
+    A depth that is not positive and finite gives a row that is not finite. Without images, as in Depth Anything 3's
+    ``mini_npz``, Gaussians are grey. SceneError if the file is damaged or lacks an array, or if images and depth maps
+    differ in size.
     """
     depths, cameras = _read_frame(path) if is_frame(path) else _read_views(path)
     grey = np.broadcast_to(np.uint8(_GREY), (*depths.shape, 3))  # takes no memory
     images = np.asarray(cameras.images) if len(cameras.images) else grey
     if images.shape[:3] != depths.shape:
         problem = f"expected images of the depth maps' size {list(depths.shape)}, found {list(images.shape[:3])}"
-        raise SceneError(path, problem)
+        raise SceneError(path, problem, "write both at one size")
     check_pixels(path, depths.shape[2], depths.shape[1])
     check_count(read_budget(path), depths.size, 0, _PIXEL_BYTES)
     parts = [_pack(*view) for view in zip(depths, images, cameras.Ks, cameras.viewmats, strict=True)]
@@ -85,10 +86,10 @@ def read_rows(path: Path) -> StoredRows:
 
 
 def read_frames(frames: Sequence[Path]) -> list[StoredRows]:
-    """Read the frames of DA3-Streaming; SceneError if they take more memory than their total bytes allow.
+    """Read the frames of DA3-Streaming, each as in :func:`read_rows`.
 
-    Each frame is read as in :func:`read_rows`. The memory that each file may take is too much for thousands of small
-    files together.
+    SceneError if they take more memory than a file of all their bytes may take. The limit of each single file would
+    allow too much memory for thousands of small files.
     """
     budget = ReadBudget(frames[0].parent, sum(map(check_file, frames)))
     check_count(budget, sum(math.prod(array_shape(frame, "depth")) for frame in frames), 0, _PIXEL_BYTES)
@@ -103,7 +104,7 @@ def read_images(frames: Sequence[Path]) -> PhotoArrays:
         frame = read_depth_frame(frames[view])
         if frame.size != (width, height):
             problem = f"expected a depth map of {width} x {height} pixels as in {frames[0].name}"
-            raise SceneError(frames[view], f"{problem}, found {frame.size[0]} x {frame.size[1]}")
+            raise SceneError(frames[view], f"{problem}, found {frame.size[0]} x {frame.size[1]}", "run the model again")
         return frame.image
 
     photos = PhotoReader(len(frames), (width, height), read)
@@ -111,48 +112,53 @@ def read_images(frames: Sequence[Path]) -> PhotoArrays:
 
 
 def _read_frame(path: Path) -> tuple[np.ndarray, CameraFile]:
-    """Read the depth map ``[1,h,w]`` of a frame of DA3-Streaming, and its camera with the image."""
+    """Read the depth map ``[1,h,w]`` of a frame of DA3-Streaming, and its camera with the image of the frame."""
     frame = read_depth_frame(path)
     view = StoredView(f"{path.stem} with its pose in {POSES}", pose_of_frame(path), frame.K, frame.size)
     return frame.depth[None], make_camera_file(path, "", C2W_OPENCV, [view], frame.image[None])
 
 
 def _read_views(path: Path) -> tuple[np.ndarray, CameraFile]:
-    """Read the depth maps ``[v,h,w]`` of a file, and the cameras of its v views, with images where it has some."""
+    """Read the depth maps ``[v,h,w]`` of a file, and the cameras of its v views, with images if the file has some."""
     dumped = "c2w" in array_names(path)
     stored, depths = (read_dump if dumped else read_da3)(CameraSource(path)), read_depths(path)
     convention = stored.convention or (C2W_OPENCV if dumped else W2C_OPENCV)
     cameras = make_camera_file(path, "", convention, stored.views, stored.images)
     if depths is None or len(depths) != len(cameras) or cameras.focal is None:
-        problem = f"expected depth maps [{len(cameras)},h,w], one for each pose, with intrinsics, found others"
-        raise SceneError(path, problem, "write all of them, or name a .ply of Gaussians")
+        problem = f"expected depth maps [{len(cameras)},h,w], one for each pose, and intrinsics, found others"
+        raise SceneError(path, problem, "write all of these arrays, or name a .ply of Gaussians")
     _check_poses(path, depths, cameras)
     return depths, cameras
 
 
 def _check_poses(path: Path, depths: np.ndarray, cameras: CameraFile) -> None:
-    """Refuse poses with which depth maps agree far less than with those of another convention."""
+    """Raise SceneError if depth maps agree far better with the poses of another convention."""
     axes, given, inverted = np.diag([1.0, -1, -1, 1]), cameras.viewmats, invert(cameras.viewmats)
-    others = {"inverted": inverted, "of OpenGL's axes": matmul(axes, given), "of both": matmul(axes, inverted)}
-    most, name = max((_agreement(depths, replace(cameras, viewmats=poses)), name) for name, poses in others.items())
-    if most > max(_AGREE, _MORE * (share := _agreement(depths, cameras))):
-        problem = f"expected poses by which the depths of the next view agree, found {share:.0%} that do"
-        raise SceneError(path, f"{problem}, and {most:.0%} were the poses {name}", "write them so")
+    conventions = {
+        "the inverse matrices": inverted,
+        "OpenGL's axes": matmul(axes, given),
+        "the inverse matrices and OpenGL's axes": matmul(axes, inverted),
+    }
+    shares = ((_agreement(depths, replace(cameras, viewmats=poses)), name) for name, poses in conventions.items())
+    most, name = max(shares)
+    if most > max(_MIN_AGREEMENT, _MIN_RATIO * (share := _agreement(depths, cameras))):
+        problem = f"expected poses with which depth maps agree, found {share:.0%} of pixels that agree"
+        raise SceneError(path, f"{problem}, but {most:.0%} with {name}", "write the poses in that convention")
 
 
 def _agreement(depths: np.ndarray, cameras: CameraFile) -> float:
-    """Return the share of some pixels that lie at the depth of the next view."""
+    """Return the share of sampled pixels whose depth agrees with the depth map of the next view."""
     (count, height, width), poses = depths.shape, cameras.viewmats
     some = slice(None, None, max(1, height * width // _SAMPLE_PIXELS))
     views = zip(depths, np.zeros((*depths.shape, 3), np.uint8), cameras.Ks, poses, strict=True)
     points = np.stack([_pack(*view).unpack(some).means for view in views])
     after = (np.arange(count) + 1) % count
     with np.errstate(all="ignore"):  # of pixels without a depth, or behind a view
-        places, ahead = project_points(points, poses[after], cameras.Ks[after])
-        inside = (ahead > 0) & (places >= 0).all(-1) & (places < (width, height)).all(-1)
+        places, projected = project_points(points, poses[after], cameras.Ks[after])  # pixels and depths
+        inside = (projected > 0) & (places >= 0).all(-1) & (places < (width, height)).all(-1)
         column, row = places[inside].astype(np.int64).T
-        there = depths[after[np.nonzero(inside)[0]], row, column] / ahead[inside]
-    return float((np.abs(there - 1) < _SAME).sum() / max(inside.size, 1))
+        ratios = depths[after[np.nonzero(inside)[0]], row, column] / projected[inside]
+    return float((np.abs(ratios - 1) < _SAME).sum() / max(inside.size, 1))
 
 
 def _pack(depth: np.ndarray, image: np.ndarray, K: np.ndarray, viewmat: np.ndarray) -> Packed:

@@ -1,4 +1,4 @@
-"""Columns of the user's own, such as labels: read from PLY files, and joined, for results that keep rows."""
+"""Read additional columns of PLY files, such as labels, and join them, for results that keep the rows."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from gsmerge.io.formats.table import PLY, Format
 
 
 def read_extra_columns(info: FileInfo) -> np.ndarray:
-    """Read the columns of a file that are no Gaussians', row by row.
+    """Read the columns of a file that do not belong to Gaussians, as a structured array ``[n]``.
 
-    Returns a structured array ``[n]``, without fields where there are none. SceneError if the file changed or cannot be
-    read.
+    The array has no fields if there are no such columns. SceneError if the file changed or cannot be read.
     """
     path = Path(info.path)
     if not info.extra_columns:
@@ -31,7 +30,7 @@ def read_extra_columns(info: FileInfo) -> np.ndarray:
 
 
 def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    """Join columns of files whose rows follow each other; also return the names of those that not all files have."""
+    """Join the columns of files, row after row; also return the names of columns that are not the same in all files."""
     kinds = [{name: part.dtype[name] for name in part.dtype.names or ()} for part in parts]
     names = dict.fromkeys(name for kind in kinds for name in kind)
     common = [name for name in names if len({kind.get(name) for kind in kinds}) == 1]
@@ -42,15 +41,18 @@ def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[st
 
 
 def describe_extra_columns(columns: np.ndarray, missing: Sequence[str], chosen: Format, *, moves: bool) -> list[str]:
-    """Describe what becomes of columns in a file of a format: one sentence each, without a full stop."""
+    """Note which columns a file of the ``chosen`` format keeps: one sentence each, without a full stop.
+
+    ``missing``: columns that not all inputs have. ``moves``: whether Gaussians are moved or turned.
+    """
     names, notes = list(columns.dtype.names or ()), list[str]()
     if missing:
-        notes.append(f"columns that not all files have, or of other types, are left out: {list_names(missing)}")
+        notes.append(f"columns that some files lack or have in other types are left out: {list_names(missing)}")
     if names and chosen is not PLY:
-        notes.append(f"{chosen.ending} has no room for more columns, left out: {list_names(names)}")
+        notes.append(f"columns that {chosen.ending} cannot store are left out: {list_names(names)}")
     elif names:
-        notes.append(f"columns that are copied as they are: {list_names(names)}")
-        places = [name for name in names if describes_places(name)]
-        if moves and places:
-            notes.append(f"columns that may hold places or directions are copied, not moved: {list_names(places)}")
+        notes.append(f"columns that are copied unchanged: {list_names(names)}")
+        positions = [name for name in names if describes_places(name)]
+        if moves and positions:
+            notes.append(f"columns that may hold positions or directions are not moved: {list_names(positions)}")
     return notes

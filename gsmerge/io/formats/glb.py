@@ -1,9 +1,10 @@
-"""Binary glTF 2.0 (``.glb``) with the extension ``KHR_gaussian_splatting`` of github.com/KhronosGroup/glTF.
+"""Read and write binary glTF 2.0 (``.glb``) with the extension ``KHR_gaussian_splatting`` of KhronosGroup/glTF.
 
-Its axis y points up, that of a ``.ply`` down: Gaussians are turned by half a turn about z, and the reader turns them
-back. Viewers that do not know the extension show points in the base colours. Drafts of the extension are read,
-too: scales as logarithms, of which some are negative, and ``_ROTATION``, ``_SCALE`` and ``COLOR_0``; and a ``.spz`` in
-the place of the values, as Cesium writes it.
+The axis y points up in glTF, and down in a ``.ply``. Therefore the writer rotates Gaussians by half a turn about z, and
+the reader rotates them back. Viewers that do not know the extension show points in the base colours.
+
+Drafts of the extension are read as well. They have logarithms of scales, of which some are negative, and attributes
+``_ROTATION``, ``_SCALE`` and ``COLOR_0``. Cesium writes a ``.spz`` instead of the values.
 """
 
 from __future__ import annotations
@@ -41,25 +42,25 @@ MAX_DEGREE = 3
 NAME = "KHR_gaussian_splatting"
 HARMONICS = [f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for degree in range(MAX_DEGREE + 1) for i in range(2 * degree + 1)]
 COLOR_SPACE = "srgb_rec709_display"
-SPZ_NAMES = (f"{NAME}_compression_spz_2", f"{NAME}_compression_spz")  # a .spz as one part of the binary chunk
+SPZ_NAMES = (f"{NAME}_compression_spz_2", f"{NAME}_compression_spz")  # extensions for a .spz in the binary chunk
 READ_EXTENSIONS = {NAME, *SPZ_NAMES, "KHR_mesh_quantization", "KHR_materials_unlit"}
-_FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # numbers of glTF
+_FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # constants of glTF
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _WIDTHS = {name: width for width, name in _TYPES.items()}
 _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
-_MAX_STRIDE = 252  # bytes from a value to the next that glTF allows
+_MAX_STRIDE = 252  # largest number of bytes from a value to the next that glTF allows
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # of a budget's 20 microseconds
-_PLACEMENT = {"matrix", "rotation", "scale", "translation"}  # keys of a node that stands elsewhere than its parent
-_EVEN = 1e-3  # by how much the scales of a node's axes may differ, and its axes be oblique
+_PLACEMENT = {"matrix", "rotation", "scale", "translation"}  # keys of a node with a transform of its own
+_TOLERANCE = 1e-3  # largest difference of the scales of a node's axes, and largest cosine between two axes
 
 
 def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
-    """Encode a ``.glb`` file, without comments; ValueError if there is NaN or inf.
+    """Encode a ``.glb`` file without comments; ValueError if there is NaN or inf.
 
-    Rotations and opacities are 16-bit numbers, which the extension allows, and all others float32.
+    Rotations and opacities are 16-bit numbers, which the extension allows. All other values are float32.
     """
     columns = to_columns(gaussians, MAX_DEGREE)
     attributes = _attributes(turn_half(columns))
@@ -74,7 +75,7 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
         )
         accessors.append({"bufferView": len(accessors), **kind, "count": len(array), "type": _TYPES[array.shape[1]]})
         at += size
-    for name, end in (("min", np.min), ("max", np.max)):  # of the positions, which glTF asks for
+    for name, end in (("min", np.min), ("max", np.max)):  # glTF asks for the bounds of positions
         accessors[0][name] = end(attributes["POSITION"], axis=0).tolist()
     content = b"".join((array if array.base is None else array.base).tobytes() for array in attributes.values())
     splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
@@ -97,7 +98,7 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 
 
 def _attributes(columns: Columns) -> dict[str, np.ndarray]:
-    """Return the attributes ``[n,width]`` by name; short rows are columns of wider ones, as glTF requires."""
+    """Return the attributes ``[n,width]`` by name; rows of two bytes are padded to four, as glTF requires."""
     wide = np.zeros((len(columns), 2), "<u2")
     wide[:, 0] = np.rint(columns.opacities.clip(0, 1) * 65535)
     values = {
@@ -126,7 +127,7 @@ def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:
 def holds_gaussians(path: Path) -> bool:
     """Return whether a ``.glb`` uses the extension for Gaussians.
 
-    True also for a file that cannot be read, so that the reader reports the error.
+    True also for a file that cannot be read, so that its reader reports the error.
     """
     try:
         with _damage(path), path.open("rb") as file:
@@ -136,9 +137,9 @@ def holds_gaussians(path: Path) -> bool:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read all Gaussians of a ``.glb`` in the frame of a ``.ply``; SceneError if there are none, or it is damaged."""
+    """Read all Gaussians of a ``.glb`` in the frame of a ``.ply``; SceneError if it has none or is damaged."""
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
-    with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):  # what is not finite is set aside later
+    with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):  # rows with NaN or inf are set aside later
         document = _read_document(file, budget)
         content = _Content(budget, file, document, file.tell(), budget.file_bytes)
         for mesh, place in _walk_splats(document, budget):
@@ -146,31 +147,31 @@ def read_rows(path: Path) -> StoredRows:
             parts.append(_read_splats(content, mesh, place, sizes, sum(part.count for part in parts)))
     if not parts:
         problem = f"expected Gaussians ({NAME}), found a .glb of points or a mesh"
-        raise SceneError(path, problem, "name the .ply that the model wrote with it")
+        raise SceneError(path, problem, "name the .ply that the model wrote beside it")
     return replace(to_stored(parts, ".glb", sizes), format="binary little-endian")
 
 
 @contextmanager
 def _damage(path: Path) -> Iterator[None]:
-    """Turn all errors that damaged or foreign files cause in the reader into a SceneError."""
+    """Convert all errors that damaged or foreign files cause in the reader to a SceneError."""
     try:
         with read_errors(path):
             yield
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
-        text = str(error) if isinstance(error, _ForeignError) else f"a damaged one ({error!r:.200})"
-        raise SceneError(path, f"expected a .glb of Gaussians, found {text}", "export it again, or as .ply") from error
+        found = str(error) if isinstance(error, _ForeignError) else f"a damaged one ({error!r:.200})"
+        raise SceneError(path, f"expected a .glb of Gaussians, found {found}", "export it again, or as .ply") from error
 
 
 class _ForeignError(ValueError):
-    """What a file has in the place of Gaussians that can be read."""
+    """Content that the reader does not support; the message continues "expected a .glb of Gaussians, found"."""
 
 
 @dataclass(frozen=True)
 class _Values:
-    """Values ``[n,width]`` of an accessor as they are stored; blocks of them are float64."""
+    """Stored values ``[n,width]`` of an accessor; a block of them is returned as float64."""
 
     stored: np.ndarray
-    most: int  # what stands for 1
+    most: int  # stored number of the value 1
 
     def __getitem__(self, block: slice) -> np.ndarray:
         rows = self.stored[block]
@@ -179,27 +180,29 @@ class _Values:
 
 @dataclass(frozen=True)
 class _Content:
-    """The content of a ``.glb`` whose binary chunk, of ``end - start`` bytes, is read part by part."""
+    """The content of a ``.glb``, whose binary chunk is read part by part."""
 
     budget: ReadBudget
     file: IO[bytes]
     document: dict[str, Any]
-    start: int
+    start: int  # of the binary chunk, in bytes from the start of the file
     end: int
-    num_read: list[int] = field(default_factory=lambda: [0])  # bytes of all parts so far, which are different ones
+    num_read: list[int] = field(default_factory=lambda: [0])  # bytes of all parts so far, at most those of the chunk
 
     def packed(self, view_id: int) -> bytes:
-        """Read the bytes of a view, which must lie in the chunk."""
+        """Read the bytes of a buffer view, which must lie in the chunk."""
         view = self.document["bufferViews"][view_id]
         at, size = self.start + view.get("byteOffset", 0), check_whole(view["byteLength"], "byteLength", 1)
         self.num_read[0] += size
         if view["buffer"] != 0 or "uri" in self.document["buffers"][0] or not self.start <= at <= self.end - size:
-            raise _ForeignError(f"one that is cut, or in another file: {size} bytes are not in its {self.end} bytes")
+            raise _ForeignError(
+                f"a truncated one, or a .spz in another file, of {self.end} bytes without {size} bytes of it"
+            )
         return self._read(at, size)
 
     def _read(self, at: int, size: int) -> bytes:
         if self.num_read[0] > self.end - self.start:
-            raise _ForeignError("one that shows the same values in several places")
+            raise _ForeignError("one that uses the same values several times")
         self.file.seek(at)
         return self.file.read(size)
 
@@ -218,13 +221,13 @@ class _Content:
         self.num_read[0] += count * each
         inside = first >= 0 and first + span <= view["byteLength"] and self.start <= at and at + span <= self.end
         if not each <= stride <= _MAX_STRIDE or not inside:
-            raise _ForeignError(f"one that is cut: {count} values of {each} bytes are not in its {self.end} bytes")
+            raise _ForeignError(f"a truncated one, of {self.end} bytes without {count} values of {each} bytes")
         rows = np.ndarray((count, width), dtype, self._read(at, span), strides=(stride, dtype.itemsize))
         return _Values(np.ascontiguousarray(rows), np.iinfo(dtype).max if accessor.get("normalized") else 1)
 
 
 def _read_document(file: IO[bytes], budget: ReadBudget) -> dict[str, Any]:
-    """Read the JSON of a ``.glb``, and go to the start of its binary chunk."""
+    """Read the JSON of a ``.glb``, and move to the start of its binary chunk."""
     size = budget.file_bytes
     start = file.read(_HEADER.size + _CHUNK.size)
     if len(start) < _HEADER.size + _CHUNK.size:
@@ -233,13 +236,13 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> dict[str, Any]:
     if (magic, version, kind) != (b"glTF", 2, b"JSON"):
         raise _ForeignError("a file that is no binary glTF 2.0")
     if total > size or length > total - len(start):
-        raise _ForeignError(f"one that is cut: {max(total, length)} bytes are not in its {size}")
+        raise _ForeignError(f"a truncated one, of {size} bytes instead of {max(total, length)}")
     document = parse_json(file.read(length).decode("utf-8-sig"), budget)
     if not isinstance(document, dict):
-        raise _ForeignError("one without an object of JSON")
+        raise _ForeignError("one whose JSON is no object")
     missing = set(document.get("extensionsRequired", ())) - READ_EXTENSIONS
     if missing and NAME in str(document.get("extensionsUsed")):
-        raise _ForeignError(f"one that needs {', '.join(sorted(map(str, missing)))}, which is not read")
+        raise _ForeignError(f"one that requires {', '.join(sorted(map(str, missing)))}, which is not supported")
     file.read(_CHUNK.size)
     return document
 
@@ -252,7 +255,7 @@ def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple
     while stack:
         node_id, above = stack.pop()
         if node_id in seen:
-            raise _ForeignError(f"one with node {node_id} in two places")
+            raise _ForeignError(f"one with two parents of node {node_id}")
         seen.add(node_id)
         node = nodes[node_id]
         place = above if _PLACEMENT.isdisjoint(node) else matmul(above, _node_matrix(node))
@@ -274,9 +277,9 @@ def _node_matrix(node: dict[str, Any]) -> np.ndarray:
 def _read_splats(
     content: _Content, primitive: dict[str, Any], place: np.ndarray, sizes: dict[str, int], count_before: int
 ) -> Packed:
-    """Read one primitive, which ``place [4,4]`` moves, and add its bytes to ``sizes`` by attribute.
+    """Read one primitive, move it by the matrix ``place [4,4]``, and add its bytes to ``sizes`` by attribute.
 
-    ``count_before``: Gaussians of the primitives before it, which share the file's budget with its own.
+    ``count_before``: number of Gaussians in the primitives before it; all share the file's budget.
     """
     splats, attributes = primitive["extensions"][NAME], primitive.get("attributes", {})
     kernel, space = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
@@ -297,7 +300,7 @@ def _read_splats(
         before = content.num_read[0]
         values = content.values(attributes[name])
         if values.stored.shape[1] != width:
-            raise _ForeignError(f"one with {values.stored.shape[1]} numbers of {name} each")
+            raise _ForeignError(f"one with {values.stored.shape[1]} numbers of {name} per Gaussian")
         sizes[kind] = sizes.get(kind, 0) + content.num_read[0] - before
         return values
 
@@ -311,7 +314,7 @@ def _read_splats(
     count = len(means.stored)
     columns = (quats, scales, sh0, *([] if opacities is None else [opacities]), *harmonics)
     if any(len(column.stored) != count for column in columns):
-        raise _ForeignError(f"one with values for others than its {count} Gaussians")
+        raise _ForeignError(f"one whose attributes do not all have {count} values, one per Gaussian")
     are_logs, move = are_logarithms(scales.stored), _mover(place, len(harmonics))
 
     def unpack(block: slice) -> Columns:
@@ -343,7 +346,7 @@ def _mover(place: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
     rotation = place[:3, :3] / scale
     oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
     mirrored = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
-    if mirrored or not (np.isfinite(place).all() and oblique < _EVEN):
+    if mirrored or not (np.isfinite(place).all() and oblique < _TOLERANCE):
         raise _ForeignError("one with a node that stretches or mirrors its Gaussians")
     turn = turner(rotation, num_higher)
     return lambda columns: replace(

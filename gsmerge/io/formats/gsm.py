@@ -1,8 +1,8 @@
-"""The ``.gsm`` container: what ``extend`` keeps of views that arrive in batches, in one safetensors file.
+"""Read and write states (``.gsm``), in which ``extend`` stores batches of views: a safetensors file with a header.
 
-Its only metadata entry is a header in JSON, with checksums of itself and of each array. Of kind ``scene`` are results
-with their cameras and pictures, which are read here as those of any file; of kind ``features`` Feature Gaussians
-(:mod:`gsmerge.states.features`). Nothing in a file is executed; each array is checked before it is used.
+The only metadata entry is the header in JSON, with checksums of itself and of each array. Files of the kind ``scene``
+hold results with their cameras and pictures, which are read here. Files of the kind ``features`` hold Feature Gaussians
+(:mod:`gsmerge.states.features`). No content of a file is executed, and each array is checked before it is used.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from gsmerge.kernels.elementary import log
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 from gsmerge.version import __version__
 
-SCHEMA = 3  # of the whole file; those before were states of 0.3.0 and before
-HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; the second of 0.1
+SCHEMA = 3  # version of the whole file; gsmerge 0.3.0 and earlier wrote lower ones
+HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; the second was written by 0.1
 SCENE, FEATURES = "scene", "features"  # kinds
 REMEDY = "run extend again with all batches"
 # Each entry of the header, with its type
@@ -43,7 +43,7 @@ _LEAST_SCALE = 1e-30  # whose logarithm is one
 
 @dataclass(frozen=True)
 class GsmFile:
-    """Content of a ``.gsm``: its header, each entry of its type, and arrays that match their checksums."""
+    """Content of a ``.gsm``: a header whose entries have the right types, and arrays that match their checksums."""
 
     path: Path
     header: Mapping[str, Any]
@@ -54,21 +54,21 @@ class GsmFile:
         return SceneError(self.path, problem, "copy it again, or " + REMEDY)
 
     def array(self, name: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
-        """Return an array of a type and shape (None: any size); SceneError for another one."""
+        """Return an array of a type and shape (None: any size); SceneError if it is missing or has another one."""
         array = self.arrays.get(name)
-        wanted = f"{name}: expected {dtype.__name__} {['n' if n is None else n for n in shape]}"
+        expected = f"{name}: expected {dtype.__name__} {['n' if n is None else n for n in shape]}"
         if array is None:
-            raise self.error(f"{wanted}, found none")
+            raise self.error(f"{expected}, found none")
         sizes_fit = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
         if array.dtype != dtype or not sizes_fit:
-            raise self.error(f"{wanted}, found {array.dtype} {list(array.shape)}")
+            raise self.error(f"{expected}, found {array.dtype} {list(array.shape)}")
         return array
 
     def finite(self, name: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
-        """Return an array as :meth:`array`; SceneError also if a number of it is not finite."""
+        """Return an array as :meth:`array` does; SceneError also if it has NaN or inf."""
         array = self.array(name, dtype, *shape)
         if not np.isfinite(array).all():
-            raise self.error(f"{name}: expected finite numbers, found others")
+            raise self.error(f"{name}: expected finite numbers, found NaN or inf")
         return array
 
 
@@ -78,46 +78,46 @@ def write_gsm(path: StrPath, header: Mapping[str, Any], arrays: Mapping[str, np.
     data = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     with atomic_output(path, overwrite=overwrite) as temporary:
         header["checksums"] = _checksums(header, data)
-        temporary.write_bytes(save(data, {HEADER: json.dumps(header)}))  # one entry: several have no fixed order
+        temporary.write_bytes(save(data, {HEADER: json.dumps(header)}))  # one entry, since the order of more varies
 
 
 def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
     """Compute the CRC-32 of the header without its checksums, and of each array."""
     plain = {name: value for name, value in header.items() if name != "checksums"}
-    text = json.dumps(json.loads(json.dumps(plain)), sort_keys=True)  # keys as they are read
+    text = json.dumps(json.loads(json.dumps(plain)), sort_keys=True)  # with the keys that a reader gets
     sums = {"header": zlib.crc32(text.encode("utf-8", "replace"))}
     return sums | {name: zlib.crc32(np.ascontiguousarray(array).tobytes()) for name, array in sorted(arrays.items())}
 
 
 def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
-    """Read a ``.gsm``, of one ``kind`` or of any; SceneError for other files, and where a checksum is wrong."""
+    """Read a ``.gsm`` of one ``kind``, or of any if it is None; SceneError for other files or a wrong checksum."""
     path = Path(path)
     metadata, arrays = read_tensors(path, "a .gsm file", REMEDY)
     header = _parse_header(path, metadata)
     if kind not in (None, header["kind"]):
-        remedy = f"gsmerge compact {path} --k 2 makes Gaussians of them, convert arrays"
+        remedy = f"decode them with gsmerge compact {path} --k 2, or write their arrays with gsmerge convert"
         raise SceneError(path, "expected results in the .gsm, found Feature Gaussians", remedy)
-    file, sums, found = GsmFile(path, header, arrays), header.get("checksums"), _checksums(header, arrays)
-    if sums != found:
-        wrong = [name for name in found if not isinstance(sums, dict) or sums.get(name) != found[name]]
+    file, stored, actual = GsmFile(path, header, arrays), header.get("checksums"), _checksums(header, arrays)
+    if stored != actual:
+        wrong = [name for name in actual if not isinstance(stored, dict) or stored.get(name) != actual[name]]
         raise file.error(f"{wrong[0] if wrong else 'arrays'}: expected the checksum in the header, found another")
     return file
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """Read the header of a ``.gsm`` alone, which says what it holds; SceneError for other files."""
+    """Read only the header of a ``.gsm``; SceneError for other files."""
     return _parse_header(path, read_tensors(path, "a .gsm file", REMEDY, arrays=False)[0])
 
 
 def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Parse the header of a file of this schema."""
+    """Parse the header of a file; SceneError if it is no header of this schema."""
     text = metadata.get(HEADER, metadata.get(ENCODED))
     if text is None:
         raise SceneError(path, "expected a .gsm of gsmerge, found another safetensors file", "name the .gsm")
     try:
         header = parse_json(text, read_budget(path))
     except ValueError as error:
-        raise SceneError(path, "expected a header in JSON, found something else", REMEDY) from error
+        raise SceneError(path, f"expected a header in JSON, found other text ({error})", REMEDY) from error
     schema = header.get("schema") if isinstance(header, dict) else None
     if schema != SCHEMA:
         newer = isinstance(schema, int) and schema > SCHEMA
@@ -130,12 +130,13 @@ def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
         if type(header.get(name)) is not entry:
             raise SceneError(path, f"expected {name} in the header, found {header.get(name)!r:.40}", REMEDY)
     if header["kind"] not in (SCENE, FEATURES):
-        raise SceneError(path, f"expected a kind {SCENE} or {FEATURES}, found {header['kind']!r:.40}", REMEDY)
+        problem = f"expected the kind {SCENE} or {FEATURES} in the header, found {header['kind']!r:.40}"
+        raise SceneError(path, problem, REMEDY)
     return dict(header)
 
 
 def write_scene(path: StrPath, scene: Scene, about: Mapping[str, Any], *, overwrite: bool) -> None:
-    """Write a scene without pixels, its cameras and pictures as whole numbers, and facts of plain JSON types."""
+    """Write a scene without pixels, with its cameras, its pictures as uint8, and facts ``about`` it as JSON."""
     arrays = {name: np.asarray(column, np.float32) for name, column in vars(scene.gaussians).items()}
     cameras = scene.cameras
     arrays |= {name: np.asarray(getattr(cameras, name), np.float64) for name in ("viewmats", "Ks")}
@@ -166,19 +167,19 @@ def read_rows(path: Path) -> StoredRows:
     comments, batches = (file.header["about"].get(name) for name in ("comments", "batches"))
     count = len(batches) if isinstance(batches, list) else 0
     stored = to_stored([Packed(n, num_higher, unpack)], f"{count} batch(es) of views", sizes)
-    kept = copied_comments(comments if isinstance(comments, list) else ())
-    return replace(stored, format="binary little-endian", comments=kept, notes=_picture_notes(file.header["about"]))
+    copied = copied_comments(comments if isinstance(comments, list) else ())
+    return replace(stored, format="binary little-endian", comments=copied, notes=_picture_notes(file.header["about"]))
 
 
 def _picture_notes(about: Mapping[str, Any]) -> tuple[str, ...]:
-    """Note what stands in for photos in some batches."""
+    """Note which pictures replace photos in batches without photos."""
     names = about.get("pictures")
-    others = sorted({str(name)[:40] for name in names if name != "photos"}) if isinstance(names, list) else []
-    return (f"without photos of some batches: {' and '.join(others)} stand in for them",) if others else ()
+    replacements = sorted({str(name)[:40] for name in names if name != "photos"}) if isinstance(names, list) else []
+    return (f"some batches have no photos; {' and '.join(replacements)} replace them",) if replacements else ()
 
 
 def list_batches(path: Path) -> list[dict[str, Any]]:
-    """List from the header of a ``.gsm`` the numbers of each batch, and the names of the views that are kept of it."""
+    """List the batches in the header of a ``.gsm``: for each, its counts and the names of its views in the file."""
     numbers, batches = ("num_views", "num_input", "num_new"), read_header(path)["about"].get("batches")
     listed = []
     for batch in filter(lambda one: isinstance(one, dict), batches if isinstance(batches, list) else ()):
@@ -189,7 +190,7 @@ def list_batches(path: Path) -> list[dict[str, Any]]:
 
 
 def holds_views(path: Path) -> bool:
-    """Return whether a path is a ``.gsm`` with cameras; True for a damaged one, whose reader says what is wrong."""
+    """Return whether a ``.gsm`` has cameras; True for a damaged file, so that its reader reports the damage."""
     try:
         return len(read_header(path)["names"]) > 0
     except SceneError:
@@ -211,7 +212,7 @@ def stored_names(file: GsmFile, num_views: int) -> tuple[str, ...]:
     """Return the names of a file's views."""
     names = file.header["names"]
     if len(names) != num_views or not all(isinstance(name, str) for name in names):
-        raise file.error(f"names: expected one of each of {num_views} views, found others")
+        raise file.error(f"names: expected {num_views} names, one per view, found others")
     return tuple(names)
 
 

@@ -1,4 +1,4 @@
-"""PLY: files opened with their header checked against the file's size, read and written as INRIA lays them out."""
+"""Read and write PLY files with INRIA's columns; headers are checked against the size of the file."""
 
 from __future__ import annotations
 
@@ -29,21 +29,22 @@ from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.types import Gaussians
 
 _PACKED_ROWS = LazyFunction("gsmerge.io.formats.compressed", "packed_rows")
-MAX_DEGREE = 3  # of the harmonics that results have: splat-transform 3.7 and gsply refuse a .ply with more
-# Of the longest comment on new views
+MAX_DEGREE = 3  # of the harmonics in results; splat-transform 3.7 and gsply refuse a .ply with more
+# Size of the longest comment on new views
 COMMENT_BYTES = len(f"comment {arrays.new_views_comment(arrays.ExpectedScores(-100, -100, -100, -100))}\n")
 MAX_READ_DEGREE = 4
-THIN = 1e-3  # of the smaller scale: the third of a 2D Gaussian
+THIN = 1e-3  # third scale of a 2D Gaussian, relative to its smaller scale
 MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
-BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache from the first column to the last
+BLOCK_BYTES = 1 << 19  # of rows that are converted at a time; they stay in the cache for all columns
 
-_PREFIXED = "columns are read without the {!r} before their names, as CloudCompare writes it"
+_PREFIXED = "the prefix {!r} of the columns' names, as CloudCompare writes it, is ignored"
+_AGAIN = "copy or export it again"
 MAX_HEADER_BYTES = 1 << 20
-MAX_LINE = 1 << 20  # characters of a row of text: its words take many times as much memory
+MAX_LINE = 1 << 20  # characters of a row of text, since its words take many times as much memory
 MAX_LIST_VALUES = 1_000_000  # of elements with lists, which are read one value at a time
 _LIST_BYTES = 140  # of memory for each of these values
-_STEPS_PER_ELEMENT = 50  # of a budget's 20 microseconds: several readers open a file one after the other
-_TYPES = {  # by NumPy's names
+_STEPS_PER_ELEMENT = 50  # of a budget's 20 microseconds, since several readers open a file one after the other
+_TYPES = {  # PLY's names of types by NumPy's
     "i1": "char", "i2": "short", "i4": "int", "f4": "float", "u1": "uchar", "u2": "ushort", "u4": "uint", "f8": "double"
 }  # fmt: skip
 _SIZES = {
@@ -55,26 +56,26 @@ _SIZES = {
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Open the rows of a PLY file, to be read by :func:`open_rows`; SceneError if it holds no Gaussians."""
+    """Open the rows of a PLY file for :func:`open_rows`; SceneError if it holds no Gaussians."""
     data = open_ply(path)
     elements = {e.name: {p.name for p in e.properties} for e in data.elements}
     compressed = "chunk" in elements and elements.get("vertex", set()) >= set(arrays.PACKED)
     rows, prefix = (_PACKED_ROWS(path, data), "") if compressed else _vertex_rows(path, data)
-    others = tuple(name for name in elements if name != "vertex")
-    layers = [f"element {name}" for name in others if {"opacity", arrays.QUATS[0]} <= elements[name]]
+    extra_elements = tuple(name for name in elements if name != "vertex")
+    layers = [f"element {name}" for name in extra_elements if {"opacity", arrays.QUATS[0]} <= elements[name]]
     unused = check_columns(path, rows.dtype, layers)
     names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
     colors, white, notes = arrays.color_columns(names), 1.0, list[str]()
     linear = colors == arrays.PLAIN_COLORS[1] and not arrays.are_logarithms(_read_column(path, rows, arrays.SCALES[0]))
     if linear:
-        notes += ["colours are r, g and b, scales hardly negative: they are taken as activated, not as logarithms"]
-    of_floats = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
-    if of_floats and np.nanmedian(_read_column(path, rows, colors[0])) > 1:
-        white, what = 255.0, f"half of the values of {colors[0]} are above 1"
-        notes += [f"{what}: colours are taken as 0 to 255"]
+        notes += ["scales are read as linear, since the columns are r, g and b and hardly any scale is negative"]
+    float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
+    if float_colors and np.nanmedian(_read_column(path, rows, colors[0])) > 1:
+        white = 255.0
+        notes += [f"colours are read as 0 to 255, since half of the values of {colors[0]} are above 1"]
     if arrays.SCALES[2] not in names:
-        notes += [f"2D Gaussians of two scales: the third is {THIN:g} of the smaller one"]
+        notes += [f"2D Gaussians have two scales; the third is set to {THIN:g} of the smaller one"]
         comments += (arrays.FLAT_COMMENT,)
     return arrays.StoredRows(
         rows=rows,
@@ -83,7 +84,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
         encoding="logit" if compressed or is_from_gsmerge(comments) else None,
         sizes=_bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
-        extra_elements=others,
+        extra_elements=extra_elements,
         notes=(*notes, *([_PREFIXED.format(prefix)] if prefix else []), *unused),
         adapt=partial(_adapt_rows, linear=linear, white=white) if notes else None,
     )
@@ -106,9 +107,9 @@ def _read_column(path: Path, rows: np.ndarray, name: str) -> np.ndarray:
 
 
 def _adapt_rows(rows: np.ndarray, *, linear: bool, white: float) -> np.ndarray:
-    """Return a block of rows with logarithms of ``linear`` scales, a third, thin one where there are two, and colours.
+    """Return a block of rows with log scales and, where there are only two, a third, thin one.
 
-    ``white`` is the value of a full colour of floats.
+    ``linear``: scales are stored as they are, not as logarithms. ``white``: stored value of a full colour channel.
     """
     columns = {name: rows[name] for name in rows.dtype.names or ()}
     if white != 1:
@@ -125,7 +126,7 @@ def _adapt_rows(rows: np.ndarray, *, linear: bool, white: float) -> np.ndarray:
 
 
 def is_from_gsmerge(comments: Sequence[str]) -> bool:
-    """Return whether header comments say that gsmerge wrote the file: a result, or Gaussians of any origin."""
+    """Return whether header comments say that gsmerge wrote the file, as a result or a copy of other Gaussians."""
     return arrays.LOGIT_COMMENT in comments or arrays.RESULT_COMMENT in comments
 
 
@@ -133,29 +134,29 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
     """Return the rows of the Gaussians without the prefix of their columns' names, and this prefix."""
     if "vertex" not in data:
         names = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
-        raise SceneError(path, f"expected an element 'vertex', found {names}")
+        raise SceneError(path, f"expected an element 'vertex', found {names}", "name a .ply of Gaussians")
     vertex = data["vertex"]
     rows, prefix = _without_prefix(vertex.data)
     columns = set(rows.dtype.names or ())
     optional = {arrays.SCALES[2], *(() if arrays.color_columns(columns) == arrays.SH0 else arrays.SH0)}
     missing = [name for name in arrays.REQUIRED if name not in columns | optional]
     if missing:
-        check_columns(path, rows.dtype, ())  # which may say why
-        remedy = "this is no Gaussian splat"
+        check_columns(path, rows.dtype, ())  # other columns may give the reason
+        remedy = "name a .ply of Gaussians, since this one has none"
         if any(name.startswith("packed_") for name in columns):
-            remedy = "it is compressed, but lacks its element 'chunk'"
+            remedy = "export it again, since it is compressed but lacks its element 'chunk'"
         elif len(missing) < len(arrays.REQUIRED) // 2:
             remedy = "export it again with them"
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:
-        raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
+        raise SceneError(path, "expected at least one Gaussian, found 0 vertices", "export it again")
     return rows, prefix
 
 
 def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return rows without what stands before the names of the columns of Gaussians, and this prefix.
+    """Return rows without the prefix before the names of the columns, and this prefix; "" if there is none.
 
-    CloudCompare writes "scalar_" before names that are not its own, and "scalar_scal_" when it wrote the file before.
+    CloudCompare writes "scalar_" before names that are not its own, and "scalar_scal_" if it writes the file again.
     """
     names, last = tuple(rows.dtype.names or ()), arrays.QUATS[0]
     prefix = next((name.removesuffix(last) for name in names if name.endswith(last)), "")
@@ -173,12 +174,13 @@ def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
     names = {name for name in columns if name.startswith("f_rest_")}
     if len(names) not in (0, 9, 24, 45, 72) or names != {f"f_rest_{i}" for i in range(len(names))}:
         numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
-        raise SceneError(path, f"expected columns {numbers} or none, found {len(names)} f_rest columns")
+        problem = f"expected columns {numbers} or none, found {len(names)} f_rest columns"
+        raise SceneError(path, problem, "export it again")
     return len(names)
 
 
 def _layout_name(names: tuple[str, ...], num_rest: int, *, compressed: bool) -> str:
-    """Name the layout of a file with these columns."""
+    """Name the layout of a file's columns for people."""
     if compressed:
         return f"compressed, SH degree {arrays.sh_degree(num_rest // 3)}"
     if arrays.SH0[0] not in names:
@@ -207,9 +209,9 @@ def _bytes_by_attribute(row: np.dtype[Any], count: int) -> dict[str, int]:
 
 
 def open_ply(path: Path) -> PlyData:
-    """Open a PLY file; its binary vertices, unless packed, are mapped for :func:`open_rows`.
+    """Open a PLY file; binary vertices that are not packed are mapped for :func:`open_rows`.
 
-    SceneError if it is no PLY file, is truncated or damaged, or its header promises more than it has.
+    SceneError if it is no PLY file, is truncated or damaged, or is shorter than its header says.
     """
     budget = read_budget(path)
     try:
@@ -217,14 +219,15 @@ def open_ply(path: Path) -> PlyData:
             start = file.read(MAX_HEADER_BYTES)
         if start[:4] not in (b"ply\n", b"ply\r"):
             if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES:
-                raise SceneError(path, "expected Gaussians, found a picture", "a model makes them of photos first")
-            problem = "expected a PLY file, found one that does not start with the line 'ply'"
-            raise SceneError(path, problem, "name the .ply")
+                remedy = "make Gaussians from photos with a model first, and name its .ply"
+                raise SceneError(path, "expected Gaussians, found a picture", remedy)
+            problem = "expected a PLY file, found a file that does not start with the line 'ply'"
+            raise SceneError(path, problem, "name a .ply of Gaussians")
         end, text = _check_header(start, budget)
         with _stream(path, end, text=text) as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # an empty list, a number beyond the column's type
+            warnings.simplefilter("ignore")  # of an empty list, or a number beyond the column's type
             data = PlyData.read(file, mmap="r")
-        mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)  # no result replaces it on Windows
+        mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)  # Windows replaces no mapped file
         for element in data.elements:
             if isinstance(element.data, np.memmap) and element.name not in mapped:
                 with open_rows(path, element.data) as read:
@@ -234,14 +237,15 @@ def open_ply(path: Path) -> PlyData:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
     except PlyElementParseError as error:
         element, row = error.element, error.row
-        promise = f"element '{element.name}' with {element.count} rows" if element is not None else "more data"
-        raise _truncated(path, promise, row or 0, error.message) from error
+        expected = f"element '{element.name}' with {element.count} rows" if element is not None else "more data"
+        raise _truncated(path, expected, row or 0, error.message) from error
     except (PlyParseError, ValueError, ArithmeticError) as error:
-        raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
+        problem = f"expected a readable PLY file, found a damaged one ({error})"
+        raise SceneError(path, problem, _AGAIN) from error
 
 
 def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
-    """Open a PLY file for the parser, with non-ASCII header bytes and empty text lines removed."""
+    """Open a PLY file for the parser, which gets no bytes beyond ASCII in the header, and no empty lines of text."""
     if text:
         return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
     file = _BinaryRows(FileIO(str(path)))
@@ -250,6 +254,8 @@ def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
 
 
 class _TextRows(TextIOWrapper):
+    """A PLY file of text, whose empty lines are skipped."""
+
     def readline(self, size: int = -1, /) -> str:  # type: ignore[override]  # bytes in the base of all
         line = super().readline(MAX_LINE)
         while line and not line.strip():
@@ -258,7 +264,9 @@ class _TextRows(TextIOWrapper):
 
 
 class _BinaryRows(BufferedReader):
-    end = 0  # of the header
+    """A binary PLY file, in whose header "?" stands for bytes beyond ASCII."""
+
+    end = 0  # of the header, in bytes
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
@@ -271,7 +279,8 @@ class _BinaryRows(BufferedReader):
 def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Callable[[slice], np.ndarray]]:
     """Yield a thread-safe function that returns blocks of a PLY file's rows.
 
-    A mapped file that becomes shorter would end the process; here it raises SceneError.
+    Rows of a mapped file are read from the file: a mapped file that becomes shorter would end the process, while here
+    it raises SceneError.
     """
     if not isinstance(rows, np.memmap):
         yield rows.__getitem__
@@ -286,8 +295,8 @@ def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Call
                 file.seek(rows.offset + start * rows.dtype.itemsize)
                 num_bytes = file.readinto(out.view(np.uint8).data)
             if num_bytes < out.nbytes:
-                whole = start + num_bytes // rows.dtype.itemsize
-                raise _truncated(path, f"{len(rows)} rows", whole, "it became shorter while it was read")
+                num_whole = start + num_bytes // rows.dtype.itemsize
+                raise _truncated(path, f"{len(rows)} rows", num_whole, "it became shorter while it was read")
             return out
 
         yield read
@@ -306,7 +315,7 @@ def bytes_after_rows(path: Path) -> int:
 def header_counts(path: Path) -> tuple[int, int]:
     """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if unreadable."""
     try:
-        check_file(path)  # a pipe would never end
+        check_file(path)  # reading a pipe would never end
         with path.open("rb") as file:
             header = file.read(1 << 16).partition(b"end_header")[0]
     except (OSError, SceneError):
@@ -316,7 +325,7 @@ def header_counts(path: Path) -> tuple[int, int]:
 
 
 def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
-    """Return what the first 4 KiB of a PLY file show: a result of gsmerge, Gaussians, or other columns.
+    """Return the content that the first 4 KiB of a PLY file show: a result of gsmerge, Gaussians, or other columns.
 
     A file that cannot be read, or has a longer header, counts as Gaussians.
     """
@@ -330,22 +339,22 @@ def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
         return "result"
     columns = re.findall(rb"^property .*?(\w+)\s*$", header, re.MULTILINE) if end else []
     expected = (b"scale_", b"rot_", b"f_dc_", b"packed_")
-    known = any(part in name for name in columns for part in expected)  # after a prefix, too
-    return "Gaussians" if known or not columns else "other"
+    has_gaussians = any(part in name for name in columns for part in expected)  # names may have a prefix
+    return "Gaussians" if has_gaussians or not columns else "other"
 
 
 def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
-    """Return the size of a header and whether rows are text; SceneError if the file is too short for it.
+    """Return the bytes of a header and whether rows are text; SceneError if the file is too short for its rows.
 
-    ``start`` has the first bytes of the file. The parser checks the rest.
+    ``start``: the first bytes of the file. The parser checks everything else in the header.
     """
     path, size = Path(budget.path), budget.file_bytes
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
     last = newline + b"end_header" + newline
     end = start.find(last)
     if end < 0:
-        problem = f"no 'end_header' within {MAX_HEADER_BYTES >> 20} MiB" if size > len(start) else "early end of file"
-        raise SceneError(path, f"expected a PLY header, found {problem}", "copy or export it again")
+        found = f"no 'end_header' within {MAX_HEADER_BYTES >> 20} MiB" if size > len(start) else "an early end of file"
+        raise SceneError(path, f"expected a PLY header, found {found}", _AGAIN)
     words = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
     text = ["format", "ascii", "1.0"] in words
     elements: list[tuple[str, int, list[list[str]]]] = []
@@ -359,25 +368,26 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     for name, count, properties in elements:
         lists = any(kind[0] == "list" for kind in properties)
         if count < 0:
-            raise SceneError(path, f"expected a number of rows, found element '{name}' with {count}")
+            raise SceneError(path, f"expected a number of rows, found {count} rows of element '{name}'", _AGAIN)
         if count and not properties:
-            raise SceneError(path, f"expected columns, found element '{name}' of {count} rows without any")
+            raise SceneError(path, f"expected columns, found element '{name}' of {count} rows without any", _AGAIN)
         if lists and name == "vertex":
-            raise SceneError(path, "expected one number a column and vertex, found a list property")
+            raise SceneError(path, "expected one number per column and vertex, found a list property", _AGAIN)
         if lists and count * len(properties) > MAX_LIST_VALUES:
-            raise SceneError(path, f"found element '{name}' with lists in {count} rows", "export it without this one")
+            problem = f"expected at most {MAX_LIST_VALUES:,} lists, found element '{name}' with lists in {count:,} rows"
+            raise SceneError(path, problem, "export it without this element")
         if lists:
             budget.check_memory(_LIST_BYTES * count * len(properties), f"lists in {count:,} rows")
         each = sum(2 if text else _SIZES.get((kind[1:2] or kind)[0], 1) for kind in properties)
         before, left = left, left - count * each
         if left < -1:  # the last row of a text may end without a new line
-            raise _truncated(path, f"element '{name}' with {count} rows", before // each, "early end-of-file")
+            raise _truncated(path, f"element '{name}' with {count} rows", before // each, "early end of file")
     return end + len(last), text
 
 
-def _truncated(path: Path, promise: str, num_whole: int, reason: str) -> SceneError:
-    problem = f"truncated or damaged: expected {promise}, found {num_whole} whole ones ({reason})"
-    return SceneError(path, problem, "copy or export it again")
+def _truncated(path: Path, expected: str, num_whole: int, reason: str) -> SceneError:
+    """Make the error of a file that ends early, or is damaged, after some complete rows."""
+    return SceneError(path, f"truncated or damaged: expected {expected}, found {num_whole} complete ({reason})", _AGAIN)
 
 
 def ply_blocks(
@@ -385,15 +395,15 @@ def ply_blocks(
 ) -> Iterator[bytes | memoryview]:
     """Yield the header and blocks of rows of a PLY file with harmonics up to ``degree``; ValueError for NaN or inf.
 
-    ``extra``: structured array ``[n]`` of little-endian columns that follow those of the Gaussians.
+    ``extra``: structured array ``[n]`` of little-endian columns, which are written after those of the Gaussians.
     """
-    more = {} if extra is None else {name: extra.dtype[name].str[1:] for name in extra.dtype.names or ()}
-    header, num_columns = _header(len(gaussians), degree, comments, normals=normals, extra=more)
+    extra_types = {} if extra is None else {name: extra.dtype[name].str[1:] for name in extra.dtype.names or ()}
+    header, num_columns = _header(len(gaussians), degree, comments, normals=normals, extra=extra_types)
     yield header
     block = max(1, BLOCK_BYTES // (4 * num_columns))
     for start in range(0, len(gaussians), block):
         columns = arrays.to_columns(gaussians[start : start + block], degree, start)
-        logits = log(columns.opacities) - log1p(-columns.opacities)  # 0 and 1 are clipped, impossible ones NaN
+        logits = log(columns.opacities) - log1p(-columns.opacities)  # infinite for 0 and 1, NaN outside [0, 1]
         parts = [
             columns.means,
             np.zeros((len(columns), 3 * normals)),
@@ -406,11 +416,11 @@ def ply_blocks(
         rows = np.concatenate(parts, axis=1, dtype="<f4", casting="same_kind")
         if not np.isfinite(rows).all():
             raise ValueError(f"expected finite Gaussians, got an opacity outside [0, 1] in the rows from {start}")
-        if not more or extra is None:
+        if not extra_types or extra is None:
             yield rows.data
             continue
-        beside = np.ascontiguousarray(extra[start : start + block]).view(np.uint8).reshape(len(rows), -1)
-        yield np.concatenate([rows.view(np.uint8), beside], axis=1).data
+        extra_bytes = np.ascontiguousarray(extra[start : start + block]).view(np.uint8).reshape(len(rows), -1)
+        yield np.concatenate([rows.view(np.uint8), extra_bytes], axis=1).data
 
 
 def _header(
@@ -421,9 +431,9 @@ def _header(
     normals: bool = True,
     extra: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[bytes, int]:
-    """Return the header of a ``.ply`` of ``count`` Gaussians, and its number of columns of float32.
+    """Return the header of a ``.ply`` of ``count`` Gaussians, and its number of float32 columns.
 
-    ``extra``: names of columns after these, with their types as NumPy writes them.
+    ``extra``: names of the columns that follow these -> NumPy's names of their types.
     """
     num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
     names = [
@@ -442,7 +452,7 @@ def _header(
 
 
 def file_bytes(count: int, sh_degree: int) -> int:
-    """Return the size in bytes of the result of ``count`` Gaussians as a ``.ply``, without further comments."""
+    """Return the size in bytes of a result of ``count`` Gaussians as a ``.ply`` without further comments."""
     header, num_columns = _header(count, min(sh_degree, MAX_DEGREE))
     return len(header) + 4 * num_columns * count
 
@@ -450,7 +460,7 @@ def file_bytes(count: int, sh_degree: int) -> int:
 def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits.
 
-    There is room for a comment on new views.
+    A comment on new views is counted, whether the result has one or not.
     """
     if not 0 <= sh_degree <= MAX_READ_DEGREE:
         raise ValueError(f"sh_degree: expected 0 to {MAX_READ_DEGREE}, got {sh_degree}")

@@ -1,4 +1,4 @@
-"""Read Gaussian splats from files: log scales, logits and channel-major harmonics end here."""
+"""Read Gaussians from files: convert log scales, logits and channel-major harmonics to the units of the package."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Gaussians, StrPath
 
 _READ_FRAMES = LazyFunction("gsmerge.io.formats.depth_maps", "read_frames")
-MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
-MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
-MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
-FREED_ROWS = 1 << 17  # after which the pages of large columns leave memory
-_MIN_JUDGED = 100  # Gaussians whose scales say something
-_SCALE_GAUSSIANS = 20_000  # of them that are looked at
-_MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviations are wrong
-# The same in units of the width over the root of the number of Gaussians: sound files have 0.3 to
-# 2, linear scales that are taken for logarithms 10 to 1,000.
+MIN_PADDING = 16  # number of equal rows at the origin that are padding; fewer may be Gaussians
+MIN_FINITE = 0.002  # least share of finite rows; a file with fewer is refused
+MAX_HARMONIC = 1e6  # rendered values of such harmonics can still be squared and summed in float32
+FREED_ROWS = 1 << 17  # rows after which the memory of large columns is freed
+_MIN_JUDGED = 100  # least number of Gaussians or values from which scales and encodings are judged
+_SCALE_GAUSSIANS = 20_000  # number of Gaussians whose scales are judged
+_MAX_WIDTH = 0.25  # standard deviations above this share of the scene's width are wrong
+# Linear scales that are taken for logarithms are larger than this, in units of the scene's width over the root of the
+# number of Gaussians. Sound files have 0.3 to 2, such files 10 to 1,000.
 _MAX_SPACINGS = 6.0
-_RAW_ROUNDING = 0.01  # by which opacities that are rounded to half of a float's bits may exceed [0, 1]
+_RAW_ROUNDING = 0.01  # opacities that were rounded to half floats may exceed [0, 1] by this
 
 
 @dataclass(frozen=True)
@@ -43,36 +43,34 @@ class FileInfo:
     path: str
     layout: str  # name of the column layout, as "17-column export" or "INRIA, SH degree 3"
     format: str  # "ascii", "binary little-endian" or "binary big-endian"
-    count: int  # Gaussians, the unusable ones included
-    file_bytes: int  # of an index, with those of its level's chunks
-    # bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats, extra); of the values' binary
-    # types for an ascii file; before gzip for .spz, and of the textures for .sog, where sh0 includes the opacities
+    count: int  # number of rows, including unusable ones
+    file_bytes: int  # for an index of levels, including the chunks of the level that is read
+    # Bytes of the rows by attribute: means, normals, sh0, shN, opacities, scales, quats, extra. For an ascii file, the
+    # bytes of the binary types; for .spz, before compression; for .sog, of the textures (sh0 includes the opacities)
     bytes_by_attribute: dict[str, int]
-    # all columns of the vertex element, in the file's order; ``extra_columns`` are ignored, and ``byte_columns`` stored
-    # as bytes
-    columns: tuple[str, ...]
-    extra_columns: tuple[str, ...]
+    columns: tuple[str, ...]  # all columns of the vertex element, in the file's order
+    extra_columns: tuple[str, ...]  # those of them that are ignored
     extra_elements: tuple[str, ...]  # elements besides ``vertex``
-    byte_columns: tuple[str, ...]
+    byte_columns: tuple[str, ...]  # columns that are stored as bytes
     comments: tuple[str, ...]  # of the header
     sh_degree: int  # 0 to 4
-    opacity_encoding: str  # "logit", or "raw" where the file holds opacities in [0, 1]
-    opacity_guessed: bool  # whether the encoding was guessed from the values, not given by the caller or the file
-    num_nonfinite: int  # rows with NaN or inf, set aside
-    num_empty: int  # rows that hold the place of a Gaussian and are none, set aside
-    num_clipped_scales: int  # Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped
-    num_zero_quats: int  # Gaussians without a rotation, read as the identity
-    # why the scales are likely wrong, one sentence without a full stop; empty where they are not
+    opacity_encoding: str  # "logit", or "raw" if the file holds opacities in [0, 1]
+    opacity_guessed: bool  # True: the encoding was guessed from the values; False: the caller or the file states it
+    num_nonfinite: int  # rows with NaN or inf, which are set aside
+    num_empty: int  # rows that only pad the file, which are set aside
+    num_clipped_scales: int  # Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, which is clipped
+    num_zero_quats: int  # Gaussians with a zero quaternion, read as the identity
+    # why the scales are likely wrong, one sentence without a full stop; empty if they are plausible
     odd_scales: str = ""
-    adapted: tuple[str, ...] = ()  # what was adapted to read the file, one sentence each without a full stop
+    adapted: tuple[str, ...] = ()  # how the content was adapted, one sentence each without a full stop
 
 
 @dataclass(frozen=True)
 class GaussianFile:
-    """The n Gaussians of a file, row by row; float32, means float64 where the file stores them so.
+    """The n Gaussians of a file, row by row, as float32; means are float64 if the file stores them as float64.
 
-    A row that is no Gaussian is False in ``valid [n]``: not finite, or empty. It is fully transparent and grey, and has
-    the position and scales of the Gaussian before it.
+    ``valid [n]`` is False for rows that are no Gaussians, because they are not finite or empty. Such a row is fully
+    transparent and grey, and has the position and scales of the Gaussian before it.
     """
 
     gaussians: Gaussians
@@ -84,7 +82,7 @@ class GaussianFile:
 
 
 def kept_comments(info: FileInfo) -> tuple[str, ...]:
-    """Return the header comments that tell viewers how to render the Gaussians."""
+    """Return the header comments that copies keep: how to render the Gaussians, and which axis is vertical."""
     return arrays.copied_comments(info.comments)
 
 
@@ -94,36 +92,38 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
         "row(s) with NaN or inf, set aside": info.num_nonfinite,
         "empty row(s) at the origin, set aside": info.num_empty,
         "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
-        "Gaussian(s) with a zero quaternion, taken as the identity": info.num_zero_quats,
+        "Gaussian(s) with a zero quaternion, read as the identity": info.num_zero_quats,
     }
-    raw = ("opacities lie in [0, 1]: taken as activated, not as logits; --hint opacity=logit says otherwise",)
-    notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
-    odd = (info.odd_scales,) if info.odd_scales else ()
-    return (*info.adapted, *notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
+    raw = ("opacities lie in [0, 1] and are read as such; if they are logits, use --hint opacity=logit",)
+    raw_notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
+    scale_notes = (info.odd_scales,) if info.odd_scales else ()
+    count_notes = (f"{count:,} {what}" for what, count in counted.items() if count)
+    return (*info.adapted, *raw_notes, *scale_notes, *count_notes)
 
 
 def degree_notes(info: FileInfo) -> tuple[str, ...]:
-    """Describe harmonics of a degree that few programs read in a ``.ply``, in the form of :func:`file_notes`."""
+    """Note harmonics of a degree that few programs read in a ``.ply``, in the form of :func:`file_notes`."""
     if info.sh_degree <= ply.MAX_DEGREE or not PLY.names(info.path):
         return ()
-    return (f"harmonics of degree {info.sh_degree}: splat-transform 3.7 and gsply refuse a .ply with them",)
+    return (f"splat-transform 3.7 and gsply refuse a .ply with harmonics of degree {info.sh_degree}, as this one has",)
 
 
 @check_arguments
 def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
-    """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, ``filter_3D`` worked in, others unused.
+    """Read a PLY file of Gaussians, binary or ascii, with harmonics of any degree up to 4.
 
-    Colours may be red, green and blue, or r, g and b (bytes, or floats in [0, 1]) where the harmonics of degree 0 are
-    missing. Of two scales, as 2D Gaussians have, the third is a thousandth of the smaller one.
+    The column ``filter_3D`` is applied to scales and opacities; other additional columns are not used. Without
+    harmonics of degree 0, colours may be red, green and blue, or r, g and b (bytes, or floats in [0, 1]). 2D Gaussians
+    have two scales; their third scale becomes a thousandth of the smaller one.
 
     Args:
         path: The file.
-        opacity: How opacities are stored; "auto" takes them as activated if all finite ones lie in [0, 1], else
+        opacity: How opacities are stored. "auto" reads them as opacities if the finite values lie in [0, 1], else
             as logits. Infinite logits are opacities of 0 and 1.
 
     Raises:
-        SceneError: If the file cannot be read, lacks columns, or hardly has a finite Gaussian: 2 in 1,000 rows.
-        ValueError: If ``opacity`` is none of the three.
+        SceneError: If the file cannot be read, lacks columns, or has fewer than 2 finite Gaussians in 1,000 rows.
+        ValueError: If ``opacity`` is not "auto", "logit" or "raw".
 
     Example:
         >>> len(gsmerge.read_ply("demo/scene.ply").gaussians)
@@ -133,9 +133,9 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
 
 
 def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> GaussianFile:
-    """Read several files as one, in the given order; see :func:`read_ply`.
+    """Read files as one, in the given order: a PLY file, PLY files with equal columns, or files of depth maps.
 
-    They are one PLY file, PLY files with equal columns, or files of depth maps.
+    Errors are those of :func:`read_ply`.
     """
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
@@ -143,7 +143,7 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
     parts = _READ_FRAMES(paths) if is_depth else parallel_map(ply.read_rows, paths)
     for path, part in zip(paths, parts, strict=True):
         if part.rows.dtype != parts[0].rows.dtype:
-            problem = f"expected the columns of {paths[0].name}, found others, so they are no parts of one scene"
+            problem = f"expected the same columns as in {paths[0].name}, found others, so these are no parts of a scene"
             raise SceneError(path, problem, "name one of the files")
     return convert_files(paths, parts, opacity)
 
@@ -152,10 +152,10 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
     """Read a file of Gaussians; the ending of its name tells the format.
 
-    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2), ``.glb``, and ``.npz`` of depth maps; of a
-    ``lod-meta.json``, it is the finest level. splat-transform reads ``.ksplat``, ``meta.json`` or its folder, ``.lcc``
-    and ``.lcc2``. Everything else is read by :func:`read_ply`, for which ``opacity`` is.
-    SceneError if the file cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
+    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2), ``.glb``, and ``.npz`` of depth maps. The
+    finest level of a ``lod-meta.json`` is read. splat-transform reads ``.ksplat``, ``meta.json`` or its folder,
+    ``.lcc`` and ``.lcc2``. Everything else is read by :func:`read_ply`; only this uses ``opacity``. SceneError if the
+    file cannot be read, is damaged, or holds no finite Gaussian. ValueError for an unknown ``opacity``.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
@@ -167,14 +167,14 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
     chosen = find_format(path)
     if chosen.read is None:
         problem = f"expected one of {', '.join(SCENE_SUFFIXES)}, found {chosen.ending}, which is written and not read"
-        raise SceneError(path, problem, "name the file that it was made of")
+        raise SceneError(path, problem, "name the file that it was made from")
     if chosen.read is ply.read_rows:
         return read_ply(path, opacity=opacity)
     return convert_files([path], [chosen.read(path)], "auto")
 
 
 def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice) -> GaussianFile:
-    """Convert the rows of files, one after the other; facts that are not sums are those of the first."""
+    """Convert the rows of files to Gaussians, file by file; facts that are not sums are those of the first file."""
     path, stored, dtype = paths[0], parts[0], parts[0].rows.dtype
     names = tuple(dtype.names or ())
     num_higher = sum(name.startswith("f_rest_") for name in names) // 3
@@ -220,15 +220,15 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         num_nonfinite=num_bad,
         num_empty=len(empty),
         num_clipped_scales=num_clipped,
-        num_zero_quats=max(0, num_zero_quats - len(empty)),  # which have none as a rule
-        odd_scales=_describe_odd_scales(out["means"], out["scales"], out["valid"]),
-        adapted=(*notes, *stored.notes, *_describe_end(out["valid"])),
+        num_zero_quats=max(0, num_zero_quats - len(empty)),  # empty rows usually have zero quaternions
+        odd_scales=_describe_wrong_scales(out["means"], out["scales"], out["valid"]),
+        adapted=(*notes, *stored.notes, *_describe_incomplete(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
 
 def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with the rows of a file, and count clipped scales and missing rotations."""
+    """Fill arrays with the rows of a file; return the numbers of clipped Gaussians and of zero quaternions."""
     n, size = len(stored.rows), max(1, ply.BLOCK_BYTES // stored.rows.dtype.itemsize)
     with ply.open_rows(path, stored.rows) as read:
 
@@ -249,7 +249,7 @@ def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) ->
 
 
 def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays of one block of rows; opacities are only copied."""
+    """Fill the arrays of one block of rows, without a conversion of opacities; return counts as _convert_file."""
     plain = _convert_plain(rows, out)
     out["valid"][:plain] = True
     if plain == len(rows):
@@ -258,9 +258,10 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
 
 
 def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
-    """Fill arrays with the rows before the first row that is not plain, and return their number.
+    """Fill arrays with the rows before the first one that needs special treatment, and return their number.
 
-    See :func:`convert_rows`.
+    :func:`gsmerge.kernels.stored_rows.convert_rows` says which rows do. The number is 0 for rows of other columns or
+    types than float32.
     """
     columns, num_higher = dict(rows.dtype.fields or {}), out["shN"].shape[1]
     rest = [f"f_rest_{channel * num_higher + j}" for j in range(num_higher) for channel in range(3)]
@@ -276,9 +277,9 @@ def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
 
 
 def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays of any rows, column by column."""
+    """Fill the arrays of rows of any kind, column by column; return counts as :func:`_convert_file`."""
     with np.errstate(all="ignore"):
-        total = np.zeros(len(rows), np.float32)  # not finite where any column is not: one test instead of many
+        total = np.zeros(len(rows), np.float32)  # not finite if any column is not, so one test is enough
 
         def take(name: str) -> np.ndarray:
             column = rows[name].astype(np.float32)
@@ -316,14 +317,14 @@ def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int,
         zero = _normalise(quats, out["quats"])
         out["opacities"][:] = take("opacity")
         valid = np.isfinite(total, out=out["valid"])
-        doubtful = np.flatnonzero(~valid)
+        doubtful = np.flatnonzero(~valid)  # the sum also overflows, or has an infinite logit or log scale
         if len(doubtful):
-            valid[doubtful] = _exactly_valid(rows[doubtful], num_higher)
+            valid[doubtful] = _are_usable(rows[doubtful], num_higher)
     return int((clipped & valid).sum()), int((zero & valid).sum())
 
 
-def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
-    """Return which rows are usable: finite, except for infinite logits and scales of zero."""
+def _are_usable(rows: np.ndarray, num_higher: int) -> np.ndarray:
+    """Return which rows are usable: all values are finite, except for infinite logits and scales of zero."""
     valid = ~np.isnan(rows["opacity"].astype(np.float32))
     colors = arrays.color_columns(rows.dtype.names)
     for name in (*arrays.MEANS, *colors, *arrays.QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
@@ -335,7 +336,7 @@ def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
 
 
 def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions, the identity for zero; return the mask of zero quaternions."""
+    """Write unit quaternions to ``out [n,4]``, and the identity for zero quaternions; return the mask of these."""
     w, x, y, z = quats
     squared = w * w + x * x + y * y + z * z
     inverse = 1 / np.sqrt(squared)
@@ -355,7 +356,7 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
 def _choose_encoding(
     paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray, empty: np.ndarray, named: OpacityChoice
 ) -> tuple[str, bool]:
-    """Choose the encoding of opacities, and return whether it is guessed; ``empty`` rows say nothing of it."""
+    """Choose the encoding of opacities, and return whether it is guessed; ``empty`` rows are not considered."""
     if named == "raw":
         _check_raw(paths[0], opacities)
     if named != "auto":
@@ -367,23 +368,23 @@ def _choose_encoding(
 
 
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
-    """Return the encoding of opacities that the parts declare; None if none does.
+    """Return the encoding of opacities that the parts declare; None if no part declares one.
 
-    A part that declares none has the encoding that its values show, if there are enough values. SceneError if parts
-    differ.
+    SceneError if the encodings of parts differ. For that, the encoding of a part that declares none is guessed from its
+    values if there are enough.
     """
-    first, seen = 0, dict[str, str]()  # name of the first part of each encoding
+    first, part_names = 0, dict[str, str]()  # encoding -> name of the first part that has it
     for path, part in zip(paths, parts, strict=True):
         values = opacities[first : first + len(part.rows)]
         first += len(values)
         is_clear = len(parts) > 1 and np.isfinite(values).sum() >= _MIN_JUDGED
         encoding = part.encoding or (_guess_encoding(values) if is_clear else None)
         if encoding is not None:
-            seen.setdefault(encoding, path.name)
-        if len(seen) > 1:
-            (other, name), _ = seen.items()
-            problem = f"expected opacities as in {name}, which are {other}, found {encoding} ones"
-            raise SceneError(path, problem, "export all parts alike; if all are logits, say --hint opacity=logit")
+            part_names.setdefault(encoding, path.name)
+        if len(part_names) > 1:
+            (other, name), _ = part_names.items()
+            problem = f"expected {other} opacities as in {name}, found {encoding} opacities"
+            raise SceneError(path, problem, "export all parts alike; if all are logits, use --hint opacity=logit")
     return next((part.encoding for part in parts if part.encoding is not None), None)
 
 
@@ -400,7 +401,7 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
 
 
 def _apply_filter(out: dict[str, np.ndarray]) -> tuple[str]:
-    """Widen Gaussians by their filter, fainter by as much as they grow, as Mip-Splatting draws them; return a note."""
+    """Add the filter of Mip-Splatting to the scales, and reduce opacities by the growth; return a note."""
     widths, scales, most = out.pop(arrays.FILTER), out["scales"], np.float32(exp(arrays.MAX_LOG_SCALE))
     out["valid"] &= np.isfinite(widths)
 
@@ -411,35 +412,35 @@ def _apply_filter(out: dict[str, np.ndarray]) -> tuple[str]:
         out["opacities"][block] *= (before / scales[block]).prod(1)
 
     parallel_map(widen, range(0, len(widths), FREED_ROWS))
-    return (f"{arrays.FILTER} of Mip-Splatting is worked into the scales and opacities",)
+    return (f"the column {arrays.FILTER} of Mip-Splatting is applied to scales and opacities",)
 
 
 def _check_raw(path: Path, opacities: np.ndarray) -> None:
-    """Raise SceneError for logits that the caller says are opacities in [0, 1]."""
+    """Raise SceneError if values that the caller declares as opacities in [0, 1] are logits."""
     finite = np.isfinite(opacities)
     outside = (np.abs(opacities - 0.5) > 0.5 + _RAW_ROUNDING) & finite
     if outside.sum() > arrays.MAX_STRAY * finite.sum():
         share = 100 * outside.sum() / finite.sum()
-        problem = f"expected opacities in [0, 1], as hinted, found {share:.3g} % outside, as logits are"
+        problem = f"expected opacities in [0, 1], as --hint opacity=raw says, found {share:.3g} % outside, like logits"
         raise SceneError(path, problem, "leave out --hint opacity=raw")
 
 
 def _guess_encoding(opacities: np.ndarray) -> str:
-    """Return "raw" where finite stored opacities lie in [0, 1], but for roundings and damage; else "logit".
+    """Return "raw" if the finite stored opacities lie in [0, 1], except for roundings and damage; else "logit".
 
-    The density of logits goes on beyond 0 and 1, that of opacities ends there: hardly any lies beyond, and fewer than
-    as near to the ends inside.
+    The density of logits continues beyond 0 and 1, while that of opacities ends there. Therefore values are opacities
+    if hardly any lies outside [0, 1], and fewer than lie inside close to 0 or 1.
     """
     finite = np.isfinite(opacities)
-    beyond = np.abs(opacities[finite] - 0.5) - 0.5
-    num_beyond = int(np.count_nonzero(beyond > 0))
-    num_near = int(np.count_nonzero((beyond <= 0) & (beyond > -_RAW_ROUNDING)))
-    few = num_beyond < num_near and num_beyond < arrays.MAX_STRAY * len(beyond)
-    return "raw" if len(beyond) and (few or num_beyond == 0) else "logit"
+    excess = np.abs(opacities[finite] - 0.5) - 0.5  # distance outside [0, 1]; negative inside
+    num_outside = int(np.count_nonzero(excess > 0))
+    num_close = int(np.count_nonzero((excess <= 0) & (excess > -_RAW_ROUNDING)))
+    are_few = num_outside < num_close and num_outside < arrays.MAX_STRAY * len(excess)
+    return "raw" if len(excess) and (are_few or num_outside == 0) else "logit"
 
 
-def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:
-    """Explain why ``scales [n,3]`` are likely wrong for ``means [n,3]``; "" where they are not."""
+def _describe_wrong_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:
+    """Explain why ``scales [n,3]`` are likely wrong for ``means [n,3]``; "" if they are plausible."""
     rows = range(len(valid)) if valid.all() else np.flatnonzero(valid)
     if len(rows) < _MIN_JUDGED:
         return ""
@@ -447,22 +448,21 @@ def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarra
     low, high = np.quantile(gather(means, sample).astype(np.float64), (0.05, 0.95), axis=0)
     width, sizes = float((high - low).max()), gather(scales, sample)
     size = float(np.median(sizes.max(1)))
-    text = f"half of the Gaussians have a standard deviation above {size:.3g}"
-    text += f" in a scene of a width of {width:.3g}"
+    text = f"half of the Gaussians have a standard deviation above {size:.3g} in a scene of width {width:.3g}"
     most = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
-    linear = float(log(size))
-    if linear <= most < size and not arrays.are_logarithms(log(sizes)):
-        start = f"hardly a stored scale is negative (median {linear:.3g}), as if linear"
-        return f"{start}: {text}; logarithms are expected"
+    stored = float(log(size))
+    if stored <= most < size and not arrays.are_logarithms(log(sizes)):
+        signs = f"the stored scales are hardly ever negative (median {stored:.3g})"
+        return f"scales seem to be linear, but logarithms are expected: {signs}, and {text}"
     if size > _MAX_WIDTH * width:
-        return f"{text}: the scales, which are logarithms, are too large"
+        return f"scales, which are stored as logarithms, seem too large: {text}"
     return ""
 
 
 def _spread_low_degree(shN: np.ndarray) -> None:
     """Move harmonics of a low degree to their places in ``shN [n,15,3]``, in place.
 
-    Long-LRM writes 45 columns whatever the degree, the used ones channel-major in the first 9 or 24.
+    Long-LRM writes 45 columns for every degree. Harmonics of degree 1 or 2 are channel-major in the first 9 or 24.
     """
     if shN.shape[1] != 15:
         return
@@ -476,23 +476,23 @@ def _spread_low_degree(shN: np.ndarray) -> None:
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
-    """Make rows with NaN or infinities transparent, in place; return their number."""
+    """Make invalid rows transparent, in place, and return their number; SceneError if hardly a row is valid."""
     valid = out["valid"]
     bad = np.flatnonzero(~valid)
     num_good = len(valid) - len(bad)
     if len(bad) and num_good < MIN_FINITE * len(valid):
         number = f"{len(bad):,} of" if num_good else "all"
         problem = f"expected finite Gaussians, found NaN or inf in {number} {len(valid):,} rows"
-        raise SceneError(path, problem, "export it again" if num_good else "")
+        raise SceneError(path, problem, "export it again")
     clear_rows(out, bad)
     return len(bad)
 
 
 def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the valid rows that hold the place of a Gaussian and are none.
+    """Return the valid rows that only pad the file.
 
-    Those are rows at the origin, not turned, round and grey, as a table of zeros is; and rows at the origin that are
-    all equal, as VolSplat fills its files up. A few stay where a file has no others; SceneError for many.
+    These are rows at the origin that are not rotated, round and grey, as rows of zeros are, and rows at the origin that
+    are all equal, as VolSplat pads its files. If a file has no other rows, a few are Gaussians; SceneError for many.
     """
     rows = np.flatnonzero((out["means"] == 0).all(1) & out["valid"])
     if len(rows) == 0:
@@ -506,16 +506,13 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     if len(rows) == np.count_nonzero(out["valid"]):
         if len(rows) < MIN_PADDING:
             return rows[:0]
-        problem = f"expected Gaussians, found {len(rows):,} rows that are empty or equal, at the origin"
-        raise SceneError(path, problem, "the export may have broken off; export it again")
+        problem = f"expected Gaussians, found only {len(rows):,} rows at the origin that are empty or equal"
+        raise SceneError(path, problem, "export it again, since the export may have been interrupted")
     return rows
 
 
 def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
-    """Make rows that are no Gaussians invalid and transparent, in place.
-
-    They get the position and scales of the Gaussian before.
-    """
+    """Make ``rows`` invalid and transparent, in place; they get the position and scales of the Gaussian before."""
     if len(rows) == 0:
         return
     out["valid"][rows] = False
@@ -527,15 +524,15 @@ def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
         out[name][rows] = value
 
 
-def _describe_end(valid: np.ndarray) -> tuple[str, ...]:
-    """Say where a file seems to have broken off: its last rows alone, or most of it, are no Gaussians."""
+def _describe_incomplete(valid: np.ndarray) -> tuple[str, ...]:
+    """Note a file whose export seems incomplete, because its last rows or most of its rows are no Gaussians."""
     good = np.flatnonzero(valid)
-    last = len(valid) - 1 - int(good[-1])  # rows after the last Gaussian
-    empty = len(valid) - len(good)
-    if last > 1 and last > empty - last:
-        where, remedy = f"the last {last:,}", "the export may have broken off; export it again"
-    elif empty > len(good):
-        where, remedy = f"{empty:,}", "export the file again if no mask emptied them"
+    num_last = len(valid) - 1 - int(good[-1])  # rows after the last Gaussian
+    num_bad = len(valid) - len(good)
+    if num_last > 1 and num_last > num_bad - num_last:
+        which, remedy = f"the last {num_last:,}", "export it again, since the export may have been interrupted"
+    elif num_bad > len(good):
+        which, remedy = f"{num_bad:,}", "export the file again unless a mask emptied them"
     else:
         return ()
-    return (f"{where} of {len(valid):,} rows are no Gaussians: {remedy}",)
+    return (f"{which} of {len(valid):,} rows are no Gaussians; {remedy}",)

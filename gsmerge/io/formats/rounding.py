@@ -1,4 +1,4 @@
-"""What a file keeps of positions, where rounding moves Gaussians so far that pictures show it."""
+"""Warn if a format's rounding of positions moves Gaussians so far that renders change visibly."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from gsmerge.io.formats.table import PLY, output_format
 from gsmerge.io.formats.write import write_gaussians
 from gsmerge.types import Gaussians, StrPath
 
-# Mean square of what Gaussians are moved by in units of their size, at most 1 each, from which pictures show it: .05 dB
-# of 27. In scenes around their origin it is a tenth of that and less.
+# Mean square of the moves of Gaussians above which renders change: by .05 dB of 27. A move is in units of the
+# Gaussian's size and at most 1. Scenes around their origin have at most a tenth of this.
 SHOWN = 0.005
-SAMPLE = 1 << 17  # Gaussians that are enough to tell
+SAMPLE = 1 << 17  # number of Gaussians from which the mean is estimated
 
 
 def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
-    """Describe how far a file's rounding moves Gaussians, and the remedy; empty where pictures do not show it."""
+    """Note how far a file's rounding moves Gaussians, and the remedy; empty if renders do not change visibly."""
     chosen = output_format(path, levels=True, cameras=True)
     if len(gaussians) == 0:
         return []
     columns, step = gaussians.numpy(), len(gaussians) // SAMPLE + 1
-    ends = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # which formats scale by
+    ends = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # formats choose their steps by these
     rows = np.unique(np.concatenate([np.arange(0, len(columns), step), *ends]))
     means, sizes = columns.means[rows].astype(np.float64), np.median(columns.scales[rows], axis=1)
     with np.errstate(over="ignore"):
@@ -34,15 +34,15 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
         return []
     middle = np.median(means, axis=0)
     shift = ",".join(f"{-float(f'{value:.3g}'):.0f}" for value in middle)
-    remedy = f"move the input and its cameras near the origin first: gsmerge convert --translate={shift}"
-    if np.abs(middle).max() < np.abs(means - middle).max():  # some are farther from the others than these from it
-        remedy = ("" if chosen.round_means is PLY.round_means else "write a .ply, or ") + "crop what is far away"
-    lost = f"positions lose digits in {chosen.ending} so far from the origin"
-    return [f"{lost}: Gaussians move by some {100 * moved**0.5:.0f} % of their size; {remedy}"]
+    remedy = f"move the input and its cameras near the origin first, with gsmerge convert --translate={shift}"
+    if np.abs(middle).max() < np.abs(means - middle).max():  # the scene is wider than its distance from the origin
+        remedy = ("" if chosen.round_means is PLY.round_means else "write a .ply, or ") + "crop far Gaussians"
+    lost = f"positions so far from the origin lose digits in {chosen.ending}"
+    return [f"{lost}, and Gaussians move by about {100 * moved**0.5:.0f} % of their size; {remedy}"]
 
 
 def as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
-    """Return Gaussians as a file of this name keeps them, read back; as they are where rounding is not shown."""
+    """Write Gaussians in the format of a path and read them back; return them unchanged if rounding is invisible."""
     if not rounding_notes(path, gaussians):
         return gaussians
     chosen = output_format(path, levels=True, cameras=True)

@@ -1,8 +1,8 @@
-"""``.sog`` version 2 (developer.playcanvas.com, "The SOG format"): lossless WebP textures in a zip or a folder.
+"""Read and write ``.sog`` version 2 (developer.playcanvas.com, "The SOG format"): WebP textures in a zip or a folder.
 
-A pixel is a Gaussian. Positions are 16 bits of their signed logarithms, rotations their three
-smaller components at 8 bits, log scales, colours and harmonics codes of codebooks of 256; all
-harmonics of a Gaussian are one of at most 65,536 of a palette.
+The textures are lossless, and each pixel is a Gaussian. Positions are signed logarithms at 16 bits. Rotations are their
+three smaller components at 8 bits. Log scales, colours and harmonics are indices of codebooks of 256 values. All
+harmonics of a Gaussian are one entry of a palette of at most 65,536.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3
 VERSION = 2
-MODELS = {arrays.MIP: "antialiased", arrays.FLAT: "2dgs"}  # as splat-transform calls the modes of rendering
+MODELS = {arrays.MIP: "antialiased", arrays.FLAT: "2dgs"}  # splat-transform's names of the modes of rendering
 GENERATOR = "gsmerge"
-# All that a writer makes
+# All files that writers make
 FILES = (
     "means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp", "shN_centroids.webp", "shN_labels.webp",
     META,
 )  # fmt: skip
-FIRST_MODE = 252  # alpha of a rotation whose largest component is the first
+FIRST_MODE = 252  # alpha of a rotation whose first component is the largest; the next three stand for the others
 PALETTE_BITS = 16
 PALETTE_COLUMNS = 64  # sets of harmonics side by side in the texture of the palette
 _LOSSLESS = 101  # OpenCV's WebP quality
-PACKED_BYTES = 19  # of a Gaussian as its textures are held
-CODES = 256
-_CELLS = 1 << 11  # as many of equal width, and of equally many values
-_MAX_STEPS = 200
+PACKED_BYTES = 19  # of a Gaussian in the decoded textures
+CODES = 256  # values of a codebook
+_CELLS = 1 << 11  # number of cells of equal width, and of cells with equally many values, before merging
+_MAX_STEPS = 200  # of Lloyd's algorithm
 
 
 @dataclass(frozen=True)
 class _Bundle:
-    """Files of a ``.sog`` by name, in a zip; one of more bytes than all have as they are stored is not read."""
+    """Files of a ``.sog`` by name, in a zip; a file that unpacks to more bytes than the whole zip has is refused."""
 
     archive: zipfile.ZipFile
-    size: int  # of all
+    size: int  # bytes of the zip
 
     def num_bytes(self, name: str) -> int:
         return self.archive.getinfo(name).compress_size
@@ -70,16 +70,16 @@ class _Bundle:
 
 @dataclass(frozen=True)
 class _Folder:
-    """Files of a ``.sog`` by name, in a folder and in no other."""
+    """Files of a ``.sog`` by name, in a folder; names of files outside it are refused."""
 
     folder: Path
-    size: int
+    size: int  # bytes of all files
 
     def num_bytes(self, name: str) -> int:
         path = self.folder / name
         inside = Path(os.path.realpath(path)).parent == Path(os.path.realpath(self.folder))
         if path.name != name or "\\" in name or not inside:
-            raise ValueError(f"{name!r}, which leads out of the folder")
+            raise ValueError(f"{name!r}, which is outside the folder")
         return check_file(path)
 
     def member(self, name: str) -> bytes:
@@ -121,7 +121,7 @@ def read_unbundled(path: Path) -> SogContent:
 
 @contextmanager
 def _damage(path: Path) -> Iterator[None]:
-    """Turn all errors that damaged files cause in a reader into a SceneError."""
+    """Convert all errors that damaged files cause in a reader to a SceneError."""
     try:
         with read_errors(path):
             yield
@@ -133,10 +133,12 @@ def _damage(path: Path) -> Iterator[None]:
         problem = f"expected meta.json and textures of .sog version {VERSION}, found others ({error})"
         raise SceneError(path, problem, "export it again") from error
     except zlib.error as error:
-        raise SceneError(path, f"expected a readable .sog file, found a damaged one ({error})") from error
+        problem = f"expected a readable .sog file, found a damaged one ({error})"
+        raise SceneError(path, problem, "copy or export it again") from error
 
 
 def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
+    """Read the ``meta.json`` of a ``.sog``, and the textures that it names."""
     meta = parse_json(files.member(META).decode("utf-8-sig"), budget)
     version = meta.get("version", 1) if isinstance(meta, dict) else "none"
     if version != VERSION:
@@ -154,10 +156,10 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
 
 
 def _image_size(data: bytes) -> tuple[int, int]:
-    """Return width and height of a WebP image; ValueError if it is another file, or lossy."""
+    """Return width and height of a lossless WebP image; ValueError for any other file."""
     at = 12
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        while at + 8 <= len(data) and data[at : at + 4] in (b"VP8X", b"ICCP"):  # before the image of an extended file
+        while at + 8 <= len(data) and data[at : at + 4] in (b"VP8X", b"ICCP"):  # chunks before the image
             at += 8 + (int.from_bytes(data[at + 4 : at + 8], "little") + 1) // 2 * 2
         if data[at : at + 4] == b"VP8L" and len(data) >= at + 13:
             bits = int.from_bytes(data[at + 9 : at + 13], "little")
@@ -171,7 +173,7 @@ def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> n
     width, height = _image_size(data)
     if not count <= width * height <= 4 * count + (1 << 16):
         raise ValueError(f"{name} of {width} x {height} pixels for {count}")
-    budget.check_memory(12 * width * height, f"{name} of {width} x {height} pixels")  # as decoded, and in two orders
+    budget.check_memory(12 * width * height, f"{name} of {width} x {height} pixels")  # decoded, in two channel orders
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -183,9 +185,11 @@ def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> n
 
 
 def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> arrays.Packed:
+    """Decode the textures and codebooks, and return their Gaussians; ValueError for damaged content."""
+
     def texture(key: str, index: int = 0, channels: int = 3) -> np.ndarray:
         pixels = _read_texture(files, meta[key]["files"][index], count, budget)
-        return pixels[:, :channels].copy()  # without pixels and channels that nothing reads
+        return pixels[:, :channels].copy()  # which frees the memory of unused channels
 
     low, high = (_check_numbers(meta["means"][key], 3) for key in ("mins", "maxs"))
     lower, upper, scales = texture("means"), texture("means", 1), texture("scales")
@@ -200,7 +204,7 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
         modes, smallest = quats[block, 3].astype(int) - FIRST_MODE, (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
         codes = np.zeros((len(modes), 0, 3), np.uint8) if labels is None else palette[labels[block]]
         return arrays.Columns(
-            means=_open_means(lower[block] + 256.0 * upper[block], low, high),
+            means=_decode_means(lower[block] + 256.0 * upper[block], low, high),
             quats=arrays.from_smallest_three(modes, smallest),
             log_scales=scale_codes[scales[block]],
             opacities=sh0[block, 3] / 255,
@@ -212,6 +216,7 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
 
 
 def _check_numbers(values: Any, length: int) -> np.ndarray:
+    """Convert a list to an array ``[length]``; ValueError if it has another length."""
     numbers = np.asarray(values, np.float64)
     if numbers.shape != (length,):
         raise ValueError(f"{numbers.shape} numbers instead of {length}")
@@ -219,7 +224,7 @@ def _check_numbers(values: Any, length: int) -> np.ndarray:
 
 
 def _read_palette(files: _Files, part: dict[str, Any], count: int, budget: ReadBudget) -> tuple[np.ndarray, np.ndarray]:
-    """Return the label ``[count]`` of each Gaussian's harmonics, and the palette ``[n,num_higher,3]`` of codes."""
+    """Return for each Gaussian its index ``[count]`` in the palette, and the palette ``[n,num_higher,3]`` of codes."""
     size, num_higher = check_whole(part["count"], "count", 1, 2**PALETTE_BITS), (part["bands"] + 1) ** 2 - 1
     name, labels_name = part["files"]
     labels = _read_texture(files, labels_name, count, budget)[:, :2].copy().view("<u2")[:, 0]
@@ -229,9 +234,9 @@ def _read_palette(files: _Files, part: dict[str, Any], count: int, budget: ReadB
 
 
 def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.sog`` along a space-filling curve; ``comments`` may say how to render it.
+    """Encode a ``.sog``, with rows in the order of a space-filling curve; ValueError if there is NaN or inf.
 
-    ValueError if there is NaN or inf.
+    ``comments`` may have the mode of rendering, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """
     columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
     content = io.BytesIO()
@@ -247,7 +252,7 @@ def file_order(gaussians: Gaussians) -> np.ndarray:
 
 
 def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, bytes]:
-    """Encode the files of a ``.sog`` by name: textures with the rows in their order, then ``meta.json``."""
+    """Encode the files of a ``.sog`` by name: textures in the order of the rows, then ``meta.json``."""
     count = len(columns)
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": GENERATOR}, "count": count}
     meta["antialias"] = mode == arrays.MIP
@@ -259,7 +264,7 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
         meta[key] = {**numbers, "files": list(files)}
         textures.update(files)
 
-    fixed, low, high = _fix_means(columns.means)
+    fixed, low, high = _quantise_means(columns.means)
     halves = {"means_l.webp": _texture(fixed & 255), "means_u.webp": _texture(fixed >> 8)}
     add("means", halves, mins=low, maxs=high)
     scales, sh0 = fit_codebook(columns.log_scales), fit_codebook(columns.sh0)
@@ -286,20 +291,21 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
 
 
 def round_means(means: np.ndarray) -> np.ndarray:
-    """Return means ``[n,3]`` as a ``.sog`` of them holds them."""
-    fixed, low, high = _fix_means(means)
-    return to_float32(_open_means(fixed, np.array(low), np.array(high)))
+    """Return means ``[n,3]`` after rounding as in a ``.sog``."""
+    fixed, low, high = _quantise_means(means)
+    return to_float32(_decode_means(fixed, np.array(low), np.array(high)))
 
 
-def _fix_means(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
-    """Quantise means to 16 bits of their signed logarithms; also returns the ends of these as they are written."""
+def _quantise_means(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
+    """Quantise the signed logarithms of means to 16 bits; also return their minima and maxima as written."""
     logs = np.sign(means) * log1p(np.abs(means))
     low, high = logs.min(axis=0), logs.max(axis=0)
     fixed = np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
     return fixed, _shorten(low), _shorten(high)
 
 
-def _open_means(fixed: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _decode_means(fixed: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Invert :func:`_quantise_means`."""
     logs = low + (high - low) * fixed / 65535
     return np.asarray(np.sign(logs) * expm1(np.abs(logs)))
 
@@ -310,7 +316,7 @@ def _shorten(values: np.ndarray) -> list[float]:
 
 
 def _texture(values: np.ndarray) -> bytes:
-    """Encode rows of channels as a lossless WebP image about as high as wide, padded with zeros."""
+    """Encode rows of channels as a lossless, roughly square WebP image, padded with zeros."""
     width = max(4, math.ceil(math.sqrt(len(values)) / 4) * 4)
     height = max(4, math.ceil(len(values) / width / 4) * 4)
     pixels = np.zeros((height * width, values.shape[1]), np.uint8)
@@ -319,7 +325,7 @@ def _texture(values: np.ndarray) -> bytes:
 
 
 def _webp(image: np.ndarray) -> bytes:
-    """Encode a WebP image without loss, except for colours of pixels whose alpha is 0."""
+    """Encode a lossless WebP image; only the colours of pixels whose alpha is 0 may change."""
     order = [2, 1, 0, 3][: image.shape[2]]
     _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., order]), [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS])
     return data.tobytes()
@@ -328,9 +334,9 @@ def _webp(image: np.ndarray) -> bytes:
 def fit_codebook(values: np.ndarray) -> np.ndarray:
     """Choose ``[256]`` rising values that represent finite numbers of any shape, by 1-D k-means.
 
-    Starting from thousands of narrow cells, the two neighbours with the least added squared error are merged (Ward
-    1963) until 256 cells are left. Lloyd's steps improve these. Therefore values far from all others keep codes of
-    their own. Unused codes repeat the last one.
+    The values are first divided into thousands of narrow cells. The two neighbours whose merger adds the least squared
+    error are merged (Ward 1963) until 256 cells are left, so that values far from all others keep their own codes.
+    Lloyd's algorithm improves these. Unused codes repeat the last one.
     """
     ordered = np.sort(values, axis=None)
     distinct = np.unique(ordered)
@@ -364,7 +370,7 @@ def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
     heapq.heapify(heap)
     for _ in range(len(n) - CODES):
         _, i, j, *sizes = heapq.heappop(heap)
-        while right[i] != j or [n[i], n[j]] != sizes:  # one of the two has grown, or is gone
+        while right[i] != j or [n[i], n[j]] != sizes:  # one of the two was merged meanwhile
             _, i, j, *sizes = heapq.heappop(heap)
         m[i], n[i], n[j] = (n[i] * m[i] + n[j] * m[j]) / (n[i] + n[j]), n[i] + n[j], 0.0
         right[i] = right[j]
@@ -382,10 +388,10 @@ def nearest_codes(codebook: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def fit_palette(vectors: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndarray]:
-    """Choose a palette of at most ``2**max_bits`` vectors for ``vectors [n,d]``, and each vector's index ``[n]`` in it.
+    """Choose a palette of at most ``2**max_bits`` entries for ``vectors [n,d]``; return it and each vector's index.
 
-    Groups are halved at the median of the coordinate with the largest spread. The palette is the means of the final
-    groups. If there are few enough vectors, each vector is an entry of the palette.
+    Groups of vectors are halved ``max_bits`` times at the median of the coordinate with the largest spread. The entries
+    are the means of the final groups. If there are few enough vectors, each vector is its own entry.
     """
     count = len(vectors)
     if count <= 2**max_bits:

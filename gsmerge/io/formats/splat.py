@@ -1,6 +1,6 @@
-"""``.splat``: 32 bytes per Gaussian and no header, the format of antimatter15/splat that most viewers read.
+"""Read and write ``.splat``, the format of antimatter15/splat that most viewers read: 32 bytes per Gaussian, no header.
 
-Quaternions wxyz are bytes 128 + 128 q; there is no room for harmonics above degree 0.
+Quaternions wxyz are bytes 128 + 128 q. Harmonics above degree 0 cannot be stored.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""PlayCanvas' program splat-transform, for what it reads and writes and gsmerge does not, by a temporary ``.ply``."""
+"""Run PlayCanvas' splat-transform for formats that gsmerge does not read or write itself, by a temporary ``.ply``."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ MAX_OUTPUT = 300  # characters of the program's own output in an error
 
 
 def find_program() -> str:
-    """Find the path of the program; UsageError, which says how to get it, where it is not installed."""
+    """Find the path of the program; UsageError, which says how to install it, if there is none."""
     named = os.environ.get(VARIABLE)
     program = shutil.which(named or PROGRAM)
     if program is None:
         place = f"at {VARIABLE}={named}" if named else f"on PATH or named by {VARIABLE}"
-        problem = f"expected the program {place}, found none; install it with: npm install -g {PACKAGE}"
+        problem = f"expected the program {place}, found none; install it with npm install -g {PACKAGE}"
         raise UsageError(f"{PROGRAM}: {problem}")
     return program
 
 
 def holds_sog(path: Path) -> bool:
-    """Return whether a ``meta.json`` is that of a ``.sog``, and not another program's."""
+    """Return whether a ``meta.json`` belongs to a ``.sog``, and not to another program."""
     try:
         document = read_json(path)
     except SceneError:
@@ -44,7 +44,7 @@ def holds_sog(path: Path) -> bool:
 
 
 def run_program(*words: object) -> None:
-    """Run the program on the CPU; its last word is the file that it writes.
+    """Run the program on the CPU with arguments ``words``, of which the last is the file that it writes.
 
     GsmergeError if it fails or takes longer than ``TIME_LIMIT``, UsageError if it is not installed.
     """
@@ -53,7 +53,7 @@ def run_program(*words: object) -> None:
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=TIME_LIMIT, check=False)
     except subprocess.TimeoutExpired as error:
-        raise GsmergeError(f"{program}: expected an end within {TIME_LIMIT} seconds, found none") from error
+        raise GsmergeError(f"{program}: expected it to end within {TIME_LIMIT} seconds, it was stopped") from error
     if done.returncode or not Path(str(words[-1])).exists():
         lines = (done.stderr or done.stdout).decode(errors="replace").strip().splitlines() or ["without output"]
         reason = next((line for line in lines if "Error: " in line), lines[-1]).rpartition("Error: ")[2]
@@ -63,7 +63,7 @@ def run_program(*words: object) -> None:
 
 @contextmanager
 def name_file(path: Path) -> Iterator[None]:
-    """Let errors about what the program wrote, which is temporary, name the file that it was made of or for."""
+    """Let errors on temporary files that the program wrote name the user's file ``path`` instead."""
     try:
         yield
     except SceneError as error:
@@ -71,9 +71,9 @@ def name_file(path: Path) -> Iterator[None]:
 
 
 def read_rows(path: Path) -> StoredRows:
-    """Read the finest Gaussians of a file that the program reads.
+    """Read the finest level of Gaussians of a file by the program.
 
-    SceneError if it cannot be read, with the command that converts it where the program is not installed.
+    SceneError if it cannot be read. If the program is not installed, the error has the command that converts the file.
     """
     check_file(path)
     with TemporaryDirectory(prefix="gsmerge-") as folder:
@@ -83,17 +83,17 @@ def read_rows(path: Path) -> StoredRows:
         except UsageError as error:
             target = path.with_name("scene.ply") if path.suffix == ".json" else path.with_suffix(".ply")
             command = shlex.join(["npx", PACKAGE, str(path), "-L", "0", str(target)])
-            problem = f"expected the program {PROGRAM}, which reads it, found none"
-            raise SceneError(path, problem, f"convert it with: {command}") from error
+            problem = f"expected the program {PROGRAM} to read this format, found none"
+            raise SceneError(path, problem, f"convert it with {command}") from error
         except GsmergeError as error:
             raise SceneError(path, f"cannot be read by {error}") from error
         with name_file(path):
             stored = ply.read_rows(made)
             with ply.open_rows(made, stored.rows) as read:
                 rows = read(slice(None))
-    alone = path.suffix.lower() == ".ksplat"
-    others = [] if alone else [file for file in path.parent.iterdir() if file.is_file() and file != path]
+    is_single_file = path.suffix.lower() == ".ksplat"  # the other formats have several files in a folder
+    beside = [] if is_single_file else [file for file in path.parent.iterdir() if file.is_file() and file != path]
     return replace(
         stored, rows=rows, layout=f"{stored.layout}, by {PROGRAM}", encoding="logit",
-        bytes_beside=sum(file.stat().st_size for file in others),
+        bytes_beside=sum(file.stat().st_size for file in beside),
     )  # fmt: skip

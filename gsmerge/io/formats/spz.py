@@ -1,13 +1,13 @@
-"""``.spz``: quantised columns (github.com/nianticlabs/spz, README and load-spz.cc).
+"""Read and write ``.spz``: quantised columns (github.com/nianticlabs/spz, README and load-spz.cc).
 
-Positions are fixed-point numbers of 24 bits, log scales steps of 1/16 from -10 on, opacities and colours bytes,
-rotations their three smaller components with sign and 9 bits each, harmonics bytes of which 5 (degree 1) or 4 bits are
-used. Version 3 is one gzip stream, with harmonics up to degree 3; version 4 has a header in the clear, a table of
-compressed and uncompressed sizes, and one Zstandard stream for each column.
+Positions are fixed-point numbers of 24 bits. Log scales are steps of 1/16 from -10 on. Opacities and colours are bytes.
+Rotations are their three smaller components, each with a sign and 9 bits. Harmonics are bytes of which 5 bits (degree
+1) or 4 bits are used. Version 3 is one gzip stream, with harmonics up to degree 3. Version 4 has an uncompressed
+header, a table of compressed and uncompressed sizes, and one Zstandard stream for each column.
 
-The README says that axes are right, up and back. The converters that come with it, splat-transform and SuperSplat all
-keep those of the ``.ply`` instead, and so does this: the file shows what the ``.ply`` shows. A file whose extension
-``SPZ_ADOBE_coordinate_system`` names its axes is turned into those of a ``.ply``: right, down and front.
+The README says that axes are right, up and back. Its converters, splat-transform and SuperSplat use the axes of the
+``.ply`` instead. This module does the same, so that a file looks like its ``.ply``. A file whose extension
+``SPZ_ADOBE_coordinate_system`` names its axes is turned to those of a ``.ply``: right, down and front.
 """
 
 from __future__ import annotations
@@ -31,43 +31,43 @@ from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
 from gsmerge.types import SH_C0, Gaussians
 
-VERSION, MAX_DEGREE = 3, 3  # that are written, and the harmonics of that; Spark 2.2 does not read 4
+VERSION, MAX_DEGREE = 3, 3  # that are written; Spark 2.2 does not read version 4
 MAGIC = 0x5053474E
-HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags; zero, or number of streams
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, number of streams or zero
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
-MIP_FLAG = 1  # the Gaussians want to be rendered with a filter of their own
-EXTENSIONS_FLAG = 2  # records lie before the table of version 4, or after the columns of the others
-RECORD = struct.Struct("<II")  # kind of an extension, and its bytes
-AXES_KIND = 0xADBE0003  # of SPZ_ADOBE_coordinate_system: a number from 1 on, in this order; 0 says nothing
+MIP_FLAG = 1  # the Gaussians are to be rendered antialiased
+EXTENSIONS_FLAG = 2  # records of extensions are before the table in version 4, and after the columns in older versions
+RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
+AXES_KIND = 0xADBE0003  # of SPZ_ADOBE_coordinate_system; its content is 1 for the first of AXES, or 0 for unknown
 AXES = (
     "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
 )  # fmt: skip
 PLY_AXES = "RDF"
-_REVERSED = {"LFD", "RFD", "LBU", "RBU"}  # whose y and z Niantic's library writes and reads against their names
+_REVERSED = {"LFD", "RFD", "LBU", "RBU"}  # in which Niantic's library writes and reads y and z with the wrong sign
 _OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
 _MAX_EXTENSIONS = 1 << 20  # bytes of all records
-GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # which versions 1 to 3, and 4 begin with
-SYSTEM, UNIX = 9, b"\3"  # place of the system in the header of gzip, and the one that is written for all
-FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
+GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # first bytes of versions 1 to 3, and of 4
+SYSTEM, UNIX = 9, b"\3"  # place of the operating system in a gzip header, and the value that is always written
+FINE = 14  # bits of a position within the scene: a sixteenth of a pixel if the scene fills 1,000 pixels
 MAX_FRACTION = 23
 LARGEST = 2**23 - 1
-COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
+COLOR_SCALE = 0.15  # of sh0, so that colours slightly outside [0, 1] can be stored
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
-MAX_READ_DEGREE = 4  # which some write as version 3, too
+MAX_READ_DEGREE = 4  # some programs write it in version 3
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
 AGAIN = "copy or export it again"
 
 
 @dataclass(frozen=True)
 class Header:
-    """Numbers at the start of a file."""
+    """The header of a file, without its magic number."""
 
     version: int
-    count: int
-    degree: int
-    fraction: int
+    count: int  # of Gaussians
+    degree: int  # of harmonics
+    fraction: int  # bits of a position after the binary point
     flags: int
     num_streams: int  # of version 4
 
@@ -87,7 +87,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
     check_file(path)
     with read_errors(path), path.open("rb") as file:
         packed = file.read(len(ZSTANDARD_MAGIC))
-        if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # others are refused, whatever their size
+        if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # other files are refused without reading them
             file.seek(0)
             packed = file.read()
     rows, header, extensions, sizes = unpack_rows(ReadBudget(path, len(packed)), packed)
@@ -96,16 +96,16 @@ def read_rows(path: Path) -> arrays.StoredRows:
     turned = replace(rows, unpack=lambda block: turn(rows.unpack(block)))
     mode = arrays.MIP if header.flags & MIP_FLAG else None
     stored = arrays.to_stored([turned], f".spz version {header.version}", sizes, mode)
-    notes = (f"the file says that its axes are {axes}: turned to {PLY_AXES}, those of a .ply",)
+    notes = (f"Gaussians are turned from the file's axes {axes} to those of a .ply, {PLY_AXES}",)
     return stored if axes == PLY_AXES else replace(stored, notes=notes)
 
 
 def unpack_rows(
     budget: ReadBudget, packed: bytes, count_before: int = 0
 ) -> tuple[arrays.Packed, Header, bytes, dict[str, int]]:
-    """Return the Gaussians in their own axes, header, extensions and bytes by attribute; SceneError if damaged.
+    """Return the Gaussians in the file's axes, header, extensions and bytes by attribute; SceneError if damaged.
 
-    ``budget``: of the file that they are in, which has ``count_before`` Gaussians in earlier parts.
+    ``budget``: budget of the file that they are in. ``count_before``: number of Gaussians in earlier parts of it.
     """
     read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
     header, parts, extensions = read(budget, packed, count_before)
@@ -117,7 +117,7 @@ def unpack_rows(
 
 
 def _stored_axes(path: Path, extensions: bytes) -> str:
-    """Return the axes that extensions name, or those of a ``.ply``; SceneError if they are unknown."""
+    """Return the axes that the extensions name, by default those of a ``.ply``; SceneError if they are unknown."""
     at = 0
     while at + RECORD.size <= len(extensions):
         kind, size = RECORD.unpack_from(extensions, at)
@@ -134,13 +134,13 @@ def _stored_axes(path: Path, extensions: bytes) -> str:
 
 
 def _axes_turn(axes: str) -> np.ndarray:
-    """Return the matrix ``[3,3]`` from axes to those of a ``.ply``: a rotation, mirrored where handedness differs."""
+    """Return the matrix ``[3,3]`` from axes to those of a ``.ply``, which mirrors if the handedness differs."""
     turn = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
     return turn * (1, -1, -1) if axes in _REVERSED else turn
 
 
 def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int], count_before: int) -> Header:
-    """Read the header, and check all Gaussians so far against the number of bytes of the file."""
+    """Read the header; SceneError if it is invalid, or if the file is too small for all Gaussians so far."""
     path = budget.path
     if len(start) < HEADER.size:
         raise SceneError(path, FOUND_EARLY_END, AGAIN)
@@ -148,14 +148,16 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
     header = Header(*numbers)
     if magic != MAGIC or header.version not in versions or header.degree > MAX_READ_DEGREE or header.fraction > 30:
         found = f"version {header.version}, SH degree {header.degree}" if magic == MAGIC else "another file"
-        raise SceneError(path, f"expected .spz of version 1 to 4 and SH degree 0 to {MAX_READ_DEGREE}, found {found}")
+        problem = f"expected .spz of version 1 to 4 and SH degree 0 to {MAX_READ_DEGREE}, found {found}"
+        raise SceneError(path, problem, "export it again")
     if header.count == 0:
-        raise SceneError(path, f"expected Gaussians in {len(packed)} bytes, found none promised")
+        raise SceneError(path, f"expected Gaussians in {len(packed)} bytes, found a count of 0", AGAIN)
     arrays.check_count(budget, count_before + header.count, header.num_higher, sum(header.widths))
     return header
 
 
 def _gzip_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tuple[Header, list[np.ndarray], bytes]:
+    """Read the header, the columns ``[n,width]`` uint8 and the extensions of versions 1 to 3."""
     path = budget.path
     stream = zlib.decompressobj(wbits=31)
     try:
@@ -164,7 +166,7 @@ def _gzip_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tuple[H
         extended = header.flags & EXTENSIONS_FLAG
         extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS) if extended else b""
     except zlib.error as error:
-        raise SceneError(path, "expected a gzip stream of .spz, found another or damaged file") from error
+        raise SceneError(path, "expected a gzip stream of .spz, found another or damaged file", AGAIN) from error
     ends = np.cumsum([0, *header.widths]) * header.count
     if len(data) < ends[-1]:
         problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(data)}"
@@ -174,10 +176,10 @@ def _gzip_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tuple[H
 
 
 def problem_at_end(path: Path) -> str | None:
-    """Describe errors at the end of a ``.spz`` that readers skip; None without any.
+    """Describe errors at the end of a ``.spz`` that readers ignore; None without errors.
 
-    The errors are a wrong checksum of the stream, and more bytes than the header declares, for example under a wrong
-    version. Version 4 has neither.
+    These are a wrong checksum of the stream, and more bytes than the header declares, for example because its version
+    is wrong. Version 4 has neither.
     """
     packed = path.read_bytes()
     if packed[:2] != GZIP_MAGIC:
@@ -187,15 +189,15 @@ def problem_at_end(path: Path) -> str | None:
             header = _read_header(ReadBudget(path, len(packed)), packed, file.read(HEADER.size), (1, 2, 3), 0)
             size = sum(iter(lambda: len(file.read(1 << 20)), 0))
     except (OSError, EOFError, zlib.error) as error:
-        return f"its gzip stream is damaged or cut at the end ({error})"
+        return f"its gzip stream is damaged or truncated at the end ({error})"
     extra = size - header.count * sum(header.widths)
     if not extra or header.flags & ~MIP_FLAG:
         return None
-    return f"{extra:,} bytes more than {header.count:,} Gaussians of version {header.version} have"
+    return f"it has {extra:,} bytes more than {header.count:,} Gaussians of version {header.version} need"
 
 
 def _zstandard_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tuple[Header, list[np.ndarray], bytes]:
-    """Read header, parts and extensions of version 4."""
+    """Read the header, the columns ``[n,width]`` uint8 and the extensions of version 4."""
     import zstandard  # few files need it
 
     path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,), count_before)
@@ -213,7 +215,7 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tu
         problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(packed)}"
         raise SceneError(path, problem, AGAIN)
     unpacker = zstandard.ZstdDecompressor()
-    try:  # one byte more than expected at most, whatever a stream says of its size
+    try:  # unpacks at most one byte more than expected, whatever size a stream states
         columns = [
             unpacker.stream_reader(packed[i:j]).read(size + 1)
             for (i, j), size in zip(pairwise(ends), sizes, strict=True)
@@ -221,7 +223,8 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tu
     except zstandard.ZstdError as error:
         raise SceneError(path, "damaged: expected Zstandard streams of .spz version 4, found others", AGAIN) from error
     if [len(column) for column in columns] != sizes:
-        raise SceneError(path, "truncated or damaged: a column of .spz version 4 is of another size", AGAIN)
+        problem = "truncated or damaged: expected columns of .spz version 4 with the sizes of its table, found others"
+        raise SceneError(path, problem, AGAIN)
     columns += [b""] * (len(header.widths) - len(columns))
     parts = [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
     start = HEADER.size + TABLE_START.size
@@ -229,6 +232,7 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tu
 
 
 def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
+    """Convert a block of stored columns to Gaussians."""
     version, fraction = header.version, header.fraction
     means, opacities, colors, scales, rotations, harmonics = parts
     words = np.zeros((len(means), 3, 4), np.uint8)  # signed numbers of three little-endian bytes
@@ -245,7 +249,7 @@ def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
 
 
 def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
-    """Restore quaternions ``[n,4]`` wxyz: from xyz as bytes, since version 3 from packed words."""
+    """Restore quaternions ``[n,4]`` wxyz, from xyz as bytes before version 3, from packed words since then."""
     if version < 3:
         xyz = stored / 127.5 - 1
         w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
@@ -257,18 +261,21 @@ def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
 
 
 def _octave(size: float) -> int:
-    """Return the exponent of the largest power of two up to a positive number."""
+    """Return the exponent of the largest power of two that is not above a positive number."""
     return math.frexp(size)[1] - 1
 
 
 def round_means(means: np.ndarray) -> np.ndarray:
-    """Return means ``[n,3]`` as a ``.spz`` of them holds them."""
+    """Return means ``[n,3]`` after rounding as in a ``.spz``."""
     fraction = choose_fraction(means, FINE)
     return to_float32(fix_means(means, fraction) / 2.0**fraction)
 
 
 def choose_fraction(means: np.ndarray, fine: int) -> int:
-    """Choose the bits behind the point of quantised means, by the scene's size and its farthest Gaussian."""
+    """Choose the bits after the binary point of quantised means, by the scene's size and its farthest Gaussian.
+
+    ``fine``: number of bits of a position within the scene.
+    """
     if not len(means):
         return 0
     size = np.median(reduce(np.maximum, (np.abs(axis - np.median(axis)) for axis in means.T)))
@@ -278,7 +285,7 @@ def choose_fraction(means: np.ndarray, fine: int) -> int:
 
 
 def fix_means(means: np.ndarray, fraction: int) -> np.ndarray:
-    """Quantise means to ``fraction`` bits behind the point."""
+    """Quantise means to ``fraction`` bits after the binary point."""
     return np.clip(np.round(means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
 
 
@@ -312,16 +319,16 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> 
 
 
 def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.spz`` file of version 3; one of the ``comments`` may mark the Gaussians as antialiased.
+    """Encode a ``.spz`` file of version 3; ValueError if there is NaN or inf.
 
-    ValueError if there is NaN or inf.
+    A comment may mark the Gaussians as antialiased, see :func:`gsmerge.io.formats.arrays.render_mode`.
     """
     header, parts = spz_columns(gaussians, MAX_DEGREE, mip=arrays.render_mode(comments) == arrays.MIP)
     return gzip_bytes(b"".join([header, *(part.tobytes() for part in parts)]))
 
 
 def gzip_bytes(data: bytes, level: int = 9, strategy: int = zlib.Z_DEFAULT_STRATEGY) -> bytes:
-    """Compress to a gzip stream that is the same at any time, and on each system and version of Python."""
+    """Compress to a gzip stream with equal bytes at any time, on every system and in every version of Python."""
     packer = zlib.compressobj(level, wbits=31, strategy=strategy)  # without a time
     packed = packer.compress(data) + packer.flush()
     return packed[:SYSTEM] + UNIX + packed[SYSTEM + 1 :]

@@ -1,8 +1,8 @@
-"""Streamed SOG version 1 (developer.playcanvas.com, "The Streamed SOG Format"): levels of detail that viewers load.
+"""Read and write Streamed SOG version 1 (developer.playcanvas.com, "The Streamed SOG Format"): levels of detail.
 
-``lod-meta.json`` is a tree of boxes. For each level, a leaf names a run of rows in a chunk: an
-unbundled ``.sog`` in a folder of its own. A viewer loads what it sees, at the level that fits. What an
-``environment`` holds is shown with every level. PlayCanvas' splat-transform writes all of it.
+The index ``lod-meta.json`` is a tree of boxes. A leaf names, for each level, a run of rows in a chunk. A chunk is a
+``.sog`` that is not zipped, in a folder of its own. A viewer loads the chunks that are visible, at the level that fits.
+It shows the Gaussians of the ``environment`` with every level. PlayCanvas' splat-transform writes all these files.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from gsmerge.types import Gaussians, StrPath
 
 VERSION = 1
 MAX_DEGREE = sog.MAX_DEGREE
-# Thousands of Gaussians of a place for which a viewer chooses one level: the few hundred thousand of a room are some
-# twenty places with levels of their own
+# Thousands of Gaussians in a region for which a viewer chooses one level. A room of a few hundred thousand Gaussians
+# has about twenty regions.
 CHUNK_THOUSANDS = 16
-ITERATIONS = 1  # of the program's palettes: ten take four times as long and show nothing more
+ITERATIONS = 1  # for the program's palettes; ten take four times as long, and renders are not better
 MAX_LEVELS = 64  # no real file has more than a dozen
-_CHUNK = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # a folder of a chunk: its level, its number, a hash
+_CHUNK = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # name of a chunk's folder: level, number, hash
 
 
 @check_arguments
@@ -47,19 +47,19 @@ def write_levels(
 ) -> None:
     """Write levels of detail as Streamed SOG, by splat-transform: an index, and chunks beside it.
 
-    A viewer loads the chunks that it sees, at the level that fits. All files are written, or none; the chunks of
-    an index that is replaced are removed.
+    A viewer loads the visible chunks, at the level that fits. Either all files are written or none. If an index is
+    replaced, its chunks are removed.
 
     Args:
         path: The index, a ``lod-meta.json``; its folder is made if it is missing.
-        levels: Finite values, the finest level first.
+        levels: Gaussians with finite values, the finest level first.
         overwrite: Replace an existing index.
-        comments: Lines as of :func:`write_gaussians`, of which "SplatRenderMode: mip" is kept.
+        comments: Lines as in :func:`write_gaussians`; "SplatRenderMode: mip" is kept.
 
     Raises:
-        UsageError: If the name is another one, or splat-transform is not installed.
+        UsageError: If the path has another name, or splat-transform is not installed.
         SceneError: If the file exists or cannot be written.
-        ValueError: If there is NaN or inf, no Gaussian at some level, or a comment is no line of ASCII.
+        ValueError: If there is NaN or inf, a level has no Gaussian, or a comment is not a line of ASCII.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget=300, levels=2)
@@ -77,7 +77,7 @@ def write_levels(
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write the files of a Streamed SOG, as :data:`gsmerge.io.formats.table.WriteOutput`.
 
-    A coarser level's path is that of its first chunk's ``meta.json``.
+    The path of a coarser level is the ``meta.json`` of its first chunk.
     """
     with TemporaryDirectory(prefix="gsmerge-") as folder:
         words: list[object] = []
@@ -102,7 +102,7 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
 
 
 def _name_by_content(path: Path) -> None:
-    """Add a hash of its content to the name of each chunk's folder: chunks of two results never mix, nor in a cache."""
+    """Add a hash of its content to the name of each chunk's folder, so that caches never mix chunks of two results."""
     document = read_json(path)
     for number, name in enumerate(document["filenames"]):
         folder, digest = (path.parent / name).parent, hashlib.sha256()
@@ -118,7 +118,7 @@ class StreamedIndex:
     """Content of an index: the chunks of each level, with their numbers of Gaussians."""
 
     levels: tuple[dict[Path, int], ...]
-    environment: Path | None  # the ``meta.json`` of what is shown with every level
+    environment: Path | None  # the ``meta.json`` of Gaussians that are shown with every level
 
     @property
     def counts(self) -> list[int]:
@@ -127,7 +127,7 @@ class StreamedIndex:
 
 
 def read_index(path: Path) -> StreamedIndex:
-    """Read a ``lod-meta.json``; SceneError if its parts contradict each other."""
+    """Read a ``lod-meta.json``; SceneError if it is damaged or its parts contradict each other."""
     document = read_json(path)
     try:
         return _check_index(path, document)
@@ -137,10 +137,11 @@ def read_index(path: Path) -> StreamedIndex:
 
 
 def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
+    """Return the content of an index; ValueError, LookupError or TypeError if it is damaged."""
     version = document.get("version", VERSION)
     if version != VERSION:
         problem = f"expected Streamed SOG version {VERSION}, found {version}"
-        raise SceneError(path, problem, "export it as that version")
+        raise SceneError(path, problem, f"export it as version {VERSION}")
     names = document["filenames"]
     num_levels = check_whole(document["lodLevels"], "lodLevels", 1, MAX_LEVELS)
     if not isinstance(names, list) or not names:
@@ -154,20 +155,20 @@ def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
             runs[check_whole(level, "level", 0, num_levels - 1)].append((file, offset, count))
     levels = tuple(_cover(chunks, level) for level in runs)
     if len({chunk for level in levels for chunk in level}) != sum(map(len, levels)):
-        raise ValueError("a chunk is that of two levels")
+        raise ValueError("a chunk belongs to two levels")
     environment = None if document.get("environment") is None else _inside(path, document["environment"])
     if any(environment in level for level in levels):
-        raise ValueError("the environment is a chunk of a level")
+        raise ValueError("the environment is also a chunk of a level")
     index = StreamedIndex(levels, environment)
     counts = index.counts
     for name, found in {"counts": counts, "count": sum(counts)}.items():
         if document.get(name, found) != found:  # older files have neither
-            raise ValueError(f"{name}: the tree has {found}, not {document[name]}")
+            raise ValueError(f"{name}: the tree has {found}, and the document says {document[name]}")
     return index
 
 
 def _inside(index: Path, name: Any) -> Path:
-    """Return the path of a chunk; ValueError if its name leads out of the folder of the index."""
+    """Return the path of a chunk; ValueError if it is outside the folder of the index."""
     place = PurePosixPath(str(name))
     outside = place.is_absolute() or ".." in place.parts or "\\" in str(name) or "\0" in str(name)
     if outside or place.name != sog.META:
@@ -182,9 +183,9 @@ def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
         node = nodes.pop()
         low, high = (np.array(node["bound"][key], np.float64) for key in ("min", "max"))
         if low.shape != (3,) or high.shape != (3,) or not (low <= high).all():
-            raise ValueError("bound: expected three numbers at each end, the lower ones first")
+            raise ValueError("bound: expected three numbers of min and three of max, none of them below min")
         if ("lods" in node) == ("children" in node):
-            raise ValueError("a node has to have either children or lods")
+            raise ValueError("a node must have either children or lods")
         if "children" in node:
             nodes += reversed(node["children"])
         else:
@@ -192,12 +193,12 @@ def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _cover(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict[Path, int]:
-    """Return the number of Gaussians of each chunk; ValueError where runs leave a gap or overlap."""
+    """Return the number of Gaussians of each chunk; ValueError if runs (file, offset, count) overlap or have gaps."""
     counts: dict[Path, int] = {}
     for file, offset, count in sorted(runs):
         end = counts.get(chunks[file], 0)
         if offset != end:
-            raise ValueError(f"runs of file {file}: expected one from {end} on, found one from {offset}")
+            raise ValueError(f"runs of file {file}: expected a run that starts at {end}, found one at {offset}")
         counts[chunks[file]] = end + count
     return counts
 
@@ -205,15 +206,15 @@ def _cover(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict
 def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) -> arrays.StoredRows:
     """Read the Gaussians of one level; level 0, the finest, includes the environment.
 
-    ``index``: result of :func:`read_index` for the path. SceneError if the index or a chunk cannot be read, or they
-    contradict each other.
+    ``index``: result of :func:`read_index` for the path; None: read it. SceneError if the index or a chunk cannot be
+    read, or if they contradict each other.
     """
     index = index or read_index(path)
     chunks: dict[Path, int | None] = {**index.levels[level]}
     if index.environment is not None and level == 0:
         chunks[index.environment] = None
     if not chunks:
-        raise SceneError(path, f"expected Gaussians at level {level}, found none")
+        raise SceneError(path, f"expected Gaussians at level {level}, found none", "export it again")
     contents = _read_chunks(path, chunks)
     sizes: dict[str, int] = {}
     for content in contents:
@@ -231,9 +232,9 @@ def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> Ga
 
 
 def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
-    """Read chunks within the budget of all together.
+    """Read chunks; SceneError if they take more memory than a file of all their bytes may take.
 
-    Each chunk comes with its number of Gaussians if the index has it.
+    ``chunks``: path of each chunk -> its number of Gaussians in the index; None if the index has none.
     """
     root, seen = os.path.realpath(path.parent), set[Path]()
     contents: list[sog.SogContent] = []
@@ -241,13 +242,13 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
     for chunk, count in chunks.items():
         place = Path(os.path.realpath(chunk))
         if not place.is_relative_to(root) or place in seen:
-            problem = f"{chunk}: expected a file of its own inside the folder, found a link to another"
+            problem = f"{chunk}: expected a separate file inside the folder, found a link to another file"
             raise SceneError(path, problem, "export it again")
         seen.add(place)
         contents.append(sog.read_unbundled(chunk))
         packed = contents[-1].packed
         if count not in (None, packed.count):
-            problem = f"expected {count:,} Gaussians as {INDEX} says, found {packed.count:,}"
+            problem = f"expected {count:,} Gaussians, as {INDEX} says, found {packed.count:,}"
             raise SceneError(chunk, problem, "export it again")
         num_bytes, total = num_bytes + contents[-1].num_bytes, total + packed.count
         num_higher = max(num_higher, packed.num_higher)
@@ -256,9 +257,9 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
 
 
 def remove_unused_chunks(path: Path) -> None:
-    """Remove the chunks beside an index that it does not name: those of the one that it replaced.
+    """Remove the chunks beside an index that it does not name, which are those of the index that it replaced.
 
-    Other files in their folders stay, and so do files that cannot be removed.
+    Other files in their folders are kept. Chunks that cannot be removed are ignored.
     """
     used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
     for folder in path.parent.iterdir():

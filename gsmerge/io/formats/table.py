@@ -21,19 +21,19 @@ from gsmerge.settings.setting import join_words
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath
 
 STATE_ENDING = ".gsm"  # of states, as gsmerge extend writes them
-INDEX = "lod-meta.json"  # the name by which loaders recognise levels of detail in chunks
+INDEX = "lod-meta.json"  # name of a Streamed SOG, by which viewers recognise it
 MODEL_NAMES = POINTS, CAMERAS, IMAGES = "points3D.bin", "cameras.bin", "images.bin"
 FRAMES, POSES = "results_output", "camera_poses.txt"  # DA3-Streaming's folder of frames, and the poses beside it
 
 
 _lazy = lazy_functions(__package__)
 WRITE_APART = _lazy("write.write_apart")
-NamedPhotos = Sequence[tuple[str, Path | None]]  # names below a model's folder of photos, and files if known
+NamedPhotos = Sequence[tuple[str, Path | None]]  # names in a model's folder of photos, with their files if known
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What an output is to hold; formats that have no place for something leave it out."""
+    """The content of an output; a format leaves out what it cannot store."""
 
     levels: Sequence[Gaussians]  # the finest first
     comments: Sequence[str] = ()  # lines for the header
@@ -41,12 +41,13 @@ class Contents:
     photos: NamedPhotos = ()  # of the cameras
     title: str = ""
     normals: bool = True  # of a ``.ply``, as in :func:`gsmerge.write_ply`
-    apart: bool = False  # whether a page has its parts in files beside it
-    extra_columns: np.ndarray | None = None  # structured array ``[n]``: more columns of a ``.ply`` with one level
+    apart: bool = False  # whether the parts of a page are written to files beside it
+    extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
 
 
-# How to add files to :func:`gsmerge.io.atomic_outputs`, the path of the output, its temporary file, which is there
-# already, and what to write -> the path of each level, in their order, with its files before they are renamed
+# A function that writes an output. Its arguments are the function of :func:`gsmerge.io.atomic_outputs` that adds a
+# file, the path of the output, its temporary file, which exists already, and the content. It returns the path of each
+# level, in order, with the temporary files of that level.
 WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]]
 
 
@@ -54,46 +55,46 @@ WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]
 class Format:
     """A format of files of Gaussians: its ending, and how to read and write it.
 
-    What a run asks of a format stands here, so that a new one is one module and one row. Writers that draw the scene
-    lie above this room; rows name them, as entry points name commands.
+    All properties of a format that a run needs are here, so that a new format is one module and one row. Writers that
+    draw the scene are in higher layers; rows name them lazily, as entry points name commands.
     """
 
-    ending: str  # of files' names, in lower case; without a dot at its start, the whole name of a folder's main file
-    about: str  # what it is, for people
-    read: Callable[[Path], StoredRows] | None  # None: it is only written
-    # One file of Gaussians with comments; None: :func:`gsmerge.io.write_ply` or ``write`` makes it
+    ending: str  # of names, in lower case; without a leading dot, it is the whole name of a folder's main file
+    about: str  # description for people
+    read: Callable[[Path], StoredRows] | None  # None: the format is only written
+    # Encodes one file of Gaussians with comments; None: :func:`gsmerge.io.write_ply` or ``write`` writes the file
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
-    max_degree: int  # of the harmonics that are written; -1: it is only read
-    write: WriteOutput = WRITE_APART  # by default each level in a file of its own
-    require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package or program is missing
-    finish: Callable[[Path], object] = lambda _: None  # called with the path once all files are in their places
-    holds: Callable[[Path], bool] = lambda _: True  # whether a file of this ending has Gaussians, where others do not
+    max_degree: int  # of the harmonics that are written; -1: the format is only read
+    write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
+    require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
+    finish: Callable[[Path], object] = lambda _: None  # is called with the path after all files were renamed
+    holds: Callable[[Path], bool] = lambda _: True  # whether a file with this ending has Gaussians
 
-    # What its files hold
-    levels: Literal["", "apart", "inside"] = "apart"  # of detail: one alone, each in its own file, or all in one output
-    cameras: Literal["", "inside", "needed"] = ""  # of the views: in a file beside it, inside, or it cannot do without
-    round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # as it holds them
-    kept_as: str = ""  # ending of the format as which its Gaussians are read back, if that is another one
-    columns: bool = False  # whether there is a choice which columns of INRIA's it has
-    marks: Sequence[str] | None = ()  # header comments of others that it keeps; None: all that copies keep
-    lost: str = "{ending} has no room for harmonics above degree {degree}: left out"
+    # Content of its files
+    levels: Literal["", "apart", "inside"] = "apart"  # of detail: a single one, one file for each, or all in one output
+    cameras: Literal["", "inside", "needed"] = ""  # of views: in a file beside it, inside it, or inside and required
+    round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as the format does
+    kept_as: str = ""  # ending of the format whose rounding its Gaussians have, if that is another one
+    columns: bool = False  # whether the user can choose which of INRIA's columns it has
+    marks: Sequence[str] | None = ()  # header comments of the input that it keeps; None: all that copies keep
+    lost: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
 
     # Its files besides the one that the path names
-    folder: str = ""  # name of an output folder that means this format
+    folder: str = ""  # name of an output folder that chooses this format
     place: str = ""  # of the main file in this folder
-    site: str = ""  # name of the main file where its parts are in files beside it
-    beside: Callable[[Path, bool], Sequence[Path]] = lambda path, apart: ()  # those whose names are known before
-    notes: Callable[[Path, NamedPhotos], list[str]] = lambda path, photos: []  # on what programs look for beside it
+    site: str = ""  # name of the main file if its parts are in files beside it
+    beside: Callable[[Path, bool], Sequence[Path]] = lambda path, apart: ()  # files whose names are known in advance
+    notes: Callable[[Path, NamedPhotos], list[str]] = lambda path, photos: []  # on files that programs need beside it
 
-    # Bytes: of a Gaussian by degree, of a .sog or .spz those of results, as measured; none where no budget counts them
+    # Bytes of a Gaussian by degree; of a .sog or .spz, as measured for results; empty if budgets cannot count them
     each: Sequence[float] = ()
-    rest: Callable[[], int] = lambda: 0  # besides those of its Gaussians, at least
-    count: Callable[[int, int], int] | None = None  # bytes and degree -> Gaussians; None where their content matters
-    measure: Callable[[Gaussians, Cameras, Sequence[str]], int] | None = None  # None: those that ``encode`` returns
+    rest: Callable[[], int] = lambda: 0  # least bytes besides those of Gaussians
+    count: Callable[[int, int], int] | None = None  # bytes, degree -> number of Gaussians; None if content matters
+    measure: Callable[[Gaussians, Cameras, Sequence[str]], int] | None = None  # bytes; None: those of ``encode``
 
     def __post_init__(self) -> None:
         if self.each and self.max_degree >= 0 and not (self.encode or self.count or self.measure):
-            raise ValueError(f"{self.ending}: expected encode, count or measure beside each, to count bytes")
+            raise ValueError(f"{self.ending}: expected encode, count or measure, since it has bytes of each Gaussian")
 
     def names(self, path: StrPath) -> bool:
         """Return whether the name of a path has the ending of this format."""
@@ -103,13 +104,13 @@ class Format:
 
 _page, _model = lazy_functions("gsmerge.pages"), lazy_functions("gsmerge.compaction")
 _SOG = 13.0, 22.0, 36.5, 56.5
-_IN_TEXT = 4 / 3  # bytes of base64, as which a page has its .sog in its text, for each of the file's
+_IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
 _READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
 _USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
     each=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes, columns=True, marks=None,
-    lost="harmonics above degree {degree} are left out: few programs read a .ply with them",
+    lost="harmonics above degree {degree} are left out, since few programs read a .ply with them",
 )  # fmt: skip
 LEVELS = Format(
     INDEX, "levels of detail in chunks; written by splat-transform",
@@ -120,8 +121,8 @@ LEVELS = Format(
 COLMAP = Format(
     POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0,
     write=_model("colmap_output.write_output"), levels="", cameras="needed", round_means=lambda means: means,
-    lost="points of COLMAP have colours alone: harmonics, sizes and opacities are left out",
-    folder="colmap", place="sparse/0",  # where trainers look for it
+    lost="harmonics, sizes and opacities are left out, since points of COLMAP have only colours",
+    folder="colmap", place="sparse/0",  # where trainers expect it
     beside=_model("colmap_output.files_beside"), notes=_model("colmap_output.note_photos"),
 )  # fmt: skip
 HTML = Format(
@@ -131,7 +132,7 @@ HTML = Format(
     each=tuple(_IN_TEXT * each for each in _SOG), rest=_page("site.least_bytes"),
     measure=_page("site.measure"),
 )  # fmt: skip
-FILES = (  # of endings that end alike the longest first
+FILES = (  # the first ending that matches counts, so .compressed.ply comes before .ply
     Format(
         ".compressed.ply", "PlayCanvas' packed .ply", ply.read_rows, None, -1, each=(16.3, 25.3, 40.4, 61.4),
     ),
@@ -166,7 +167,7 @@ STATE = Format(
     STATE_ENDING, "batches of views: Gaussians, cameras and pictures", _lazy("gsm.read_rows"), None, -1, each=(56.0,)
 )
 META = "meta.json"  # of a .sog that is a folder
-BY_PROGRAM = (  # which splat-transform reads in our place
+BY_PROGRAM = (  # formats that splat-transform reads for gsmerge
     Format(".ksplat", "by splat-transform", _READ_BY_PROGRAM, None, -1),
     Format(
         META, "a .sog without its zip, by splat-transform", _READ_BY_PROGRAM, None, -1,
@@ -175,10 +176,10 @@ BY_PROGRAM = (  # which splat-transform reads in our place
     Format(".lcc", "the finest level, by splat-transform", _READ_BY_PROGRAM, None, -1),
     Format(".lcc2", "as `.lcc`", _READ_BY_PROGRAM, None, -1),
 )  # fmt: skip
-SEVERAL_USES = (".npz", ".glb")  # endings of files that need not hold Gaussians
+SEVERAL_USES = (".npz", ".glb")  # endings of files that often hold no Gaussians
 FORMATS = (*FILES, HTML, LEVELS, COLMAP, DEPTHS, STATE, *BY_PROGRAM)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
-VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # as results in a page
+VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # results that a page shows
 FOLDERS = {row.folder: row for row in FORMATS if row.folder}  # by the name of an output folder
 SCENE_SUFFIXES = tuple(
     dict.fromkeys(
@@ -198,7 +199,7 @@ def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
         return chosen.count(max_bytes, sh_degree)
     each, rest = chosen.each[min(sh_degree, len(chosen.each) - 1)], chosen.rest()
     if max_bytes < rest + each:
-        viewer = f"{rest / 1e6:.2f} MB for the viewer of a page, and " if rest else ""
+        viewer = f"{rest / 1e6:.2f} MB for the viewer of a page and " if rest else ""
         problem = f"expected at least {viewer}{each:.0f} bytes for one Gaussian"
         raise UsageError(f"budget: {problem}, got {human_bytes(max_bytes) if rest else max_bytes}")
     return int((max_bytes - rest) / each)
@@ -228,32 +229,32 @@ def find_format(path: StrPath) -> Format:
 
 
 def is_frame(path: Path) -> bool:
-    """Return whether a file has one of DA3-Streaming's frames."""
+    """Return whether a file is a frame of DA3-Streaming."""
     return DEPTHS.names(path) and path.parent.name == FRAMES and (path.parent.parent / POSES).is_file()
 
 
 def may_hold_gaussians(path: Path) -> bool:
-    """Return whether the ending, and for endings with several uses the content, is that of Gaussians."""
+    """Return whether a file has an ending for Gaussians, and content with Gaussians if the ending has other uses."""
     return path.suffix.lower() in SCENE_SUFFIXES and find_format(path).holds(path)
 
 
 def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model or a page, which have cameras.
+    ``levels``: allow an index of levels of detail. ``cameras``: allow a COLMAP model or a page, which have cameras.
     """
     named = next((row for row in FORMATS if row.names(path)), None)
     refused = named is not None and ((named.levels == "inside" and not levels) or (named.cameras and not cameras))
     chosen, meant = None if refused else named, FOLDERS.get(Path(path).name, named)
     if meant is not None and meant.cameras == "needed" and not cameras:
         problem = f"expected a format without cameras, got {meant.about.partition(':')[0]}"
-        raise UsageError(f"{path}: {problem}; write a .ply, and convert it with --cameras")
+        raise UsageError(f"{path}: {problem}; write a .ply, and convert that with --cameras")
     if chosen is None or chosen.max_degree < 0:
-        read_only = "" if chosen is None else f"{chosen.ending} is read, not written: "
+        read_only = "" if chosen is None else f"{chosen.ending} can be read but not written; "
         inside = [row.ending for row in FORMATS if row.cameras == "inside" and row.ending[0] == "."]
         endings = join_words((*OUTPUT_FORMATS, *(inside if cameras else [])))
         index = f", or the name {INDEX}" if levels else ""
-        folder = f", or a folder, or one named {' or '.join(FOLDERS)}" if cameras else ""
+        folder = f", or a folder, or a folder named {' or '.join(FOLDERS)}" if cameras else ""
         raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{index}{folder}")
     chosen.require()
     return chosen

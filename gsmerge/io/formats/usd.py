@@ -1,7 +1,7 @@
-"""USD with the schema ``ParticleField3DGaussianSplat`` of OpenUSD 26.3 on (openusd.org, UsdVol), by ``usd-core``.
+"""Write USD with the schema ``ParticleField3DGaussianSplat`` of OpenUSD 26.3 and later (UsdVol), by ``usd-core``.
 
-Its axis y points up, that of a ``.ply`` down: Gaussians are turned by half a turn about z, as in a ``.glb``. It is not
-read: its parser asks for memory and time as it likes, and opens whatever files a layer names.
+The axis y points up in USD, and down in a ``.ply``. Therefore Gaussians are rotated by half a turn about z, as in a
+``.glb``. USD is not read, since its parser has no limits of memory and time, and opens any file that a layer names.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from gsmerge.io.formats.arrays import Columns, to_columns, turn_half
 from gsmerge.kernels.elementary import exp
 from gsmerge.types import Gaussians
 
-MAX_DEGREE = 3  # as far as renderers go
+MAX_DEGREE = 3  # the highest that renderers draw
 PRIM, LAYER = "Gaussians", "scene.usdc"
-# As the extra asks for; the second works beside a wheel and in a checkout
+# The version is that of the extra; the second command also works for a wheel and in a checkout
 INSTALL = 'install gsmerge[usd], or pip install "usd-core>=26.3,<27"'
-# USDZ: contents begin at multiples of 64 bytes, behind an extra field of this kind; a file's header has 30 bytes
+# The content of a member of a USDZ begins at a multiple of 64 bytes. An extra field of this kind pads its header, which
+# has 30 bytes besides the name.
 _ALIGNMENT, _PADDING, _ZIP_HEADER, _EXTRA = 64, 0x1986, 30, struct.Struct("<HH")
-_REACH = 3.0  # standard deviations about a centre that the extent holds
+_REACH = 3.0  # standard deviations around a centre that the extent includes
 
 
 def usdc_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
@@ -37,7 +38,7 @@ def usdc_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     usd, columns = require_usd(), turn_half(to_columns(gaussians, MAX_DEGREE))
     stage = usd.Usd.Stage.CreateInMemory(LAYER)
     usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
-    usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # what most scenes of feed-forward models have, about
+    usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # approximately, for most scenes of feed-forward models
     splats = usd.UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/{PRIM}")
     stage.SetDefaultPrim(splats.GetPrim())
     _fill(splats, columns, usd.Vt)
@@ -50,7 +51,7 @@ def usdc_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 def usdz_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     """Encode a ``.usdz``, an archive of one ``.usdc``; ValueError if there is NaN or inf.
 
-    The archive is written here, since USD's own writer puts the time of day into it.
+    USD's own writer is not used, since it puts the time of day into the archive.
     """
     package, layer = BytesIO(), new_member(LAYER)
     padding = -(_ZIP_HEADER + len(layer.filename) + _EXTRA.size) % _ALIGNMENT
@@ -65,7 +66,7 @@ def require_usd() -> SimpleNamespace:
     try:
         from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
     except ImportError as error:
-        raise UsageError(f"USD: usd-core is not installed; {INSTALL}") from error
+        raise UsageError(f"USD: expected the package usd-core, found none; {INSTALL}") from error
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         version = ".".join(map(str, Usd.GetVersion()[1:]))
         raise UsageError(f"USD: expected usd-core 26.3 or later, which knows Gaussians, found {version}; {INSTALL}")
@@ -73,7 +74,7 @@ def require_usd() -> SimpleNamespace:
 
 
 def _fill(splats: Any, columns: Columns, vt: Any) -> None:
-    """Set the attributes of the prim: linear scales, opacities of 0 to 1, harmonics Gaussian by Gaussian."""
+    """Set the attributes of the prim: linear scales, opacities from 0 to 1, and all harmonics of each Gaussian."""
 
     def vectors(values: np.ndarray) -> Any:
         return vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))

@@ -1,4 +1,4 @@
-"""Writers of Gaussians, by the format that a file's name asks for."""
+"""Write Gaussians in the format that the name of a file chooses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsmerge.types import Gaussians, StrPath
 
 
 def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:
-    """Describe the harmonics that a format leaves out; None if it keeps all. UsageError for an unknown ending."""
+    """Describe which harmonics a format leaves out; None if it stores all. UsageError for an unknown ending."""
     chosen = output_format(path, levels=True, cameras=True)
     if sh_degree <= chosen.max_degree:
         return None
@@ -24,19 +24,19 @@ def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:
 
 
 def output_notes(out: Path, sh_degree: int, photos: NamedPhotos) -> list[str]:
-    """Describe what an output lacks: harmonics that are not written, and files that programs look for beside it."""
+    """Note which harmonics an output lacks, and which files programs need beside it."""
     lost = lost_harmonics(out, sh_degree)
     return [*([lost] if lost else []), *find_format(out).notes(out, photos)]
 
 
 def level_output(output: Path, level: int) -> Path:
-    """Return the path of a further level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
+    """Return the path of a coarser level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
     cut = len(output.name) - len(output_format(output).ending)
     return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")
 
 
 def write_apart(add: AddOutput, path: Path, first: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write each level into a file of its own, as :data:`gsmerge.io.formats.table.WriteOutput`."""
+    """Write each level to a separate file, as :data:`gsmerge.io.formats.table.WriteOutput`."""
     written, ending = {path: [first]}, output_format(path).ending
     for level in range(1, len(contents.levels)):
         written[level_output(path, level)] = [add(level_output(path, level))]
@@ -64,22 +64,22 @@ def write_gaussians(
 ) -> None:
     """Write Gaussians to a file; the ending of its name, one of ``OUTPUT_FORMATS``, chooses the format.
 
-    All but ``.ply`` and USD quantise. ``.glb`` and USD have y upward, so Gaussians are turned by half a turn about z in
-    them. Harmonics of degree 4 are left out, except by :func:`write_ply`.
+    All formats except ``.ply`` and USD quantise. In ``.glb`` and USD y points up, so Gaussians are rotated by half a
+    turn about z. Harmonics of degree 4 are left out; only :func:`write_ply` writes them.
 
     Args:
-        path: The file; complete or not there at all.
-        gaussians: Finite values.
+        path: The file. It is written completely or not at all.
+        gaussians: Gaussians with finite values.
         overwrite: Replace an existing file.
-        comments: Lines for the header of the two that have one; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
-        ending: Format to write instead of the name's.
-        normals: Of a ``.ply``, as in :func:`write_ply`.
+        comments: Lines for the header of a ``.ply``; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
+        ending: Ending of the format to write, instead of that of the name.
+        normals: Columns of a ``.ply``, as in :func:`write_ply`.
 
     Raises:
-        UsageError: If the name ends in none of these, or ``usd-core`` is needed and not installed.
+        UsageError: If the ending is unknown, or if ``usd-core`` is needed and not installed.
         SceneError: If the file exists or cannot be written.
-        ValueError: If there is no Gaussian, NaN or inf, a comment is no line of ASCII, or there are half a million
-            characters of them.
+        ValueError: If there is no Gaussian, if there is NaN or inf, if a comment is not a line of ASCII, or if comments
+            have more than half a million characters.
 
     Example:
         >>> gaussians = gsmerge.compact("demo", effort="draft", budget=300).gaussians
@@ -107,28 +107,30 @@ def write_ply(
 ) -> None:
     """Write Gaussians in INRIA's column order, binary little-endian float32.
 
-    Opacities become finite logits (within +-16), scales finite logarithms (within +-30), quaternions unit ones.
+    Opacities become finite logits (within +-16), and scales become finite logarithms (within +-30). Quaternions are
+    normalised.
 
     Args:
-        path: The file; complete or not there at all.
-        gaussians: Finite values.
+        path: The file. It is written completely or not at all.
+        gaussians: Gaussians with finite values.
         overwrite: Replace an existing file.
-        sh_degree: Drop harmonics above this degree; None keeps all.
+        sh_degree: Drop harmonics above this degree. None: keep all.
         comments: Lines for the header, such as :func:`gsmerge.io.kept_comments` of another file.
-        normals: Write three columns of zeros that no renderer uses but a few readers, such as SIBR's, expect: 12 bytes
-            per Gaussian.
+        normals: Write three columns of zeros, 12 bytes per Gaussian. No renderer uses them, but a few readers, such as
+            SIBR's, expect them.
 
     Raises:
         SceneError: If the file exists or cannot be written.
-        ValueError: If the name is that of another format, there is no Gaussian, NaN or inf, fewer harmonics than asked
-            for, a comment is no line of ASCII, or there are half a million characters of them.
+        ValueError: If the name has the ending of another format, if there is no Gaussian, if there is NaN or inf, if
+            ``sh_degree`` is above that of the Gaussians, if a comment is not a line of ASCII, or if comments have more
+            than half a million characters.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget=300)
         >>> gsmerge.write_ply("demo/small.ply", result.gaussians, overwrite=True)
     """
     if fspath(path).lower().endswith(tuple(ending for ending in OUTPUT_FORMATS if ending != PLY.ending)):
-        raise ValueError(f"path: expected a name that ends in .ply, got {fspath(path)}; write_gaussians writes that")
+        raise ValueError(f"path: expected a name that ends in .ply, got {fspath(path)}; call write_gaussians for it")
     _write_ply(path, gaussians, overwrite, sh_degree, comments, normals)
 
 
@@ -151,7 +153,7 @@ def _write_ply(
 
 
 def check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:
-    """Raise ValueError for what the readers refuse."""
+    """Raise ValueError for a file that readers would refuse: without Gaussians, or with invalid comments."""
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none")
     length = sum(len(f"comment {comment}\n") for comment in comments)

@@ -178,7 +178,7 @@ def test_scales_and_colours_are_recognised_by_their_distribution(tmp_path: Path)
         rows[name] = rng.uniform(0.01, 0.1, 10_000)
         rows[name][:3] = -1e-9
     activated = read_ply(save(tmp_path / "a.ply", rows))
-    assert any("activated" in note for note in file_notes(activated.info))
+    assert any("linear" in note for note in file_notes(activated.info))
     np.testing.assert_allclose(activated.gaussians.scales[5:, 0], rows["scale_0"][5:], rtol=1e-5)
     for name in "rgb":
         rows[name] *= 255
@@ -202,7 +202,7 @@ def test_columns_with_a_prefix(tmp_path: Path, prefix: str, text: bool) -> None:
     assert actual.info.extra_columns == ("label",)
     assert noted(file_notes(actual.info), repr(prefix), "CloudCompare")
     assert header_content(tmp_path / "b.ply") == "Gaussians"
-    with refuses(SceneError, tmp_path / "c.ply", "no Gaussian splat"):
+    with refuses(SceneError, tmp_path / "c.ply", "since this one has none"):
         read_ply(save(tmp_path / "c.ply", repack_fields(more[["x", "y", "z", f"{prefix}label"]])))
 
 
@@ -275,8 +275,8 @@ def test_extreme_scales_are_clipped_and_counted(tmp_path: Path) -> None:
     [
         (1.0, elementary.log, ""),
         (500.0, elementary.log, ""),  # millimetres: no logarithm is negative
-        (100.0, np.positive, "as if linear"),
-        (1.0, np.positive, "as if linear"),
+        (100.0, np.positive, "seem to be linear"),
+        (1.0, np.positive, "seem to be linear"),
         (1.0, lambda scales: elementary.log(1000 * scales), "too large"),
     ],
 )
@@ -354,7 +354,7 @@ def test_what_4dgt_writes(tmp_path: Path, linear: bool, two: bool) -> None:
     np.testing.assert_allclose(ply.gaussians.opacities, opacities, rtol=1e-6)
     np.testing.assert_allclose(ply.gaussians.scales[:, : 3 - two], scales[:, : 3 - two], rtol=1e-5)
     assert ply.info.extra_columns == ()
-    assert any("logarithms" in note for note in file_notes(ply.info)) == linear
+    assert any("read as linear" in note for note in file_notes(ply.info)) == linear
 
 
 @pytest.fixture(scope="module")
@@ -431,7 +431,7 @@ def test_empty_rows_are_set_aside(tmp_path: Path, turned: bool) -> None:
     assert np.flatnonzero(~actual.valid).tolist() == [3, 7, 48]
     assert (actual.info.num_empty, actual.info.num_nonfinite, actual.info.num_zero_quats) == (3, 0, 0)
     assert not actual.gaussians.opacities[[3, 7, 48]].any()
-    assert not noted(file_notes(actual.info), "broken off")
+    assert not noted(file_notes(actual.info), "interrupted")
     assert noted(file_notes(actual.info), "3 empty row(s)")
 
 
@@ -440,4 +440,4 @@ def test_files_that_broke_off_are_said_to_have(tmp_path: Path, last: int, others
     rows = table_of(100)
     rows[-last:] = 0
     rows[:others] = 0
-    assert noted(file_notes(read_ply(save(tmp_path / "a.ply", rows)).info), "broken off") == broken
+    assert noted(file_notes(read_ply(save(tmp_path / "a.ply", rows)).info), "interrupted") == broken

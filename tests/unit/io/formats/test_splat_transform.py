@@ -110,7 +110,7 @@ def test_without_the_program_one_line_has_the_command_that_converts(
     with pytest.raises(SceneError) as error:
         read_gaussians(path)
     target = path.with_name("scene.ply") if path.suffix == ".json" else path.with_suffix(".ply")
-    assert str(error.value).endswith(f"convert it with: npx {PACKAGE} {path} -L 0 {target}")
+    assert str(error.value).endswith(f"convert it with npx {PACKAGE} {path} -L 0 {target}")
 
 
 def test_without_the_program_nothing_is_written(tmp_path: Path, no_program: None) -> None:

@@ -114,7 +114,7 @@ def test_harmonics_without_room_are_noted() -> None:
     assert noted([str(lost_harmonics("a.ply", 4))], "above degree 3", ".ply")
     assert lost_harmonics("a.spz", 3) is None
     note = lost_harmonics("a.splat", 1)
-    assert note == ".splat has no room for harmonics above degree 0: left out"
+    assert note == "harmonics above degree 0, which .splat cannot store, are left out"
     assert "above degree 3" in str(lost_harmonics("a.SPZ", 4))
     assert "COLMAP" in str(lost_harmonics("colmap/sparse/0/points3D.bin", 1))
 
