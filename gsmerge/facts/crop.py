@@ -11,7 +11,7 @@ from gsmerge.facts.holes import usual_opacity
 from gsmerge.facts.views import take_rows
 from gsmerge.frame import canonicalise
 from gsmerge.geometry import euler_to_rotmat, lies_inside, rgb_to_sh0
-from gsmerge.raster import render_in_turn
+from gsmerge.raster import render_in_batches
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import parse_crop
@@ -71,4 +71,4 @@ def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:
         return np.asarray(of_mask > MOSTLY * np.maximum(of_all, usual_opacity(of_all)))
 
     with use_threads() as threads:
-        return np.stack(list(render_in_turn(gaussians, canonical.cameras, at_once=threads, convert=shows_rows)))
+        return np.stack(list(render_in_batches(gaussians, canonical.cameras, at_once=threads, convert=shows_rows)))

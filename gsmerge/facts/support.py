@@ -17,7 +17,7 @@ from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras, Gaussians, make_scene
 
 LEAST = FitOptions().min_contribution  # least blending weight in a pixel of a Gaussian that a view shows, as in a fit
 LEVEL, SIDE = 2, 480  # factor by which pictures are smaller, as in a fit's search for Gaussians; their largest width
@@ -45,7 +45,7 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
 def count_views_in_world(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """Count the views that show each of n Gaussians in their own world, ``[n]`` int32; there is at least one view."""
-    frame = scene_frame(Scene.of(gaussians, cameras))
+    frame = scene_frame(make_scene(gaussians, cameras))
     return count_views(frame.enter(gaussians), frame.enter_cameras(cameras))
 
 

@@ -130,7 +130,7 @@ PLACES = {
     "render room -o alone.ply/pictures": "alone.ply/pictures*work/alone.ply",
     "render room --path room/scene.ply -o a.mp4": "room/scene.ply*cameras inside",
     "evaluate room --lpips none --targets nowhere.json": "nowhere.json*cameras*no such file",
-    "evaluate room --lpips none --targets room/transforms.json": "room/transforms.json*held-out views*scene was made from",
+    "evaluate room --lpips none --targets room/transforms.json": "room/transforms.json*held-out views*was made from",
     "evaluate room alone.ply --lpips none --set merge_seconds=room/transforms.json": "room/transforms.json*report",
     "evaluate room alone.ply --lpips none --set merge_seconds=alone.ply": "alone.ply*text*'utf-8'",
     "evaluate alone.ply --hint order=none --targets room/targets": "alone.ply*none*--cameras",
