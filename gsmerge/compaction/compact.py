@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from os import PathLike
 from typing import TYPE_CHECKING
 from weakref import ReferenceType, ref
 
@@ -89,7 +90,7 @@ def compact(
     options = (options or CompactOptions()).with_settings(settings)
     with use_threads(options.threads), record_run(progress):
         # a reference, so that the result does not keep the scene in memory
-        source: StrPath | ReferenceType[Scene] = ref(scene) if isinstance(scene, Scene) else scene
+        source: StrPath | ReferenceType[Scene] = scene if isinstance(scene, str | PathLike) else ref(scene)
         scene = as_scene(scene)
         if options.clean.crop is not None:
             scene = crop_scene(scene.numpy(), options.clean.crop)
@@ -122,7 +123,7 @@ def _warn_of_doubts(report: CompactReport) -> None:
     agreement = report.choices.get("agreement") or {}
     doubts = [report.worse, report.unmet, *(text for text in report.notes if text == agreement.get("doubt"))]
     for text in dict.fromkeys(filter(None, doubts)):
-        warnings.warn(text, DoubtWarning, stacklevel=4)  # above here, compact, and its check of the arguments
+        warnings.warn(text, DoubtWarning, stacklevel=4)  # the caller: above this function, compact and its decorator
 
 
 def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
