@@ -414,9 +414,8 @@ def result_section(run: Run) -> str:
     return "\n\n".join([
         "## 5. make_result: what comes out",
         text(
-            "[`compaction/candidate.py`](../../gsmerge/compaction/candidate.py) moves the Gaussians back into the",
-            "world of the file and scores them. [`compaction/result.py`](../../gsmerge/compaction/result.py) scores",
-            "the input and makes the report.",
+            "[`compaction/candidate.py`](../../gsmerge/compaction/candidate.py) moves the Gaussians into the world of",
+            "the file and scores them; [`compaction/result.py`](../../gsmerge/compaction/result.py) scores the input.",
         ),
         "\n".join([
             entry("result.gaussians.means", gaussians.means, child),

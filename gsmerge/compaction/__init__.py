@@ -1,1 +1,1 @@
-"""The way from a scene to a result: one piece or blocks, one count or a search, from files or from memory."""
+"""Compaction of a scene: in one piece or in blocks, by one count or a search, from files or from memory."""

@@ -123,7 +123,7 @@ def _warn_of_doubts(report: CompactReport) -> None:
     agreement = report.choices.get("agreement") or {}
     doubts = [report.worse, report.unmet, *(text for text in report.notes if text == agreement.get("doubt"))]
     for text in dict.fromkeys(filter(None, doubts)):
-        warnings.warn(text, DoubtWarning, stacklevel=4)  # above here, compact, and its check of the arguments
+        warnings.warn(text, DoubtWarning, stacklevel=4)  # the caller: above this function, compact and its decorator
 
 
 def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:

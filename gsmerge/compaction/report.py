@@ -160,7 +160,7 @@ def report_document(
         ``schema_version`` 1; within a version keys are only added. ``unmet``: why a target is not met, or null.
         ``new_views``: the expected PSNR of new views ``before`` and ``after``, estimated on so many ``views`` that a
         short fit left out; null with fewer than four photos, or if it was not asked for. ``psnr_reference``: what
-        ``psnr_input_views`` are measured against: "photos", or what stands in for them. ``psnr_covered``: ``share``,
+        ``psnr_input_views`` are measured against: "photos", or other pictures. ``psnr_covered``: ``share``,
         ``before``, ``after`` over the pixels that the input covers, if it lacks some. ``psnr_photo_files``: ``before``,
         ``after`` on the photos as their files have them, if the run changed some. ``psnr_protected``: ``share``,
         ``before``, ``after`` over the pixels that ``protect`` names. ``worse``: a warning that the result, or else a

@@ -45,7 +45,7 @@ USAGE = {
     "compact room --set checkpoint=none --set require_checkpoint=true": 'require_checkpoint*"none"',
     "compact room --set method=magic": "method*voxel*'magic'",
     "compact room --set method=voxel --budget auto": "method voxel*budget auto",
-    "compact room --set method=blocks --hint order=none": "method blocks*one Gaussian per pixel*method",
+    "compact room --set method=blocks --hint order=none": "method blocks*per pixel*method",
     "compact room --budget 2 --dry-run": 'budget*5*got 2*"2%"',
     "compact room --budget -1dB": "budget*'-1dB'*--quality -1dB",
     "compact room --threads 99999999999999999999999": "--threads*1024",

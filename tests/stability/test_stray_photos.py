@@ -172,7 +172,7 @@ def test_none_is_used_where_most_are_wrong(
 ) -> None:
     wanted = {**FIT, **settings}
     result, without = (compact(one, **wanted) for one in (with_photos(room, change), replace(room, images=None)))
-    assert noted(result.report.notes, f"{VIEWS} of {VIEWS}", "photos", "none")
+    assert noted(result.report.notes, f"{VIEWS} of {VIEWS}", "photos", "no photo is used")
     assert result.report.psnr_reference == without.report.psnr_reference == ROW_COLORS
     assert scenes.identical(result.gaussians, without.gaussians)
 
