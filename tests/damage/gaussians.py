@@ -223,7 +223,7 @@ def of_glb() -> dict[str, Damage]:
         "a count of 10^12": refused(place(*accessor, "count", value=10**12), "truncated"),
         "a count of 400 digits": refused(place("accessors", 0, "count", value=10**400), "count"),
         "a count of 10^9": refused(place("accessors", 0, "count", value=10**9), "truncated"),
-        "fewer of one attribute": refused(place(*accessor, "count", value=5), "others"),
+        "fewer of one attribute": refused(place(*accessor, "count", value=5), "one per Gaussian"),
         "a length of 2^62": either(place(*view, "byteLength", value=2**62)),
         "a stride of 2^62": either(place(*view, "byteStride", value=2**62)),
         "a node in itself": refused(place("nodes", 0, "children", value=[0]), "node 0"),

@@ -159,7 +159,7 @@ def _headers() -> dict[str, Damage]:
         "another first line": refused(swap("ply\n", "plywood\n"), "'ply'"),
         "a column missing": refused(rename("scale_1", "scale_2"), "column scale_1"),
         "columns missing": refused(rename("opacity", "rot_2"), "columns opacity, rot_2"),
-        "points": refused(rename(*COLUMNS[6:]), "f_dc_0, f_dc_1, f_dc_2, opacity", "splat"),
+        "points": refused(rename(*COLUMNS[6:]), "f_dc_0, f_dc_1, f_dc_2, opacity", "this one has none"),
         "packed columns alone": refused(packed_columns, "compressed"),
         **{f"{n} f_rest": refused(with_rest(*range(n)), f"{n} f_rest") for n in (1, 10, 46)},
         "f_rest with a gap": refused(with_rest(*range(8), 9), "9 f_rest"),
