@@ -1,4 +1,4 @@
-"""Files: the only place that knows their formats."""
+"""Read and write files; no other room knows their formats."""
 
 from gsmerge.io.atomic import atomic_output as atomic_output
 from gsmerge.io.atomic import atomic_outputs as atomic_outputs

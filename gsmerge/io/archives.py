@@ -1,4 +1,4 @@
-"""Archives of zip: what those that are read unpack to is bounded by what they promise."""
+"""Read and write zip archives; no member unpacks to more bytes than the directory of its archive states."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_budget
 from gsmerge.types import StrPath
 
-# For others, zipfile unpacks each piece of packed bytes whole, whatever the directory promises
+# With other methods, zipfile unpacks each piece of packed bytes completely, even if the directory states fewer bytes
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_PIECE = 1 << 14  # bytes that are unpacked in a budget's step
+_PIECE = 1 << 14  # bytes that are unpacked in one step of a budget
 
 
 @contextmanager
@@ -22,26 +22,26 @@ def open_archive(path: StrPath) -> Iterator[zipfile.ZipFile]:
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
             if info.compress_type not in _METHODS:
-                problem = f"{info.filename!r:.80}: expected a member that is stored or deflated, found one packed"
-                raise SceneError(path, f"{problem} by method {info.compress_type}", "pack it again")
+                problem = f"expected members that are stored or deflated, found {info.filename!r:.80} packed by method"
+                raise SceneError(path, f"{problem} {info.compress_type}", "pack the archive again with one of these")
         yield archive
 
 
 def new_member(name: str) -> zipfile.ZipInfo:
-    """Return a member to write, of 1980 and of Unix: the same bytes at any time and on any system."""
+    """Return a member to write, dated 1980 and marked as Unix, so that bytes are equal at any time on any system."""
     member = zipfile.ZipInfo(name)
     member.create_system = 3
     return member
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """Read the bytes that the directory promises, and unpack no more, as ``ZipFile.read`` does."""
+    """Read as many bytes of a member as the directory states; ``ZipFile.read`` would unpack more."""
     with archive.open(info) as file:
         return file.read(info.file_size)
 
 
 def damaged_member(path: Path) -> str | None:
-    """Describe what is wrong with an archive's members by their checksums; None if nothing is."""
+    """Describe the first damaged member of an archive, by the checksums; None without damage."""
     try:
         with open_archive(path) as archive:
             pieces = sum(-(-info.file_size // _PIECE) for info in archive.infolist())
@@ -49,6 +49,6 @@ def damaged_member(path: Path) -> str | None:
             name = archive.testzip()
     except SceneError as error:
         return str(error).removeprefix(f"{path}: ")
-    except Exception as error:  # whatever a damaged archive makes the library raise
+    except Exception as error:  # a damaged archive may make the library raise any error
         return f"cannot be unpacked ({' '.join(str(error).split())})"
-    return None if name is None else f"{name}: not what was written, by its checksum"
+    return None if name is None else f"{name}: damaged, since its checksum is wrong"

@@ -1,7 +1,7 @@
-"""Write files that are either complete or not there, one or several together.
+"""Write one or several files completely or not at all.
 
-Each is written under another name beside its place. When all are written and on the disk, all are renamed. The other
-name has the process that writes the file and its machine, so that a later one can remove the rest of a killed one.
+Each file is first written under a temporary name in its folder. When all files are on the disk, all are renamed. The
+temporary name has the process and its machine, so that a later process can remove the files of a killed one.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from pathlib import Path, PurePath
 from gsmerge.errors import SceneError
 from gsmerge.types import StrPath
 
-# What the disk itself may answer in the middle of writing; any other OSError is the caller's own.
+# Errors of the disk while a file is written; other OSErrors are errors of the caller
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
-_MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps: names end at 255
-_STALE_SECONDS = 7 * 86400  # age at which a file of another machine, whose processes nobody here sees, is stale
-_SYNCHRONIZE, _NO_PROCESS = 0x100000, 87  # a right and an error of Windows
+_MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps, since names have at most 255
+_STALE_SECONDS = 7 * 86400  # age at which a file of another machine is stale; its processes are not visible here
+_SYNCHRONIZE, _NO_PROCESS = 0x100000, 87  # an access right and an error code of Windows
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _TEMPORARY = re.compile(r"\.gsmerge-(?P<place>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
 _RESERVED = re.compile(r"(?is)(con|prn|aux|nul|com\d|lpt\d) *(\..*)?|.*[<>:\"|?*\x00-\x1f].*|(?!\.\.?$).*[ .]")
 
-AddOutput = Callable[[Path], Path]  # opens one more file of :func:`atomic_outputs`, and returns the one to write
+AddOutput = Callable[[Path], Path]  # adds a file to :func:`atomic_outputs`, and returns the temporary file to write
 _written: set[str] = set()  # the temporary files of this process
 
 
 @contextmanager
 def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
-    """Yield an empty temporary file beside ``path`` that is renamed to ``path`` when the block succeeds.
+    """Yield an empty temporary file beside ``path``, and rename it to ``path`` when the block succeeds.
 
-    Missing folders are made. A link stays a link; the file that it leads to is replaced. Inside an outer block that
-    yielded ``path``, ``path`` itself is yielded. SceneError if the file exists and ``overwrite`` is False, or cannot be
-    written.
+    Missing folders are made. A link stays a link, and the file that it points to is replaced. If ``path`` is itself a
+    temporary file of an outer block, it is yielded unchanged. SceneError if the file cannot be written, or if it exists
+    and ``overwrite`` is False.
     """
     with atomic_outputs(overwrite=overwrite) as add:
         yield add(Path(path))
@@ -57,12 +57,13 @@ def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
 def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
     """Write several files and rename all of them at the end; if the block fails, none is left.
 
-    Yields a function that makes each file, as :func:`atomic_output`. A process that is killed between two renames,
-    or a disk that fails there, leaves each file whole, old or new. Files in deeper folders are renamed first, and their
-    names are on the disk before others are renamed, so that an index above them never names one that is not there.
+    Yields a function that adds a file and returns its temporary file, as in :func:`atomic_output`. If the process is
+    killed or the disk fails between two renames, each file is complete, either old or new. Files in deeper folders are
+    renamed first, and their names are on the disk before the next folder is renamed. Therefore an index above them
+    never names a missing file.
     """
-    made: dict[str, tuple[Path, Path]] = {}  # temporary file -> as it was asked for, where it goes
-    folders: list[Path] = []
+    made: dict[str, tuple[Path, Path]] = {}  # temporary file -> path that was asked for, path after links
+    folders: list[Path] = []  # that were made
 
     def add(path: Path) -> Path:
         if str(path) in _written:
@@ -104,16 +105,16 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
             with suppress(OSError):
                 os.unlink(temporary)
         for folder in reversed(folders):
-            with suppress(OSError):  # it holds what was written
+            with suppress(OSError):  # a folder with files is not removed
                 os.rmdir(folder)
         _written.difference_update(made)
 
 
 def link_file(source: Path, target: Path) -> None:
-    """Make an empty file a link to another file, hard or symbolic, or a copy where neither can be."""
+    """Replace the file ``target`` by a hard link to ``source``, else by a symbolic link, else by a copy."""
     os.unlink(target)
     real = os.path.realpath(source)
-    for make in (os.link,) if sys.platform == "win32" else (os.link, os.symlink):  # few may make the latter there
+    for make in (os.link,) if sys.platform == "win32" else (os.link, os.symlink):  # most users may not make those there
         with suppress(OSError, NotImplementedError):
             make(real, target)
             return
@@ -127,16 +128,16 @@ def _make_folder(folder: Path) -> Iterator[Path]:
         try:
             os.mkdir(path)
             yield path
-        except FileExistsError:  # somebody else was quicker
+        except FileExistsError:  # another process made it meanwhile
             pass
         except OSError as error:
             raise SceneError(path, f"cannot be made ({error.strerror})", "choose another folder") from error
 
 
 def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
-    """Rename each temporary file to its final name, folder by folder; an interrupt takes effect after the last.
+    """Rename each temporary file to its final name, folder by folder; an interrupt takes effect after the last rename.
 
-    Without ``overwrite``, if somebody else was quicker with one of the names, none is left of these files.
+    Without ``overwrite``, all renamed files are removed again if another process has made one of the names meanwhile.
     """
     renamed = list[Path]()
     try:
@@ -146,8 +147,8 @@ def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
                 renamed.append(target)
             _flush_names(folder)
     except KeyboardInterrupt:
-        left = [(temporary, target) for temporary, target in files if os.path.lexists(temporary)]
-        _rename_all(left, overwrite=overwrite)
+        remaining = [(temporary, target) for temporary, target in files if os.path.lexists(temporary)]
+        _rename_all(remaining, overwrite=overwrite)
         raise
     except FileExistsError as error:
         for path in renamed:
@@ -156,11 +157,11 @@ def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
 
 
 def _rename_to_new(temporary: str, target: Path) -> None:
-    """Rename a file to a name that must not exist, whoever makes it meanwhile; FileExistsError if it does."""
+    """Rename a file to a new name; FileExistsError if the name exists, even if another process makes it meanwhile."""
     try:
-        (os.rename if sys.platform == "win32" else os.link)(temporary, target)  # both fail where the name exists
+        (os.rename if sys.platform == "win32" else os.link)(temporary, target)  # both fail if the name exists
     except FileExistsError:
-        if not os.path.samefile(temporary, target):  # as after an interrupt
+        if not os.path.samefile(temporary, target):  # they are the same if an interrupt came after the link was made
             raise
     except OSError:  # a file system without links
         if os.path.lexists(target):
@@ -171,7 +172,7 @@ def _rename_to_new(temporary: str, target: Path) -> None:
 
 
 def _flush_names(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk; not every system can."""
+    """Wait until the names in a folder are on the disk, if the system can do that."""
     with suppress(OSError):
         _flush(folder)
 
@@ -179,28 +180,29 @@ def _flush_names(folder: Path) -> None:
 def _flush(path: str | Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk."""
     if sys.platform == "win32" and not os.access(path, os.W_OK):
-        return  # a link to somebody's file: Windows flushes only what may be written
+        return  # the file is a link to a read-only file, and Windows flushes only writable files
     descriptor = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that know no such thing
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that cannot flush
             raise
     finally:
         os.close(descriptor)
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a temporary name beside ``path``, of the same suffix, with a hash of the machine and the process id."""
+    """Return a temporary name in the folder of ``path``, with its suffix, a hash of the machine and the process id."""
     suffix = path.suffix if len(os.fsencode(path.suffix)) <= _MAX_SUFFIX else ""
     return path.with_name(f".gsmerge-{_place()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
 
 
 @cache
 def _place() -> str:
-    """Return a hash of the machine and the container, within which process numbers are unique.
+    """Return a hash of the machine and the container, in which process ids are unique.
 
-    Host names and the numbers of name spaces repeat among containers, so Linux's random boot number is used as well.
+    Host names and ids of name spaces are often equal in different containers. Therefore Linux's random boot id is used
+    as well.
     """
     names = f"{socket.gethostname()} {uuid.getnode()}"
     with suppress(OSError):
@@ -209,18 +211,19 @@ def _place() -> str:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove temporary files in a folder whose process has ended; files of other machines after a week."""
-    with suppress(OSError), os.scandir(folder) as entries:  # another may be cleaning as well, or may not
+    """Remove temporary files in a folder if their process has ended, and files of other machines after a week."""
+    with suppress(OSError), os.scandir(folder) as entries:  # another process may remove them, or rights may be missing
         for entry in list(entries):
             match = _TEMPORARY.fullmatch(entry.name)
             if match is not None and _is_stale(entry, match["place"], int(match["pid"])):
                 os.unlink(entry.path)
 
 
-_remove_stale_once = cache(remove_stale)  # by folder and process: with many files in one, a look costs more than a file
+_remove_stale_once = cache(remove_stale)  # once per folder and process, since listing a large folder takes long
 
 
 def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:
+    """Return whether the process that wrote a temporary file has ended, or a file of another machine is old."""
     if place != _place():
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS
     if sys.platform == "win32":  # where a signal 0 would end the process
@@ -233,9 +236,9 @@ def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return True
-    except (OSError, OverflowError):  # another user's
+    except (OSError, OverflowError):  # a process of another user
         return False
-    try:  # of a killed run, nobody may have asked yet how its processes ended
+    try:  # a killed process whose parent has not asked for its exit status is still listed, as a zombie
         status = Path(f"/proc/{pid}/stat").read_bytes()
         return status.rpartition(b") ")[2][:1] in (b"Z", b"X")
     except OSError:
@@ -243,15 +246,15 @@ def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:
 
 
 def check_name(path: PurePath, system: str = sys.platform) -> None:
-    """Raise SceneError for an output in whose path Windows takes a name for a device or a stream, or changes it."""
+    """Raise SceneError for an output with a name that Windows reads as a device or a stream, or changes."""
     for part in path.parts[bool(path.anchor) :] if system == "win32" else ():
         if _RESERVED.fullmatch(part):
-            remedy = 'choose one without : * ? " < > |, no device such as aux, no dot or blank at its end'
-            raise SceneError(path, f"expected a name that Windows can keep, found {part!r}", remedy)
+            remedy = 'choose a name without : * ? " < > |, which is no device such as aux and ends in no dot or blank'
+            raise SceneError(path, f"expected a name that Windows can use, found {part!r}", remedy)
 
 
 def _refuse(path: Path, overwrite: bool) -> None:
-    """Raise a SceneError for an output that cannot be written or may not be replaced."""
+    """Raise SceneError for an output that cannot be written or must not be replaced."""
     check_name(path)
     try:
         status = os.stat(path)

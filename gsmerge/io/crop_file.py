@@ -1,4 +1,4 @@
-"""Read a crop from a small JSON or TOML file: a sphere, or a box that may be turned."""
+"""Read a crop from a small JSON or TOML file: a sphere, or a box that may be rotated."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from gsmerge.geometry import rotmat_to_euler
 from gsmerge.io.bounds import read_table
 from gsmerge.settings.stages import parse_crop
 
-# Keys that say where a shape lies; each but the last may have ``rotate``, of a box
+# Sets of keys that place a shape; without ``matrix``, a box may also have the key ``rotate``
 FORMS = {"box": ({"min", "max"}, {"center", "size"}, {"matrix"}), "sphere": ({"center", "radius"}, {"matrix"})}
-MAX_NUMBER = 1e15  # whose squares and products are far from overflow
-SHEAR = 1e-3  # cosine of the angle between two axes of a matrix from which on they are not taken for perpendicular
+MAX_NUMBER = 1e15  # squares and products of smaller numbers are far from overflow
+SHEAR = 1e-3  # largest cosine of the angle between two axes of a matrix that count as perpendicular
 
 
 def read_crop(path: Path) -> str:
-    """Read a crop from a file as text, as :func:`gsmerge.settings.stages.parse_crop` takes it.
+    """Read a crop from a file, and return it as text for :func:`gsmerge.settings.stages.parse_crop`.
 
-    SceneError for a file that cannot be read, or that holds no crop.
+    SceneError if the file cannot be read or holds no valid crop.
     """
     table = read_table(path)
     try:
         shape = table.get("shape")
-        if shape not in tuple(FORMS):  # it may be a list
+        if shape not in tuple(FORMS):  # not in the dictionary itself, since a list has no hash
             raise ValueError(f"shape: expected {' or '.join(FORMS)}, found {shape!r:.40}")
         numbers = _list_box(table) if shape == "box" else _list_sphere(table)
         text = f"{shape}:{','.join(repr(float(number)) for number in numbers)}"
@@ -38,7 +38,7 @@ def read_crop(path: Path) -> str:
 
 
 def _list_box(table: Mapping[str, Any]) -> list[float]:
-    """List the corners of a box and the degrees by which it is turned about its middle."""
+    """List the two corners of a box, and the angles (degrees) by which it is rotated about its centre."""
     keys = _check_keys(table)
     if "matrix" in keys:
         middle, halves, rotation = _parse_matrix(table)
@@ -51,7 +51,7 @@ def _list_box(table: Mapping[str, Any]) -> list[float]:
 
 
 def _list_sphere(table: Mapping[str, Any]) -> list[float]:
-    """List the middle of a sphere and its radius."""
+    """List the centre of a sphere and its radius."""
     if "matrix" not in _check_keys(table):
         return [*_parse_numbers(table, "center"), *_parse_numbers({"radius": [table["radius"]]}, "radius", (1,))]
     middle, radii, _ = _parse_matrix(table)
@@ -61,33 +61,35 @@ def _list_sphere(table: Mapping[str, Any]) -> list[float]:
 
 
 def _check_keys(table: Mapping[str, Any]) -> set[str]:
-    """Return the keys that place a shape; ValueError if they do not belong to one form."""
+    """Return the keys that place a shape, without ``rotate``; ValueError if they are none of the sets of ``FORMS``."""
     keys, forms = table.keys() - {"shape"}, FORMS[table["shape"]]
-    turned = {"rotate"} if table["shape"] == "box" and "matrix" not in keys else set[str]()
-    if keys - turned not in forms:
+    optional = {"rotate"} if table["shape"] == "box" and "matrix" not in keys else set[str]()
+    if keys - optional not in forms:
         expected = " or ".join(" and ".join(sorted(form)) for form in forms)
         raise ValueError(f"{table['shape']}: expected {expected}, found {', '.join(sorted(keys)) or 'neither'}")
-    return keys - turned
+    return keys - optional
 
 
 def _parse_matrix(table: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decompose the matrix of a cube from -1 to 1, or a sphere of radius 1: centre, scales ``[3]``, rotation."""
+    """Decompose the matrix that maps a cube from -1 to 1, or a sphere of radius 1: centre, scales ``[3]``, rotation."""
     matrix = _parse_numbers(table, "matrix", (4, 4))
     axes = matrix[:3, :3]
     scales = np.sqrt(np.square(axes).sum(0))
     if (matrix[3] != (0, 0, 0, 1)).any() or not (scales > 0).all():
-        raise ValueError("matrix: expected 4 x 4 numbers, row by row, that move, turn and scale, found others")
+        problem = "expected a 4 x 4 matrix, row by row, of a translation, rotation and scale, with the last row 0 0 0 1"
+        raise ValueError(f"matrix: {problem}")
     rotation = axes / scales
-    sheared = max(abs(float((rotation[:, i] * rotation[:, j]).sum())) for i, j in ((0, 1), (0, 2), (1, 2)))
-    if sheared > SHEAR:
-        raise ValueError(f"matrix: expected axes at right angles, found a cosine of {sheared:.3g} between two")
-    rotation[:, 2] *= np.sign((np.cross(rotation[:, 0], rotation[:, 1]) * rotation[:, 2]).sum())  # of a mirrored cube
+    cosine = max(abs(float((rotation[:, i] * rotation[:, j]).sum())) for i, j in ((0, 1), (0, 2), (1, 2)))
+    if cosine > SHEAR:
+        raise ValueError(f"matrix: expected axes at right angles, found a cosine of {cosine:.3g} between two of them")
+    # A mirrored cube is the same as one that is not
+    rotation[:, 2] *= np.sign((np.cross(rotation[:, 0], rotation[:, 1]) * rotation[:, 2]).sum())
     return matrix[:3, 3], scales, rotation
 
 
 def _parse_numbers(table: Mapping[str, Any], name: str, shape: tuple[int, ...] = (3,)) -> np.ndarray:
     """Return an entry as numbers of the given shape; ValueError for any other content."""
-    expected = f"{name}: expected {' x '.join(map(str, shape))} number(s) below {MAX_NUMBER:g}"
+    expected = f"{name}: expected {' x '.join(map(str, shape))} number(s) from -{MAX_NUMBER:g} to {MAX_NUMBER:g}"
     try:
         numbers = np.array(table[name])
     except ValueError as error:  # lists of different lengths

@@ -1,4 +1,4 @@
-"""Files that stand in the place of scenes, cameras or photos, recognised by their first bytes."""
+"""Recognise files that are no scenes, cameras or photos by their first bytes, and refuse them with a remedy."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from gsmerge.errors import SceneError
 
 _PACKED_SCENES = (".spz", ".splat", ".sog", ".ksplat", ".npz", ".glb", ".gsm")
 _PHOTOS = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff")
-NO_TEXT = (".ply", *_PACKED_SCENES, *_PHOTOS, ".torch", ".safetensors", ".bin")  # endings of what is never plain text
-_START = 1 << 10  # bytes of a file that are looked at
-_DOWNLOAD = "download it again, from a browser if it needs a click or a login"
-_UNPACK = "unpack it, and name the scene that is in it"
-_GLB = "export it as .glb, which is one file"
+NO_TEXT = (".ply", *_PACKED_SCENES, *_PHOTOS, ".torch", ".safetensors", ".bin")  # endings of files that are never text
+_START = 1 << 10  # bytes of a file that are compared with the patterns
+_DOWNLOAD = "download it again, in a browser if the page needs a click or a login"
+_UNPACK = "unpack it, and name the scene in it"
+_GLB = "export it as .glb, which is a single file"
 _AGAIN = "copy or download it again"
 
 
 @dataclass(frozen=True)
 class OtherContent:
-    """Content by which a file is refused, and what to do about it."""
+    """Content for which a file is refused, with a remedy."""
 
     what: str
-    start: str  # a pattern of a file's first bytes; its group ``quote``, if any, is shown
+    start: str  # a pattern of the first bytes; the message has its group ``quote`` if there is one
     remedy: str
-    right: tuple[str, ...] = ()  # endings of files that rightly start so
-    wrong: tuple[str, ...] | None = None  # the only endings of files that do not; None: all others
+    right: tuple[str, ...] = ()  # endings of files that may have this content
+    wrong: tuple[str, ...] | None = None  # endings of files that may not have it; None: all endings except ``right``
 
 
-_TRAIN = "train Gaussians on it, or let a model make them of the photos"
-_WRITE = "write its Gaussians as .ply: ns-export gaussian-splat for nerfstudio, option save_ply for gsplat's trainer"
-_EXPORT = "export the scene there, as .ply"
+_TRAIN = "train Gaussians on it, or make Gaussians from the photos with a model"
+_WRITE = "write its Gaussians as .ply, with ns-export gaussian-splat (nerfstudio) or the option save_ply (gsplat)"
+_EXPORT = "export the scene from that program as .ply"
 FILM = "a film"
-_FILM = FILM, "cut it into frames, of which a model such as Depth Anything 3 makes a scene"
-# Files that programs and people have beside their scenes, by ending: what they are, and what to do
+_FILM = FILM, "save its frames as photos, and make a scene from them with a model such as Depth Anything 3"
+# Other files that are often beside scenes, by ending: their content, and the remedy
 FOREIGN: dict[str, tuple[str, str]] = {
     **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"), _FILM),
     **dict.fromkeys((".pt", ".pth", ".ckpt", ".pkl"), ("a checkpoint", _WRITE)),
@@ -45,10 +45,10 @@ FOREIGN: dict[str, tuple[str, str]] = {
     ".psht": ("a project of Postshot", _EXPORT),
     ".rad": ("levels of Spark", "name the .ply or .spz that they were made from"),
     ".spx": ("a file of Reall3DViewer", "name the .ply that it was made from"),
-    ".splatv": ("splats that move", "name a .ply of one moment"),
+    ".splatv": ("moving splats", "name a .ply of one moment"),
 }
 _RAW = ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"
-# Pictures that are not read: how people call them, the endings of their names, and a pattern of their first bytes
+# Formats of pictures that are not read: name, endings, and a pattern of the first bytes
 OTHER_PICTURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("AVIF", (".avif",), r"(?s).{4}ftypavi[fs]"),
     ("HEIC", (".heic", ".heif", ".hif"), r"(?s).{4}ftyp(hei|hev|mif1|msf1)"),
@@ -59,12 +59,12 @@ OTHER_PICTURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("Radiance", (".hdr",), r"#\?R(ADIANCE|GBE)"),
     ("Photoshop", (".psd", ".psb"), r"8BPS"),
     ("DirectDraw", (".dds",), r"DDS "),
-    ("Targa", (".tga",), r"(?!)"),  # whose files begin with no mark
+    ("Targa", (".tga",), r"(?!)"),  # has no mark at its start, so this pattern never matches
     ("SVG", (".svg",), r"(?:<\?xml[^>]*>)?\s*<svg"),
-    ("raw", _RAW, r"(?s)FUJIFILMCCD-RAW|.{4}ftypcrx|II[RU][OS\0]"),  # others begin as TIFF does
+    ("raw", _RAW, r"(?s)FUJIFILMCCD-RAW|.{4}ftypcrx|II[RU][OS\0]"),  # other raw formats start like TIFF
 )
 CONVERT = "convert it to .jpg or .png"
-# In the order of trial
+# They are tried in this order
 OTHER_CONTENTS = (
     OtherContent("a Git LFS pointer", r"version https://git-lfs\.github\.com/spec/", "fetch it with: git lfs pull"),
     OtherContent(
@@ -75,7 +75,7 @@ OTHER_CONTENTS = (
         right=(".html", ".htm"),
     ),
     OtherContent(
-        "tensors of torch.save, as Lyra 1 names .ply",
+        "tensors of torch.save, which Lyra 1 writes as .ply",
         r"(?s)PK.*/data\.pkl",
         "run Lyra with save_gaussians_orig: true, and name the file in gaussians_orig",
         right=(".torch",),
@@ -87,7 +87,7 @@ OTHER_CONTENTS = (
     OtherContent("a rar archive", r"Rar!\x1a\x07", _UNPACK),
     OtherContent("a packed file", r"BZh[1-9]1AY|\xfd7zXZ\0|\x28\xb5\x2f\xfd", _UNPACK),
     OtherContent("glTF in several files", r"\s*\{", _GLB, wrong=(".gltf",)),
-    OtherContent("a PLY file", r"ply\r?\n", "give it the ending .ply", wrong=_PACKED_SCENES),
+    OtherContent("a PLY file", r"ply\r?\n", "change its ending to .ply", wrong=_PACKED_SCENES),
     OtherContent(
         "text", r"(?!ply[\r\n])\s*(?P<quote>[ -~\x80-\xff]+)(?:[\t\r\n][\t\r\n -~\x80-\xff]*)?\Z", _DOWNLOAD,
         wrong=NO_TEXT,
@@ -98,7 +98,7 @@ _PICTURES = tuple((name, re.compile(start.encode("latin-1"))) for name, _, start
 
 
 def read_start(path: Path, count: int = 1 << 12) -> bytes:
-    """Read the first bytes of a file, which tell its kind; none if it cannot be read."""
+    """Read the first bytes of a file, which show its kind; empty if it cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         return file.read(count)
     return b""
@@ -113,7 +113,7 @@ def refuse_picture(path: Path) -> None:
 
 
 def _list_formats(start: bytes) -> list[str]:
-    """List the formats of pictures, of those that are not read, to which the first bytes of a file belong."""
+    """List the formats that the first bytes of a file match, of the formats of pictures that are not read."""
     return [name for name, pattern in _PICTURES if pattern.match(start)]
 
 
@@ -123,16 +123,16 @@ def _unread_picture(path: Path, name: str) -> SceneError:
 
 
 def check_first_bytes(path: Path, size: int) -> None:
-    """Raise SceneError for a file of ``size`` bytes that cannot be what its name says, with what it is instead.
+    """Raise SceneError for a file of ``size`` bytes whose content or ending is none that is read.
 
-    A file that cannot be read is left to its reader.
+    No error is raised for a file that cannot be read, since its reader reports that.
     """
     ending = path.suffix.lower()
     if size == 0 and ending in NO_TEXT:
         raise SceneError(path, "expected content, found an empty file", _AGAIN)
     if ending in FOREIGN:
-        what, remedy = FOREIGN[ending]
-        raise SceneError(path, f"expected a scene, found {what}", remedy)
+        content, remedy = FOREIGN[ending]
+        raise SceneError(path, f"expected a scene, found {content}", remedy)
     start = read_start(path, _START)
     if ending in _PHOTOS and (names := _list_formats(start)):
         raise _unread_picture(path, names[0])

@@ -1,4 +1,4 @@
-"""Files of JSON lines that survive a kill at any moment, and several processes at once."""
+"""Read and append JSON lines; files stay valid if a process is killed, or if several processes append at once."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsmerge.io.locks import lock_folder
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
     """Yield, for each complete line from byte ``start`` on, the position after it and its value (None if damaged).
 
-    A line whose value takes more memory than the file allows counts as damaged.
+    A line whose value takes more memory than the file's budget also counts as damaged.
     """
     if not path.exists():
         return
@@ -41,10 +41,10 @@ def _parse(line: bytes, budget: ReadBudget) -> dict[str, Any] | None:
 
 
 def append_line(path: Path, value: Mapping[str, Any]) -> None:
-    """Append one JSON line durably, replacing a half-written last line.
+    """Append one JSON line and wait until it is on the disk; an incomplete last line is replaced.
 
-    A line that does not fit on the disk leaves the file as it was. Raises SceneError if the file
-    cannot be written, ValueError if there is NaN or inf among the values.
+    If the disk is full, the file stays as it was. SceneError if the file cannot be written, ValueError if a value is
+    NaN or inf.
     """
     line = json.dumps(value, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii") + b"\n"
     try:
@@ -52,7 +52,7 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
         with lock_folder(path.parent), FileIO(path, "a+b") as file:
             end = _end_of_lines(file)
             file.truncate(end)
-            if file.write(line) != len(line):  # a full disk takes the first part without an error
+            if file.write(line) != len(line):  # a full disk stores the first part without an error
                 file.truncate(end)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(file.fileno())
@@ -61,7 +61,7 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
 
 
 def _end_of_lines(file: FileIO) -> int:
-    """Return the byte after the last complete line."""
+    """Return the position after the last complete line, in bytes."""
     size = file.seek(0, os.SEEK_END)
     if size == 0:
         return 0

@@ -1,4 +1,4 @@
-"""Locks between processes: files that are there only meanwhile."""
+"""Lock files and folders between processes; the file of a lock exists only while the lock is held."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from gsmerge.errors import SceneError
 
 @contextmanager
 def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Let one process at a time into the block, and make a file for that; yield whether it is this one's turn.
+    """Let one process at a time into the block, by a lock file; yield whether this process has the lock.
 
-    ``wait``: wait for that turn. SceneError if the file cannot be made.
+    ``wait``: wait for the lock; otherwise yield False if another process has it. SceneError if the lock file cannot be
+    made.
     """
-    from filelock import FileLock, Timeout  # most commands need none
+    from filelock import FileLock, Timeout  # most commands need no lock
 
     lock = FileLock(path)
     try:
@@ -28,11 +29,11 @@ def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
     try:
         yield True
     finally:
-        with suppress(OSError):  # Windows removes no open file; there the release does
-            path.unlink()  # before the release: who waits for it sees that it is nobody's any more
+        with suppress(OSError):  # Windows removes no open file; there the release removes it
+            path.unlink()  # before the release, so that a waiting process notices that its file is no longer the lock
         lock.release()
 
 
 def lock_folder(folder: Path) -> AbstractContextManager[bool]:
-    """Let one process at a time into the block for a folder; others wait."""
+    """Let one process at a time into the block for a folder; other processes wait."""
     return lock_file(folder / ".gsmerge-lock")

@@ -1,4 +1,4 @@
-"""Photos of a scene: matched by name, decoded in parallel, resized and cropped."""
+"""Read the photos of a scene: match them by name, decode them in parallel, resize and crop them."""
 
 from __future__ import annotations
 
@@ -25,51 +25,51 @@ from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
-_FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # besides PNG, whose header is read here
-_WIDTH_TAG, _HEIGHT_TAG = 256, 257  # of TIFF: Pillow's own size follows the orientation tag
+_FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # formats whose headers Pillow reads; that of PNG is read here
+_WIDTH_TAG, _HEIGHT_TAG = 256, 257  # of a TIFF; the size that Pillow gives is turned by the orientation tag
 _ORIENTATION_TAG = 274
-# Turn that each tag asks for: quarter turns counterclockwise, and 4 more where the photo is mirrored first
+# Turn of each orientation tag: quarter turns counterclockwise, plus 4 if the photo is mirrored first
 _TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
-_MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of any file: four floats a pixel, and profiles or thumbnails
+_MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of a file: four floats per pixel, and profiles or thumbnails
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
 _HALF_OPAQUE = 127
-ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a multiple of 14 by itself
+ASPECT_TOLERANCE = 0.04  # of width over height, since backbones round each side to a multiple of 14 separately
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
-_PALETTE = 3  # the kind of a PNG's colours
-_JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of its scans, of which a progressive one has any number
-_EFFORT = 1  # of 6, of a WebP: more takes twice as long for 1 % less and .2 dB
-_PIXELS_PER_STEP = 50_000  # of a scan that changes nothing
-_MEMORY_PER_BYTE = 100  # of a photo or mask that is decoded by itself
-_COPIES = 2, 3  # of all pixels: OpenCV's, and at most those of Pillow and of what becomes of its image
-_PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # of a pixel, 4 in other modes
-_COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10
-_EMBEDDED_BYTES = 9  # more of a pixel while embedded photos are decoded
-_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two with numbers of 64 bits
-_TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8, 0])  # of a number of each type
-_TILE_TAGS = (322, 323)  # width and length, pixels
+_PALETTE = 3  # colour type of a PNG with a palette
+_JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of a scan; a progressive JPEG has any number of scans
+_EFFORT = 1  # of a WebP, of at most 6; more effort takes twice as long for 1 % fewer bytes and .2 dB
+_PIXELS_PER_STEP = 50_000  # of an empty scan, per step of a budget
+_MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
+_COPIES = 2, 3  # of all pixels in memory: with OpenCV, and at most with Pillow and the conversion of its image
+_PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # of a pixel by mode; 4 in all other modes
+_COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10  # of a pixel, while decoding
+_EMBEDDED_BYTES = 9  # additional bytes of a pixel while embedded photos are decoded
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # first bytes; the last two are those of BigTIFF
+_TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8, 0])  # of a number by type of tag
+_TILE_TAGS = (322, 323)  # width and length of a tile, pixels
 _BITS_TAG, _SAMPLES_TAG = 258, 277
-_MAX_TAGS = 1 << 16  # that are looked at; decoders read fewer
+_MAX_TAGS = 1 << 16  # that are checked; decoders read fewer
 _CHANNELS = 3  # bytes of a decoded photo's pixel
-_FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100  # bytes of a scene's decoded photos; 0.03 bytes a pixel are few
-_WHITES = 1, 255, 65535  # of pictures of 0 and 1 or of fractions, of eight bits, of sixteen
-_SMALLER = "make it smaller: a mask to the size of its photo, a photo to about that of its view"
+_FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100  # bytes of a scene's decoded photos: allowance, and per byte of files
+_WHITES = 1, 255, 65535  # largest value of pictures of 0 and 1 or of fractions, of 8 bits, and of 16 bits
+_SMALLER = "reduce its size: a mask to that of its photo, a photo to about that of its view"
 _BAND = 256  # rows of a mask that are converted at once
-_PARTS = {  # of each side of a photo that is decoded
+_REDUCTIONS = {  # by which each side is divided -> OpenCV's flag
     1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
 }  # fmt: skip
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
 Size = tuple[int, int]  # width, height, pixels
-_AT_ONCE = 128 << 20  # bytes of decoded photos; more are decoded one by one, when they are used
+_AT_ONCE = 128 << 20  # bytes of decoded photos in memory; if there are more, photos are decoded at each use
 
 
 @dataclass(frozen=True)
 class PhotoReader:
-    """c photos of one size ``(width, height)`` that are decoded at each use and not kept in memory."""
+    """c photos of one size ``(width, height)``, which are decoded at each use and not stored in memory."""
 
     count: int
     size: Size
-    read: Callable[[int], np.ndarray]  # number -> [h,w,3] uint8 sRGB; several threads may call it
+    read: Callable[[int], np.ndarray]  # index -> [h,w,3] uint8 sRGB; thread-safe
 
     def __len__(self) -> int:
         return self.count
@@ -84,17 +84,17 @@ class PhotoReader:
         return PhotoReader(len(ids), self.size, lambda photo: self[ids[photo]])
 
 
-PhotoArrays = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c of [h,w,3], uint8 sRGB; empty where there are none
-NO_IMAGES = np.empty((0, 1, 1, 3), np.float32)  # photos as floats, where there are none
+PhotoArrays = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c photos [h,w,3], uint8 sRGB; empty without photos
+NO_IMAGES = np.empty((0, 1, 1, 3), np.float32)  # stands for photos as floats if there are none
 
 
 def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
     """Read the image of every view: ``[c,h,w,3]`` float32, sRGB in [0, 1], in the order of ``names``.
 
-    ``source`` is a folder with its sub-folders, or the image files. ``names`` are the names in a camera file, with or
-    without folders and extension. If no name matches but there are as many images as names, the images are taken in
-    order, with numbers in names sorted as numbers. SceneError if an image is missing or cannot be read, or if images
-    differ in size.
+    ``source`` is a folder, which is searched with its sub-folders, or a list of image files. ``names`` are the names in
+    a camera file, with or without folders and extension. If no name matches but there are as many images as names, the
+    images are used in their order, in which numbers in names count as numbers. SceneError if an image is missing or
+    cannot be read, or if images differ in size.
     """
     return as_floats(decode_images(match_images(source, names)))
 
@@ -102,15 +102,16 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 def decode_images(paths: Sequence[Path]) -> PhotoArrays:
     """Decode image files of one size to ``[h,w,3]`` uint8 each; if they are large, they are decoded at each use.
 
-    A file that several of ``paths`` name is decoded once. SceneError if an image cannot be read, two differ in size, or
-    all together take more memory than their files allow.
+    A file that is several times in ``paths`` is decoded once. SceneError if an image cannot be read, if two differ in
+    size, or if all together take more memory than the bytes of their files allow.
     """
     files = list(dict.fromkeys(paths))
     sizes = {path: image_size(path) for path in files}
     for path, (w, h) in sizes.items():
         w0, h0 = size = sizes[files[0]]
         if (w, h) != size:
-            raise SceneError(path, f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {files[0]}")
+            problem = f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {files[0]}"
+            raise SceneError(path, problem, "resize them to one size")
     if not files:
         return []
     _check_together(paths, sum(map(check_file, files)), size)
@@ -126,13 +127,13 @@ def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
     if num_bytes > most:
         problem = f"expected photos of at most {most / 1e6:,.0f} MB together from files of {file_bytes:,} bytes"
         found = f"found {len(paths):,} of {size[0]} x {size[1]}, {num_bytes / 1e6:,.0f} MB"
-        raise SceneError(paths[0].parent, f"{problem}, {found}", "make them smaller, or leave some out")
+        raise SceneError(paths[0].parent, f"{problem}, {found}", "reduce their size, or leave some out")
 
 
 def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size) -> PhotoArrays:
     """Decode the photo of each view to ``[h,w,3]`` uint8, turned, and resized to one ``size``; black without a file.
 
-    If they are large, they are decoded at each use. SceneError as :func:`decode_images`.
+    If photos are large, they are decoded at each use. SceneError as in :func:`decode_images`.
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
@@ -155,19 +156,20 @@ def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size)
 
 
 def decode_small(path: Path, side: int) -> np.ndarray:
-    """Decode a photo to ``[h,w,3]`` float32 sRGB in [0, 1], with ``side`` to twice as many pixels on its longer side.
+    """Decode a small version of a photo to ``[h,w,3]`` float32 sRGB in [0, 1].
 
-    The orientation tag is ignored, and small photos stay as they are. JPEG files are decoded at a part of their size.
+    The longer side has from ``side`` to twice as many pixels; small photos keep their size. The orientation tag is
+    ignored. JPEG files are decoded at a reduced size, which is fast.
     """
     width, height = image_size(path)
-    part = next(part for part in reversed(_PARTS) if max(width, height) >= part * side or part == 1)
+    divisor = next(divisor for divisor in reversed(_REDUCTIONS) if max(width, height) >= divisor * side or divisor == 1)
     with read_errors(path):
         data = np.fromfile(path, np.uint8)
     _check_scans(ReadBudget(path, len(data)), [data], (width, height))
-    photo = _decode(path, data, (width, height), part if data[:2].tobytes() == _JPEG else 1)
-    level = max(photo.shape[:2]) / (2 * side)
-    if level > 1:
-        small = round(photo.shape[1] / level), round(photo.shape[0] / level)
+    photo = _decode(path, data, (width, height), divisor if data[:2].tobytes() == _JPEG else 1)
+    ratio = max(photo.shape[:2]) / (2 * side)
+    if ratio > 1:
+        small = round(photo.shape[1] / ratio), round(photo.shape[0] / ratio)
         photo = cv2.resize(photo, tuple(max(1, each) for each in small), interpolation=cv2.INTER_AREA)
     return np.multiply(photo, np.float32(1 / 255), dtype=np.float32)
 
@@ -175,14 +177,14 @@ def decode_small(path: Path, side: int) -> np.ndarray:
 def change_photos(
     photos: PhotoArrays, change: Callable[[int, np.ndarray], np.ndarray], size: Size | None = None
 ) -> PhotoArrays:
-    """Apply ``change(number, photo)`` to every photo, at each use for a reader; ``size``: of the new ones."""
+    """Apply ``change(index, photo)`` to every photo; a reader applies it at each use. ``size``: size of the results."""
     if isinstance(photos, PhotoReader):
         return PhotoReader(len(photos), size or photos.size, lambda photo: change(photo, photos[photo]))
     return parallel_map(lambda photo: change(photo, photos[photo]), range(len(photos)))
 
 
 def keep_photos(photos: PhotoArrays) -> PhotoArrays:
-    """Decode photos into memory, for callers that use them more than once."""
+    """Decode the photos of a reader into memory, for callers that use them more than once."""
     return parallel_map(photos.read, range(len(photos))) if isinstance(photos, PhotoReader) else photos
 
 
@@ -227,8 +229,8 @@ def same_shape(size: Size, other: Size) -> bool:
 def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     """Decode the brightness ``[h,w]`` uint8 of a mask, times its opacity; 255 is white.
 
-    White is 1 in a picture of 0 and 1 alone, and in one of fractions. The memory limit is that of its bytes and of its
-    ``photo`` together, since masks compress to almost nothing.
+    In a picture whose values are all 0 and 1, or fractions of 1, white is 1. The limit of memory is that of the mask's
+    bytes and those of its ``photo`` together, since masks compress to very few bytes.
     """
     budget = _photo_budget(path, *([] if photo is None else [photo]))
 
@@ -237,7 +239,7 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
         if image.mode[0] in "IF":  # more than 8 bits
             return np.asarray(image)
         grey = np.empty(image.size[::-1], np.uint8)
-        for top in range(0, image.height, _BAND):  # whose copies take little memory
+        for top in range(0, image.height, _BAND):  # copies of a band take little memory
             band = image.crop((0, top, image.width, min(top + _BAND, image.height)))
             rows = grey[top : top + _BAND]
             rows[:] = band.convert("L")
@@ -247,8 +249,8 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
 
     grey = _decode_channel(path, brightness)
     assert grey is not None
-    most = float(grey.max(initial=0))
-    white = next((white for white in _WHITES if most <= white), most)
+    brightest = float(grey.max(initial=0))
+    white = next((white for white in _WHITES if brightest <= white), brightest)
     if grey.dtype == np.uint8 and white == 255:
         return grey
     levels = np.zeros(grey.shape, np.uint8)
@@ -274,12 +276,12 @@ def decode_alpha(path: Path) -> np.ndarray | None:
 
 
 def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
-    """Return the budget of a photo or a mask that is decoded by itself, with the bytes of files ``beside`` it."""
+    """Return the budget of a photo or mask that is decoded alone; the bytes of files ``beside`` it count as well."""
     return ReadBudget(path, sum(map(check_file, (path, *beside))), _MEMORY_PER_BYTE, _SMALLER)
 
 
 def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
-    """Raise SceneError if Pillow takes more memory for an image, and one channel of it, than its file allows."""
+    """Raise SceneError if Pillow needs more memory for an image and one of its channels than the file allows."""
     pixel = _PILLOW_BYTES.get(image.mode, 4)
     more = _decoder_bytes(image) + (_PILLOW_WEBP_BYTES if image.format == "WEBP" else 0)
     num_bytes = max(_COPIES[1] * pixel, pixel + more) * image.width * image.height
@@ -287,9 +289,9 @@ def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
 
 
 def _decoder_bytes(image: Image.Image) -> float:
-    """Return the bytes for each pixel, as measured, that a decoder takes beside the image that it writes.
+    """Return the bytes per pixel that a decoder takes besides its output, as measured.
 
-    They are the frames of a WebP, a strip of a TIFF and its RGBA, or the coefficients of a progressive JPEG.
+    They hold the frames of a WebP, a strip of a TIFF and its RGBA, or the coefficients of a progressive JPEG.
     """
     if image.format == "WEBP":
         return _MOVING_WEBP_BYTES if getattr(image, "is_animated", False) else _WEBP_BYTES
@@ -301,12 +303,12 @@ def _decoder_bytes(image: Image.Image) -> float:
 
 def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
     """Decode an image and return the result of ``choose``; SceneError if it cannot be decoded."""
-    size, _ = _read_header(path)  # refuses what is no image, or too large
+    size, _ = _read_header(path)  # raises SceneError for a file that is no image or is too large
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             data = np.fromfile(path, np.uint8)
-            pixels = _png_pixels(data) if data[: len(_PNG)].tobytes() == _PNG else data  # its texts may unpack to 64 MB
+            pixels = _png_pixels(data) if data[: len(_PNG)].tobytes() == _PNG else data  # without texts of many MB
             if pixels is None:
                 raise ValueError("damaged chunks")
             with Image.open(io.BytesIO(pixels.data), formats=("PNG", *_FORMATS)) as image:
@@ -314,18 +316,18 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
                 return None if channel is None else np.asarray(channel)
     except (SceneError, MemoryError):
         raise
-    except Exception as error:  # whatever damage makes the library raise
+    except Exception as error:  # damage may make the library raise any error
         raise _undecodable(path, size) from error
 
 
 def _undecodable(path: Path, size: Size) -> SceneError:
     """Make the error of an image that a library did not decode; MemoryError if there was no memory for it."""
-    np.empty((_CHANNELS + _EMBEDDED_BYTES, *size), np.uint8)  # libraries do not tell
+    np.empty((_CHANNELS + _EMBEDDED_BYTES, *size), np.uint8)  # libraries do not say that memory was the reason
     return _unreadable(path)
 
 
 def _unreadable(path: Path) -> SceneError:
-    """Make the error of a file that is no image of a format that is read."""
+    """Make the error of a file that is no image; SceneError if it is one in a format that is not read."""
     refuse_picture(path)
     return SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
 
@@ -333,8 +335,8 @@ def _unreadable(path: Path) -> SceneError:
 def image_size(path: Path) -> Size:
     """Read (width, height) from the header of a PNG, JPEG, WebP, BMP, TIFF or PNM file; its orientation is ignored.
 
-    SceneError if it is another file, cannot be read, has an impossible size, or its pixels take more memory than the
-    file allows.
+    SceneError if it is another file, if it cannot be read, if its size is impossible, or if its pixels take more memory
+    than the file allows.
     """
     (width, height), pixel_bytes = _read_header(path)
     _photo_budget(path).check_memory(pixel_bytes * width * height, f"{width} x {height} pixels")
@@ -347,22 +349,24 @@ def _read_header(path: Path) -> tuple[Size, float]:
     with read_errors(path), path.open("rb") as file:
         (width, height), pixel_bytes = _parse_header(path, file)
     if num_bytes > _MAX_PIXEL_BYTES * width * height + _MAX_EXTRA:
-        raise SceneError(path, f"expected an image of {width} x {height}, found {num_bytes >> 20} MiB for it")
+        problem = f"expected at most {_MAX_PIXEL_BYTES} bytes per pixel, found {num_bytes >> 20} MiB"
+        raise SceneError(path, f"{problem} for {width} x {height} pixels", "save the image again")
     return (width, height), pixel_bytes
 
 
 def orientation_turn(path: Path) -> int:
-    """Return how a photo's orientation tag turns it, 0 to 7; see :func:`gsmerge.kernels.pictures.turn_picture`."""
+    """Return the turn by a photo's orientation tag, 0 to 7; see :func:`gsmerge.kernels.pictures.turn_picture`."""
     with read_errors(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             with Image.open(path, formats=(*_FORMATS, "PNG")) as image:
                 return _TURNS.get(image.getexif().get(_ORIENTATION_TAG, 0), 0)
-        except Exception:  # whatever a damaged tag makes the library raise; pixels are checked later
+        except Exception:  # a damaged tag may make the library raise any error; pixels are checked later
             return 0
 
 
 def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
+    """Return the size in the header of an image, and the bytes of memory for each pixel while it is decoded."""
     start, pixel_bytes = file.read(24), 0.0
     file.seek(0)
     try:
@@ -382,9 +386,9 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
     except (SceneError, MemoryError):
         raise
     except Image.DecompressionBombError as error:
-        problem = f"expected at most {MAX_PIXELS // 1_000_000} million pixels an image, found more"
-        raise SceneError(path, problem) from error
-    except Exception as error:  # whatever a damaged header makes the library raise
+        problem = f"expected at most {MAX_PIXELS // 1_000_000} million pixels per image, found more"
+        raise SceneError(path, problem, "reduce its size") from error
+    except Exception as error:  # a damaged header may make the library raise any error
         raise _unreadable(path) from error
     check_pixels(path, width, height)
     return (width, height), max(_COPIES[0] * _CHANNELS, _CHANNELS + pixel_bytes)
@@ -393,7 +397,7 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
 def _check_tags(path: Path, file: BinaryIO) -> None:
     """Raise SceneError if the tags of a TIFF refer to more bytes than allowed, since its decoder copies all of them.
 
-    ValueError if a tag that sizes depend on is there twice, of which each decoder takes another.
+    ValueError if a tag on which sizes depend is there twice, since decoders differ in which of them they use.
     """
     num_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
@@ -413,29 +417,30 @@ def _check_tags(path: Path, file: BinaryIO) -> None:
 
 
 def _check_tile(budget: ReadBudget, tags: Mapping[int, Any]) -> None:
-    """Raise SceneError if a tile of a TIFF, for which decoders make room, takes more memory than the file allows."""
+    """Raise SceneError if a tile of a TIFF, for which decoders allocate memory, takes more than the file allows."""
     width, length = (tags.get(tag, 0) for tag in _TILE_TAGS)
     num_bytes = max(_CHANNELS + 1, _sample_bytes(tags)) * width * length
     budget.check_memory(num_bytes, f"a tile of {width} x {length} pixels")
 
 
 def _sample_bytes(tags: Mapping[int, Any]) -> float:
-    """Return the bytes of a TIFF's pixel."""
+    """Return the bytes of a pixel in a TIFF."""
     return float(tags.get(_SAMPLES_TAG, 1) * max(tags.get(_BITS_TAG, (1,))) / 8)
 
 
 def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray | PhotoReader:
-    """Decode images that a file holds as image files in bytes (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
+    """Decode image files that are embedded in a file (``[b]`` uint8 each) to ``[c,h,w,3]`` uint8.
 
-    If there are many large images, they are decoded at each use. SceneError if an image cannot be decoded, two differ
-    in size, or they take more memory or time than the file's budget.
+    If there are many large images, they are decoded at each use. SceneError if an image cannot be decoded, if two
+    differ in size, or if they take more memory or time than the file's budget allows.
     """
     path = Path(budget.path)
     sizes = [_parse_header(path, io.BytesIO(data.tobytes()))[0] for data in files]
     width, height = sizes[0]
-    odd = next((name for name, size in zip(names, sizes, strict=True) if size != sizes[0]), None)
-    if odd is not None:
-        raise SceneError(path, f"{odd}: expected images of one size, found another than {width} x {height}")
+    for name, (w, h) in zip(names, sizes, strict=True):
+        if (w, h) != sizes[0]:
+            problem = f"{name}: expected images of one size, {width} x {height}, found {w} x {h}"
+            raise SceneError(path, problem, "resize them to one size")
     at_once = len(files) if _CHANNELS * len(files) * width * height <= _AT_ONCE else 1
     num_bytes = (_CHANNELS * at_once + _EMBEDDED_BYTES) * width * height
     budget.check_memory(num_bytes, f"{at_once} photos of {width} x {height}")
@@ -448,15 +453,15 @@ def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np
 
 
 def _check_scans(budget: ReadBudget, files: Sequence[np.ndarray], size: Size) -> None:
-    """Raise SceneError if JPEG files have more scans, each a pass over all pixels, than the budget has time for."""
+    """Raise SceneError if the scans of JPEG files, each over all pixels, take longer than the budget allows."""
     num_scans = sum(data.tobytes().count(_SCAN) for data in files if data[:2].tobytes() == _JPEG)
     budget.check_steps(num_scans * size[0] * size[1] // _PIXELS_PER_STEP, f"steps of decoding {num_scans:,} scans")
 
 
-def _decode(path: Path, data: np.ndarray, size: Size, part: int = 1) -> np.ndarray:
-    """Decode ``[h,w,3]`` uint8 sRGB, or a ``part`` of each side; the orientation tag is ignored."""
-    width, height = (-(-side // part) for side in size)
-    flags = _PARTS[part] | cv2.IMREAD_IGNORE_ORIENTATION
+def _decode(path: Path, data: np.ndarray, size: Size, divisor: int = 1) -> np.ndarray:
+    """Decode ``[h,w,3]`` uint8 sRGB, with each side divided by ``divisor``; the orientation tag is ignored."""
+    width, height = (-(-side // divisor) for side in size)
+    flags = _REDUCTIONS[divisor] | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = _png_pixels(data) if data[: len(_PNG)].tobytes() == _PNG else data
     try:
         image = cv2.imdecode(pixels, flags) if pixels is not None and len(pixels) else None
@@ -465,14 +470,15 @@ def _decode(path: Path, data: np.ndarray, size: Size, part: int = 1) -> np.ndarr
     if image is None:
         raise _undecodable(path, size)
     if image.shape != (height, width, 3):
-        raise SceneError(path, f"expected {width} x {height} pixels as its header says, found others", "replace it")
+        problem = f"expected {width} x {height} pixels, as its header says, found another size"
+        raise SceneError(path, problem, "replace it")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
 
 def _png_pixels(data: np.ndarray) -> np.ndarray | None:
-    """Remove everything from a PNG file ``[b]`` uint8 that does not change its pixels; None if it is damaged.
+    """Return a PNG file ``[b]`` uint8 with only the chunks that determine its pixels; None if it is damaged.
 
-    Otherwise the decoder prints messages of its own about damaged colour profiles and texts.
+    The decoder would print messages about damaged colour profiles and texts.
     """
     view, start, pixels = np.ascontiguousarray(data).data, len(_PNG), bytearray(_PNG)
     while start + 12 <= len(view):
@@ -492,8 +498,8 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
 
 def encode_picture(picture: np.ndarray, quality: int) -> bytes:
-    """Encode a picture ``[h,w,3]`` uint8 sRGB as a WebP of a ``quality`` up to 100."""
-    from PIL import WebPImagePlugin  # noqa: F401 - Pillow imports those of all formats where it lacks one
+    """Encode a picture ``[h,w,3]`` uint8 sRGB as a WebP with a ``quality`` up to 100."""
+    from PIL import WebPImagePlugin  # noqa: F401 - without it, Pillow imports the plugins of all formats
 
     content = io.BytesIO()
     Image.fromarray(picture).save(content, "WEBP", quality=quality, method=_EFFORT)
@@ -503,7 +509,7 @@ def encode_picture(picture: np.ndarray, quality: int) -> bytes:
 def encode_indexed(indices: np.ndarray, colors: np.ndarray) -> bytes:
     """Encode ``indices [h,w]`` uint8 into ``colors [n,3 or 4]`` uint8 sRGB as a PNG; index 0 is transparent.
 
-    Of up to 16 colours two pixels share a byte.
+    With up to 16 colours, two pixels share a byte.
     """
     (height, width), bits = indices.shape, 4 if len(colors) <= 16 else 8
     opacities = colors[:, 3].copy() if colors.shape[1] > 3 else np.full(len(colors), 255, np.uint8)
@@ -511,8 +517,8 @@ def encode_indexed(indices: np.ndarray, colors: np.ndarray) -> bytes:
     if bits == 4:
         indices = np.pad(indices, ((0, 0), (0, width % 2)))
         indices = indices[:, ::2] << 4 | indices[:, 1::2]
-    rows = np.pad(indices, ((0, 0), (1, 0)))  # each begins with the number of its filter, which is none
-    packer = zlib.compressobj(1, strategy=zlib.Z_RLE)  # pixels repeat, longer runs seldom do
+    rows = np.pad(indices, ((0, 0), (1, 0)))  # each row begins with the number of its filter, 0 for none
+    packer = zlib.compressobj(1, strategy=zlib.Z_RLE)  # single pixels repeat often, longer runs seldom
     content = _PNG
     for kind, data in (
         (b"IHDR", struct.pack(">IIBBBBB", width, height, bits, _PALETTE, 0, 0, 0)),
@@ -536,7 +542,7 @@ class PhotoTransform:
 
     @property
     def crops(self) -> bool:
-        """Whether anything is cut off."""
+        """Whether the transform crops photos at the left or top."""
         return bool(self.left or self.top)
 
     @property
@@ -577,7 +583,10 @@ def resize_to(size: Size, to: Size) -> PhotoTransform:
 
 
 def resize_and_crop(size: Size, to: Size, scale: float | None = None) -> PhotoTransform:
-    """Make the transform that resizes photos in proportion, by default to cover ``to``, and crops the centre."""
+    """Make the transform that resizes photos in proportion and crops them at the centre to the size ``to``.
+
+    ``scale``: of both sides; None: the smallest one that covers ``to``.
+    """
     if scale is None:
         scale = max(to[0] / size[0], to[1] / size[1])
     width, height = (max(side, round(whole * scale)) for side, whole in zip(to, size, strict=True))

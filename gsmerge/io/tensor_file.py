@@ -1,4 +1,4 @@
-"""Safetensors files, read into memory: a mapped file that becomes shorter would end the process without a word."""
+"""Read safetensors files into memory; a mapped file that becomes shorter would end the process without a message."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from safetensors import SafetensorError, deserialize
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import parse_json, read_budget
 
-_HEADER_SIZE = 8  # bytes of the number that says how many the header has
-_ARRAY_MEMORY, _COPIES = 1800, 3  # bytes of an array's description, and of the file, while it is read
+_HEADER_SIZE = 8  # bytes of the number at the start, which is the length of the header
+_ARRAY_MEMORY, _COPIES = 1800, 3  # bytes of memory for each array's description, and copies of the file, while read
 _TYPES = {
     "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,
     "I8": np.int8, "U64": np.uint64, "U32": np.uint32, "U16": np.uint16, "U8": np.uint8, "BOOL": np.bool_,
@@ -21,9 +21,9 @@ _TYPES = {
 def read_tensors(
     path: Path, what: str, remedy: str, *, arrays: bool = True
 ) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    """Read the metadata of a safetensors file, and its arrays by name; without ``arrays`` none of them.
+    """Read the metadata of a safetensors file, and its arrays by name; ``arrays=False``: read only the metadata.
 
-    Raises SceneError, which says that ``what`` was expected, for a file that is none, or becomes shorter meanwhile.
+    SceneError, with ``what`` as the expected file and the ``remedy``, if it is another file or becomes shorter.
     """
     budget = read_budget(path)
     try:
@@ -37,7 +37,7 @@ def read_tensors(
             header = parse_json(head.decode("utf-8"), budget)
             metadata = (header.get("__metadata__") if isinstance(header, dict) else None) or {}
             if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
-                raise ValueError("metadata that is no text by name")
+                raise ValueError("metadata that is not text")
             del header
             tensors = {
                 name: np.frombuffer(tensor["data"], _TYPES[tensor["dtype"]]).reshape(tensor["shape"])
@@ -46,5 +46,5 @@ def read_tensors(
     except (SafetensorError, OSError, ValueError, KeyError, MemoryError) as error:  # KeyError: of a type not in _TYPES
         reason = f"numbers of type {error.args[0]}" if isinstance(error, KeyError) else str(error)
         reason = next(iter(reason.splitlines()), "out of memory")
-        raise SceneError(path, f"expected {what}, could not read it ({reason})", remedy) from error
+        raise SceneError(path, f"expected {what}, found a file that cannot be read ({reason})", remedy) from error
     return metadata, tensors

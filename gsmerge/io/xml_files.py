@@ -1,7 +1,7 @@
-"""Read XML within the budget of its file: no entities, no namespaces, and only the attributes that a reader asks for.
+"""Read XML within the budget of its file: without entities and namespaces, and with only some attributes.
 
-What the library's own parser keeps is no measure of a file: it copies the address of a namespace into each tag's name,
-and a million attributes of one tag take thirty times their bytes.
+The memory of the library's own parser is not limited by the size of the file. It copies the address of a namespace into
+each tag's name, and a million attributes of one tag take thirty times their bytes.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from xml.parsers import expat
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_budget, read_text
 
-_ELEMENT_BYTES, _ATTRIBUTE_BYTES = 200, 330  # of memory for each "<" and "=" of a file, at most
+_ELEMENT_BYTES, _ATTRIBUTE_BYTES = 200, 330  # most bytes of memory for each "<" and "=" of a file
 
 
 def read_xml(path: Path, attributes: Collection[str]) -> Element:
-    """Read a file, and keep some ``attributes`` of its elements; SceneError if it is no XML, or too large.
+    """Read a file with the given ``attributes`` of its elements; SceneError if it is no XML, or too large.
 
-    Names keep their prefixes. A document type is refused: its entities could make a short text endless.
+    Names keep their prefixes. A document type is refused, since its entities could make a short text endless.
     """
     text, builder, parser = read_text(path), TreeBuilder(), expat.ParserCreate()
     budget = read_budget(path)
@@ -30,7 +30,7 @@ def read_xml(path: Path, attributes: Collection[str]) -> Element:
         builder.start(tag, {name: own[name] for name in attributes if name in own})
 
     def refuse(*_: object) -> None:
-        raise SceneError(path, "expected XML without a document type, found <!DOCTYPE", "remove it")
+        raise SceneError(path, "expected XML without a document type, found <!DOCTYPE", "remove that line")
 
     parser.StartElementHandler, parser.EndElementHandler = start, builder.end
     parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = builder.data, refuse
@@ -39,4 +39,4 @@ def read_xml(path: Path, attributes: Collection[str]) -> Element:
         parser.Parse(text, True)
         return builder.close()
     except (expat.ExpatError, AssertionError, LookupError, ValueError) as error:
-        raise SceneError(path, f"expected XML, found something else ({error})") from error
+        raise SceneError(path, f"expected XML, found other text ({error})") from error

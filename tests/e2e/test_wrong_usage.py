@@ -229,4 +229,4 @@ def test_a_named_folder_without_photos_is_refused(
 def test_a_film_is_no_folder_of_photos(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "a.mov").write_bytes(b"\0")
     outcome = run("compact", smallest_scene, "--images", tmp_path / "a.mov", "-o", tmp_path / "a.ply", code=3)
-    assert "found a film; cut it into the frames" in outcome.err
+    assert "found a film; save the frames" in outcome.err

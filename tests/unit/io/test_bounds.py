@@ -76,14 +76,14 @@ def test_json_and_toml(tmp_path: Path) -> None:
 def test_what_is_no_table_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(text)
-    with refuses(SceneError, path, "JSON" if text in ("{", "\x00") or len(text) > 9 else "settings"):
+    with refuses(SceneError, path, "JSON" if text in ("{", "\x00") or len(text) > 9 else "a table of names"):
         read_table(path)
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "folder.json").mkdir()
-    for name, found in (("nowhere.json", "no such file"), ("bytes.json", "as text"), ("folder.json", "a folder")):
+    for name, found in (("nowhere.json", "no such file"), ("bytes.json", "UTF-8 text"), ("folder.json", "a folder")):
         with refuses(SceneError, tmp_path / name, found):
             read_table(tmp_path / name)
 

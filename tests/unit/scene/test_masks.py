@@ -115,7 +115,7 @@ def test_a_folder_of_other_masks_beside_the_photos_is_not_used(tiny_folder: Path
     write(tiny_folder / "masks" / "object_0.png", half(tiny).astype(np.uint8) * 255)
     load = load_scene(tiny_folder)
     assert load.scene.masks is None
-    assert any(note.startswith("masks are not used: ") and "found none of them" in note for note in load.notes)
+    assert any(note.startswith("masks are not used: ") and "found none" in note for note in load.notes)
 
 
 def test_masks_without_photos_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
@@ -205,5 +205,5 @@ def test_photos_in_place_of_masks_are_doubted(grey: bool, tiny_folder: Path, tin
 
 def test_a_picture_that_is_too_large_has_a_remedy(tmp_path: Path) -> None:
     write(tmp_path / "a.png", np.full((4800, 6400), 255, np.uint8))
-    with refuses(SceneError, "a.png", "6400 x 4800", "a mask to the size of its photo"):
+    with refuses(SceneError, "a.png", "6400 x 4800", "a mask to that of its photo"):
         decode_levels(tmp_path / "a.png")

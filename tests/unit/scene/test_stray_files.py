@@ -196,5 +196,5 @@ def test_a_scene_without_photos_says_what_beside_it_is_not_read(tiny_folder: Pat
     path = tiny_folder / place
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(b"\0" * 20)
-    assert noted(load_scene(tiny_folder).notes, words, "not read")
+    assert noted(load_scene(tiny_folder).notes, words, "cannot be read")
     assert not noted(load_scene(tiny_folder, images="none").notes, words)
