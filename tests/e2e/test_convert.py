@@ -214,7 +214,7 @@ def test_columns_of_the_users_own_stay_with_their_rows(result: Path, tmp_path: P
     source = rows[written["label"]]
     np.testing.assert_array_equal(written["confidence"], source["confidence"])
     np.testing.assert_allclose(written["x"], 2 * source["x"], rtol=1e-5)
-    assert noted(document["notes"], "copied as they are", "label, confidence, vx")
+    assert noted(document["notes"], "copied unchanged", "label, confidence, vx")
     assert noted(document["notes"], "not moved: vx")
 
     both = convert_files(ConvertOptions([tmp_path / "own.ply", tmp_path / "cut.ply"], tmp_path / "both.ply"))
