@@ -89,7 +89,7 @@ def of_sog() -> dict[str, Damage]:
         "rotations of no mode": refuse(swap_pictures, "mode"),
         "a palette of 10^9": refuse(set_json("shN", value={"count": 10**9, "bands": 3, "files": ["a", "b"]}), 65536),
         "meta.json of bzip2": refuse(
-            add_bomb("meta.json", zipfile.ZIP_BZIP2), "method 12", place="a.sog: 'meta.json'", slow=True
+            add_bomb("meta.json", zipfile.ZIP_BZIP2), "'meta.json'", "method 12", place="a.sog", slow=True
         ),
         "meta.json that promises less": refuse(add_bomb("meta.json", zipfile.ZIP_DEFLATED), slow=True),
     }

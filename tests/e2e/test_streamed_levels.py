@@ -94,7 +94,7 @@ def test_a_run_that_fails_leaves_no_folder(
     def fail(*_: object) -> Any:
         raise gsmerge.errors.SceneError(small_scene, "expected luck, found none")
 
-    monkeypatch.setattr("gsmerge.compaction.placement.viewer_cameras", fail)  # when all chunks are written
+    monkeypatch.setattr("gsmerge.compaction.outputs.viewer_cameras", fail)  # when all chunks are written
     assert run("compact", small_scene, "-o", index, *QUICK).code == 3
     assert not index.parent.exists()
     assert run("compact", small_scene, "-o", index.parent / "deep" / "lod-meta.json", *QUICK).code == 3

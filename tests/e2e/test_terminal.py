@@ -168,5 +168,5 @@ def test_a_compact_scene_is_known_again(small_scene: Path, tmp_path: Path, run: 
     views = ("--cameras", small_scene / "transforms.json", "--images", small_scene / "images")
     assert run("compact", out, "-o", tmp_path / "smaller.ply", *words, *views, code=0).err.count("already (") == 1
     scored = run("evaluate", small_scene, out, "--set", "views=2", "--lpips", "none")
-    assert "measured as results of 2 views" in scored.err
+    assert "scores assume results of 2 views" in scored.err
     assert "more" not in run("evaluate", small_scene, out, "--lpips", "none").err

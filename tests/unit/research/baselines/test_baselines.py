@@ -85,7 +85,7 @@ def test_a_run_repeats_on_any_number_of_threads(scene: Scene, method: str) -> No
 @pytest.mark.parametrize("method", EACH)
 def test_scenes_without_an_order(scene: Scene, method: str) -> None:
     if method == "blocks":
-        with refuses(UsageError, "method blocks", "own"):
+        with refuses(UsageError, "method blocks", "one Gaussian per pixel"):
             compact(unaligned_scenes.shuffled(scene), method=method)
         return
     result = compact(unaligned_scenes.shuffled(scene), method=method, budget=COUNT, fit_steps=4)
