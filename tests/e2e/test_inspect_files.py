@@ -102,7 +102,7 @@ WRONG: dict[str, tuple[Any, ...]] = {
     "fewer rows": ("scene.ply", halve, "truncated or damaged", "'vertex'", 1152),
     "more bytes": ("scene.ply", append, "", "100 bytes"),
     "the stream's checksum": ("a.spz", flip(-6), "", "gzip", ".spz"),
-    "the stream's end": ("a.spz", lambda path: path.write_bytes(path.read_bytes()[:-4]), "", "cut", "Compressed"),
+    "the stream's end": ("a.spz", lambda path: path.write_bytes(path.read_bytes()[:-4]), "", "truncated", "Compressed"),
     "half a splat": ("a.splat", lambda path: path.write_bytes(path.read_bytes()[:-5]), "", "32 bytes"),
     "a bit of a sog": ("away/a.sog", member_bit, "", "CRC-32"),
     "a bit of an npz": ("views.npz", member_bit, "", "CRC-32"),
