@@ -19,7 +19,7 @@ from gsmerge.io.formats.write import level_output
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.report import SCHEMA_VERSION, file_sha256
 from gsmerge.runtime.estimate import memory_bytes
-from gsmerge.scene.content_hash import content_hash, digest, filled, read_files, stem_of
+from gsmerge.scene.content_hash import content_hash, digest, fill_template, list_files, scene_name
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
@@ -110,7 +110,7 @@ class CompactCall:
         without = [name for name in sorted(files.named) if getattr(files, name) is None]
         reading = {"opacity": self.opacity, **vars(self.hints), "without": without}
         version = {"tool_version": __version__, "schema_version": SCHEMA_VERSION}
-        scene = digest({"scene": content_hash(read_files(files)), **version})
+        scene = digest({"scene": content_hash(list_files(files)), **version})
         return f"{scene}.{digest({'settings': settings, 'reading': reading})}"
 
     def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
@@ -185,7 +185,7 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
             owners[name] = str(scene)
         patterns = {name: getattr(options, name) for name in PLACES}
         places: dict[str, Any] = {
-            name: path if path == NONE else filled(path, scene) for name, path in patterns.items()
+            name: path if path == NONE else fill_template(path, scene) for name, path in patterns.items()
         }
         jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), **places, within=within))
     for name in owners:
@@ -205,7 +205,7 @@ def _check_place(option: str, place: str | None) -> None:
 def output_name(options: BatchOptions, scene: Path, index: int) -> str:
     """Return the name of a scene's result in the output folder."""
     path = Path(os.path.abspath(scene))
-    stem = stem_of(path).removesuffix(".compressed")  # belongs to the format of the scene, not of its result
+    stem = scene_name(path).removesuffix(".compressed")  # belongs to the format of the scene, not of its result
     decode = options.settings.decode
     k = decode.k if decode.k != AUTO else decode.max_k
     values = {"stem": stem, "parent": path.parent.name, "index": index, "k": k}

@@ -50,7 +50,9 @@ _TILE_TAGS = (322, 323)  # width and length of a tile, pixels
 _BITS_TAG, _SAMPLES_TAG = 258, 277
 _MAX_TAGS = 1 << 16  # that are checked; decoders read fewer
 _CHANNELS = 3  # bytes of a decoded photo's pixel
-_FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100  # bytes of a scene's decoded photos: allowance, and per byte of files
+# Bytes of a scene's decoded photos that are allowed in any case, and for each byte of the files: even strongly
+# compressed photos have more than 0.03 bytes per pixel
+_FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100
 _WHITES = 1, 255, 65535  # largest value of pictures of 0 and 1 or of fractions, of 8 bits, and of 16 bits
 _SMALLER = "reduce its size: a mask to that of its photo, a photo to about that of its view"
 _BAND = 256  # rows of a mask that are converted at once
@@ -349,8 +351,9 @@ def _read_header(path: Path) -> tuple[Size, float]:
     with read_errors(path), path.open("rb") as file:
         (width, height), pixel_bytes = _parse_header(path, file)
     if num_bytes > _MAX_PIXEL_BYTES * width * height + _MAX_EXTRA:
-        problem = f"expected at most {_MAX_PIXEL_BYTES} bytes per pixel, found {num_bytes >> 20} MiB"
-        raise SceneError(path, f"{problem} for {width} x {height} pixels", "save the image again")
+        limit = f"{_MAX_PIXEL_BYTES} bytes per pixel and {_MAX_EXTRA >> 20} MiB"
+        found = f"{num_bytes >> 20} MiB for {width} x {height} pixels"
+        raise SceneError(path, f"expected at most {limit}, found {found}", "save the image again")
     return (width, height), pixel_bytes
 
 

@@ -40,27 +40,27 @@ def content_hash(files: Sequence[Path]) -> str:
     return state.hexdigest()
 
 
-def read_files(files: SceneFiles) -> list[Path]:
+def list_files(files: SceneFiles) -> list[Path]:
     """List all files and folders from which a scene is read, each once."""
     paths = list(files.paths)
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
         folders = (root, files.cameras.parent, files.ply.parent)
         paths += [place / name for place in folders for name in EXTRA_FILES if (place / name).exists()]
-        paths += photos_of(files.cameras) or ([] if files.images else images_beside(files.ply))
+        paths += list_photos(files.cameras) or ([] if files.images else images_beside(files.ply))
     return list(dict.fromkeys(paths))
 
 
-def photos_of(cameras: Path) -> list[Path]:
+def list_photos(cameras: Path) -> list[Path]:
     """List the photos of a camera file: the files that it names, otherwise image folders beside it."""
-    camera_file = cameras_of(cameras)
+    camera_file = try_cameras(cameras)
     root = cameras if cameras.is_dir() else cameras.parent
     names = () if camera_file is None else camera_file.names
     named = [root / name for name in names if (root / name).is_file()]
     return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
 
 
-def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
+def try_cameras(path: Path, scene: str | None = None) -> CameraFile | None:
     """Read the cameras of a file; None if that fails, since the reader of the scene reports the reason."""
     try:
         return read_cameras(path, scene=scene)
@@ -68,17 +68,17 @@ def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
         return None
 
 
-def stem_of(scene: Path) -> str:
+def scene_name(scene: Path) -> str:
     """Return a scene's name: a file's name without extension, a folder's name unchanged."""
     return scene.stem if scene.suffix in SCENE_SUFFIXES else scene.name
 
 
-def filled(template: str | None, scene: Path) -> Path | None:
+def fill_template(template: str | None, scene: Path) -> Path | None:
     """Fill ``{scene}``, ``{parent}`` (its folder) and ``{stem}`` (its name) into a path; UsageError on other fields."""
     if template is None:
         return None
     parent = scene if scene.is_dir() else scene.parent
     try:
-        return Path(template.format(scene=scene, parent=parent, stem=stem_of(scene)))
+        return Path(template.format(scene=scene, parent=parent, stem=scene_name(scene)))
     except (AttributeError, LookupError, TypeError, ValueError) as error:
         raise UsageError(f"{template}: expected only {{scene}}, {{parent}} or {{stem}} in braces") from error

@@ -27,7 +27,7 @@ from gsmerge.io.locks import lock_folder
 from gsmerge.report import document_head, seconds_document, seconds_line
 from gsmerge.runtime.memory import human_bytes, human_share, peak_memory
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.content_hash import content_hash, read_files
+from gsmerge.scene.content_hash import content_hash, list_files
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, scene_title
 from gsmerge.settings.extend import batch_settings
@@ -70,7 +70,7 @@ def extend_file(
     except ValueError as error:
         raise UsageError(str(error)) from error
     state = tried or (None if identity is None else load_state(path))
-    sha256 = content_hash(read_files(files))
+    sha256 = content_hash(list_files(files))
     known = [] if state is None else [batch.get("sha256") for batch in state.about["batches"]]
     document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}, "dry_run": dry_run}
     if state is not None and sha256 in known:

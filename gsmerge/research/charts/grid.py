@@ -19,7 +19,15 @@ from gsmerge.io.formats.table import estimate_counts
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.lines import ONE_SIZE, SIZES
 from gsmerge.research.charts.measure_run import INPUT, ChartRun, RunRecord, describe
-from gsmerge.scene.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
+from gsmerge.scene.content_hash import (
+    content_hash,
+    digest,
+    fill_template,
+    list_files,
+    list_photos,
+    scene_name,
+    try_cameras,
+)
 from gsmerge.scene.files import find_scene_files
 from gsmerge.settings.compact import OURS, RECIPES, CompactOptions
 from gsmerge.settings.setting import Settings, join_words, setting, settings_of
@@ -138,17 +146,17 @@ def find_sources(
     scenes = list({main_file(scene).resolve(): scene for scene in find_scenes(arguments, out)}.values())
     sources = []
     for scene, name in zip(scenes, scene_names(scenes), strict=True):
-        files, cameras = find_scene_files(scene), filled(targets, scene)
-        photos = filled(target_images, scene)
-        read = read_files(files)
+        files, cameras = find_scene_files(scene), fill_template(targets, scene)
+        photos = fill_template(target_images, scene)
+        read = list_files(files)
         if cameras is not None:
             if not cameras.exists():
                 raise SceneError(cameras, f"expected cameras of held-out views of {scene}, found nothing")
             # other files in a folder of cameras, such as results, are ignored
             inside = find_cameras(cameras) if cameras.is_dir() and not is_colmap(cameras) else None
-            read += [inside or cameras, *photos_of(cameras)]
+            read += [inside or cameras, *list_photos(cameras)]
         read += [] if photos is None else [photos]
-        scene_cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
+        scene_cameras = None if files.cameras is None else try_cameras(files.cameras, files.ply.stem)
         num_views = None if scene_cameras is None else len(scene_cameras)
         sha256 = content_hash(list(dict.fromkeys(read)))
         sources.append(ChartScene(scene, name, cameras, photos, num_views, sha256))
@@ -157,7 +165,7 @@ def find_sources(
 
 def scene_names(scenes: Sequence[Path]) -> list[str]:
     """Name each scene by its file or folder, with as many parent folders as are needed to make the names unique."""
-    parts = [(*scene.absolute().parent.parts[1:], stem_of(scene.absolute())) for scene in scenes]
+    parts = [(*scene.absolute().parent.parts[1:], scene_name(scene.absolute())) for scene in scenes]
     for depth in range(1, max(map(len, parts), default=0)):
         names = ["/".join(part[-depth:]) for part in parts]
         if len(set(names)) == len(names):

@@ -35,7 +35,7 @@ from gsmerge.research.training.backbones import PredictedCapture
 from gsmerge.research.training.examples import Example, make_examples, scene_name
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.runtime.threads import work_alone
-from gsmerge.scene.content_hash import content_hash, digest, read_files
+from gsmerge.scene.content_hash import content_hash, digest, list_files
 from gsmerge.scene.files import find_scene_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.version import __version__
@@ -107,7 +107,7 @@ def scene_key(scene: Path, options: TrainOptions) -> str:
     files = find_scene_files(scene)
     targets = files.ply.parent / "targets"
     held_out = content_hash([targets]) if targets.is_dir() else None  # separate, since names are relative to folders
-    return digest({**head, "content": content_hash(read_files(files)), "held_out": held_out})
+    return digest({**head, "content": content_hash(list_files(files)), "held_out": held_out})
 
 
 def _read_record(path: Path) -> dict[str, str] | None:

@@ -19,7 +19,7 @@ from tiny_scene import Tiny, frames_of, save_json, write_images, write_npz, writ
 from gsmerge.batch.find import find_scenes, main_file
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, to_cameras
-from gsmerge.scene.content_hash import read_files
+from gsmerge.scene.content_hash import list_files
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene
 
@@ -169,7 +169,7 @@ def test_gaussians_among_the_photos_and_poses_as_a_model_returns_them(tmp_path: 
     assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)
     assert not noted(loaded.notes, "poses")
     if written == "AnySplat":
-        assert {tmp_path / name for name in tiny.names} <= set(read_files(loaded.files))
+        assert {tmp_path / name for name in tiny.names} <= set(list_files(loaded.files))
 
 
 @pytest.mark.parametrize("frames", [True, False])
@@ -196,7 +196,7 @@ def test_long_lrm_s_folders(tmp_path: Path, frames: bool) -> None:
     assert loaded.alignment.worst_px < 0.5
     assert noted(loaded.notes, "moved into their mean pose") is not frames
     assert not noted(loaded.notes, "positions scaled")
-    assert {*export.path.glob("input_frame_idx.txt")} <= set(read_files(loaded.files))
+    assert {*export.path.glob("input_frame_idx.txt")} <= set(list_files(loaded.files))
 
 
 def test_cameras_of_any_name_only_where_one_file_has_them(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from gsmerge.cli import main
 from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
-from gsmerge.scene.content_hash import content_hash, read_files
+from gsmerge.scene.content_hash import content_hash, list_files
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene, read_scene
 from gsmerge.settings.compact import CompactOptions
@@ -45,7 +45,7 @@ def test_parts_are_one_scene(tmp_path: Path, tiny: Tiny, names: list[str], cuts:
     folder = split(tmp_path / "parts", tiny, names, cuts)
     files = find_scene_files(folder)
     assert [path.name for path in files.plys] == names
-    assert set(files.plys) <= set(read_files(files))
+    assert set(files.plys) <= set(list_files(files))
     load = load_scene(folder)
     assert load.notes[0] == f"{len(names)} files are read as one scene: {names[0]} to {names[-1]}"
     assert load.info.count == len(tiny.gaussians)
@@ -123,7 +123,7 @@ def test_a_state_is_of_all_parts(tmp_path: Path, tiny: Tiny) -> None:
     folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
     assert main(["extend", str(folder / "scene.gsm"), str(folder), "--set", "superpixels=20%", "-q"]) == 0
     (batch,) = load_state(folder / "scene.gsm").about["batches"]
-    assert batch["sha256"] == content_hash(read_files(find_scene_files(folder)))
+    assert batch["sha256"] == content_hash(list_files(find_scene_files(folder)))
     assert batch["num_input"] == len(tiny.gaussians)
 
 
