@@ -142,7 +142,7 @@ def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
 
 def has_few_rows(scene: SceneSize) -> bool:
     """Return whether Gaussians without pixels, such as tokens, are too few for a share of them to show the photos."""
-    has_photos = scene.pictures == "photos" and not scene.has_own_pixels
+    has_photos = not scene.rendered and not scene.has_own_pixels
     return has_photos and scene.num_gaussians < FEW * _few_pixels(scene)
 
 

@@ -402,13 +402,13 @@ def stands_alone(scene: Scene, options: CompactOptions) -> bool:
 def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     """Return the name of the checkpoint to load: the one that was asked for, or the shipped one if it improves results.
 
-    If no fit follows, the shipped networks improve scenes with one Gaussian per pixel, and other scenes with photos. A
-    fit gains more by further steps in the same time (docs/internals/networks.md).
+    The shipped networks improve the result if no fit follows, and if the views have photos or pixels. A fit gains more
+    by further steps in the same time (docs/internals/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
-    photos, unfitted = size.pictures == "photos", options.fit.fit == "none"
-    return "shipped" if (size.has_own_pixels and (unfitted or not photos)) or (photos and unfitted) else "none"
+    gains_from_networks = options.fit.fit == "none" and not size.rendered
+    return "shipped" if gains_from_networks else "none"
 
 
 def heads_alone(options: CompactOptions) -> bool:

@@ -67,7 +67,7 @@ class CompactReport:
         psnr_after: Like ``psnr_before``, rendered from the result; if a file is written that rounds positions visibly,
             rendered from the rounded values.
         choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit), and ``pruned``, the
-            number of Gaussians that were left out because no photo shows them. Without photos and without pixels,
+            number of Gaussians that were left out because no view shows them. Without photos and without pixels,
             ``fidelity`` has the ``psnr`` (dB) against renders of the input and the number of ``views`` for it; these
             are ``held_out`` if they were placed because the scene has no cameras.
         notes: Warnings about the input and adaptations to it, one sentence each.
@@ -246,7 +246,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     if fidelity := document["choices"].get("fidelity"):
         rows += [("PSNR", "", psnr_words(fidelity["psnr"]), _describe_views(fidelity))]
     if pruned := document["choices"].get("pruned"):
-        rows += [("left out", "", f"{pruned:,}", "Gaussians that no photo shows")]
+        rows += [("left out", "", f"{pruned:,}", "Gaussians that no view shows")]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]
@@ -313,7 +313,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
     if protected := document.get("psnr_protected"):
         quality += f", {protected['before']:.2f} -> {protected['after']:.2f} dB where they are protected"
     ratio, pruned = human_share(document["ratio"]), document["choices"].get("pruned")
-    share = f"{ratio}; {pruned:,} that no photo shows are left out" if pruned else ratio
+    share = f"{ratio}; {pruned:,} that no view shows are left out" if pruned else ratio
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
         f" ({share}), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"

@@ -96,7 +96,8 @@ def compact_tensors(
         sh0: ``[n,1,3]`` or ``[n,3]`` harmonics of degree 0; rgb = 0.5 + 0.2821 sh0.
         colors: ``[n,3]`` sRGB in [0, 1], in place of ``sh0``.
         shN: ``[n,k-1,3]`` higher harmonics, basis-major; None: none.
-        images: ``[V,H,W,3]`` photos, sRGB in [0, 1]; None: no fit and no PSNR.
+        images: ``[V,H,W,3]`` photos, sRGB in [0, 1]; None: the colours of the pixels' Gaussians stand in for them, or
+            renders of the scene with ``order="none"``.
         viewmats: ``[V,4,4]`` or ``[V,3,4]`` world to camera, OpenCV axes.
         Ks: ``[V,3,3]`` intrinsics in pixels; the top-left pixel's centre is (0.5, 0.5).
         shape: Views, height and width; None: those of the images.

@@ -73,7 +73,7 @@ class Prepared:
         """Sizes of the scene that the plan depends on."""
         measured = self.input_scene if self.reference.placed else self.scene
         reference = self.reference
-        size = measure_size(measured, "photos" if reference.of_views else "renders")
+        size = measure_size(measured, rendered=not reference.of_views)
         # Gaussians that fill holes are not in the file and do not count
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 

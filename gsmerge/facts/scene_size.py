@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -17,7 +16,6 @@ TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
 DENSE = 0.5  # Gaussians per pixel from which on a scene is dense
 FLAT, FAINT = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
 SAMPLE_GAUSSIANS = 65536  # Gaussians that these bounds are tested on
-Pictures = Literal["photos", "renders"]  # photos, or row colours instead; or drawings of the scene itself
 
 
 @dataclass(frozen=True)
@@ -29,14 +27,9 @@ class SceneSize:
     height: int  # Pixels
     width: int
     has_own_pixels: bool  # Each view has Gaussians of its own
-    pictures: Pictures  # What results are fitted to
+    rendered: bool  # Renders of the input stand for the pictures of its views, which have neither photos nor pixels
     num_cameras: int = 2  # Number of different cameras; 1: all views have the same camera
     sh_degree: int = 0
-
-    @property
-    def rendered(self) -> bool:
-        """Whether results are measured against renders of the input, because there are neither photos nor pixels."""
-        return self.pictures == "renders"
 
     @property
     def pixels_per_view(self) -> int:
@@ -49,13 +42,12 @@ class SceneSize:
         return self.has_own_pixels or self.num_gaussians >= DENSE * self.num_views * self.pixels_per_view > 0
 
 
-def measure_size(scene: Scene, pictures: Pictures | None = None) -> SceneSize:
-    """Return the sizes of a scene; ``pictures`` None: photos if there are any, whether they show the scene or not."""
-    if pictures is None:
-        pictures = "photos" if scene.is_shown else "renders"
+def measure_size(scene: Scene, rendered: bool | None = None) -> SceneSize:
+    """Return the sizes of a scene; ``rendered`` None: views with photos have pictures, whatever these show."""
+    rendered = not scene.is_shown if rendered is None else rendered
     cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
     return SceneSize(
-        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.has_own_pixels, pictures,
+        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.has_own_pixels, rendered,
         num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
         sh_degree=scene.gaussians.sh_degree,
     )  # fmt: skip

@@ -77,8 +77,8 @@ class CompactOptions(Settings):
         "It sets the defaults of other settings, such as `fit_steps`.", choices=EFFORT_NAMES)  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
         "none, or auto, which uses the shipped networks where they improve the result.",
-        "They improve it if no fit follows, or if a scene with one Gaussian per pixel has no photos. A draft or a fast "
-        "run uses only their decoder heads.",
+        "They improve it if no fit follows, and if there are photos or one Gaussian per pixel. A draft or a fast run "
+        "uses only their decoder heads.",
         metavar="FILE|NAME", neutral=("none",), replaces=True)  # fmt: skip
     recipe: str | None = setting(None, "A set of settings under one name. paper: the method of the superpixel merging "
         "paper, with networks that have absolute outputs.", choices=tuple(RECIPES), in_trial=None,

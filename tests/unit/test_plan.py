@@ -113,7 +113,7 @@ def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
     ],
 )  # fmt: skip
 def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: bool, aligned: bool, name: str) -> None:
-    size = SceneSize(768, 1, 24, 32, aligned, "photos" if photos else "renders")
+    size = SceneSize(768, 1, 24, 32, aligned, rendered=not photos)
     assert choose_networks(options_of(**settings), size) == name
 
 
@@ -324,7 +324,7 @@ def test_the_estimate_is_what_the_run_does(
 
 @pytest.mark.parametrize("budget", ["40%", "5MB", "quest3"])
 def test_limits_beyond_what_wrong_depth_bears_are_as_no_budget(budget: str) -> None:
-    size, wrong = SceneSize(1_000_000, 10, 250, 400, True, "photos"), Agreement(0.3, 0.6, 0.1)
+    size, wrong = SceneSize(1_000_000, 10, 250, 400, True, rendered=False), Agreement(0.3, 0.6, 0.1)
     with record_run() as record:
         limits = choose_for_scene(size, resolve_budget(size, options_of(budget=budget), wrong)).limits
         usual = choose_for_scene(size, options_of()).limits

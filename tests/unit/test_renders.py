@@ -127,7 +127,7 @@ def test_the_plan_and_its_estimate_say_so(scene: Scene) -> None:
     assert estimate(scene, CompactOptions())["superpixels_per_view"] == 0
     for settings in ({"max_color": 0.11}, {"segmentation": "slic"}, {"checkpoint": "shipped"}, {"method": "voxel"}):
         assert not choose_for_scene(size, CompactOptions().with_settings(settings)).may_merge_pairs
-    assert not choose_for_scene(replace(size, pictures="photos"), CompactOptions()).may_merge_pairs
+    assert not choose_for_scene(replace(size, rendered=False), CompactOptions()).may_merge_pairs
 
 
 def test_cameras_between_stand_half_way_and_look_at_the_same(scene: Scene) -> None:

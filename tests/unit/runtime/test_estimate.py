@@ -19,7 +19,7 @@ VIEW = 480 * 320
 
 def seconds(views: int = 12, *, fit_steps: int = 240, num_drawn: float = 0.3 * VIEW, **settings: Any) -> float:
     options = CompactOptions().with_settings(settings)
-    size = SceneSize(views * VIEW, views, 320, 480, True, "photos")
+    size = SceneSize(views * VIEW, views, 320, 480, True, rendered=False)
     plain = choose_for_scene(size, options).settings(options)
     return work_seconds(views * VIEW, VIEW, plain, fit_steps=fit_steps, num_drawn=num_drawn)
 

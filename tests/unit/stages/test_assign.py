@@ -115,7 +115,7 @@ def test_density_is_of_the_gaussians_where_those_are_fewer(room: Scene) -> None:
 
 def test_few_gaussians_are_as_many_as_of_pixels(room: Scene) -> None:
     """A share of tokens is too few to show the photos; half of them are the most."""
-    tokens = replace(measure_size(unaligned_scenes.without_order(room)), pictures="photos")
+    tokens = replace(measure_size(unaligned_scenes.without_order(room)), rendered=False)
     sizes = [replace(tokens, num_gaussians=count) for count in (1151, 200)]
     assert [superpixels_per_view(size, SegmentOptions(superpixels="10%")) for size in sizes] == [76, 33]
     large = replace(tokens, height=1000, width=1000)
