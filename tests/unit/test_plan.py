@@ -100,20 +100,22 @@ def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "photos", "aligned", "name"),
+    ("settings", "own_pixels", "rendered", "name"),  # the colours of own pixels stand for photos
     [
-        ({}, True, True, "none"), ({}, False, True, "shipped"), ({"fit": "none"}, True, True, "shipped"),
-        ({"fit_steps": 12}, True, True, "none"), ({"effort": "draft", "fit": "none"}, True, True, "shipped"),
-        ({"effort": "fast", "fit": "none"}, True, True, "shipped"), ({"fit": "none"}, True, False, "shipped"),
-        ({"fit": "none"}, False, False, "none"),
-        ({"fit_steps": 60}, True, False, "none"),
-        ({"effort": "fast"}, True, True, "none"), ({"effort": "draft"}, False, True, "shipped"),
-        ({"checkpoint": "own.safetensors"}, True, True, "own.safetensors"),
-        ({"checkpoint": "none"}, False, True, "none"),
+        ({}, True, False, "none"), ({}, False, True, "none"), ({"fit": "none"}, True, False, "shipped"),
+        ({"fit_steps": 12}, True, False, "none"), ({"effort": "draft", "fit": "none"}, True, False, "shipped"),
+        ({"effort": "fast", "fit": "none"}, True, False, "shipped"), ({"fit": "none"}, False, False, "shipped"),
+        ({"fit": "none"}, False, True, "none"),
+        ({"fit_steps": 60}, False, False, "none"),
+        ({"effort": "fast"}, True, False, "none"), ({"effort": "draft"}, False, True, "none"),
+        ({"checkpoint": "own.safetensors"}, True, False, "own.safetensors"),
+        ({"checkpoint": "none"}, False, False, "none"),
     ],
 )  # fmt: skip
-def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: bool, aligned: bool, name: str) -> None:
-    size = SceneSize(768, 1, 24, 32, aligned, rendered=not photos)
+def test_networks_are_loaded_where_they_help(
+    settings: dict[str, Any], own_pixels: bool, rendered: bool, name: str
+) -> None:
+    size = SceneSize(768, 1, 24, 32, own_pixels, rendered)
     assert choose_networks(options_of(**settings), size) == name
 
 
