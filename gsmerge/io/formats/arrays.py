@@ -23,8 +23,8 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
 
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
-LOGIT_COMMENT = "opacity: logit"  # the encoding of files that gsmerge writes is stated, not guessed
-RESULT_COMMENT = "gsmerge result"  # instead of it in results of commands; of equal length, so that sizes are equal
+LOGIT_COMMENT = "opacity: logit"  # states the encoding in files of gsmerge, so that no reader guesses it
+RESULT_COMMENT = "gsmerge result"  # replaces LOGIT_COMMENT in results of commands, and has the same length
 RENDER_COMMENT = "SplatRenderMode"  # written by Brush, with the mode of rendering
 NEW_VIEWS_COMMENT = "gsmerge new views"  # followed by the PSNR (dB) of new views of the input and of the result
 MAX_COPIED = 100  # characters of a comment that is copied to other files
@@ -39,11 +39,11 @@ PLAIN_COLORS = (("red", "green", "blue"), ("r", "g", "b"))  # instead of SH0, in
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 FILTER = "filter_3D"  # of Mip-Splatting: standard deviation of the filter that is added to all scales
-PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # instead of these in compressed PLYs
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of compressed PLYs
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
 MAX_STRAY = 0.01  # share of a column's values that may contradict the rest, because of roundings and damage
-_EXACT = 1e-5  # largest rounding error of a whole number in a matrix that turns harmonics
-_UNPACKING = 16_000_000  # bytes of the blocks that are unpacked at a time
+_EXACT = 1e-5  # largest rounding error of a whole number in a matrix that rotates harmonics
+_UNPACKING = 16_000_000  # bytes of all blocks that are unpacked at the same time
 GAUSSIAN_BYTES = 4 * len(REQUIRED) + 1  # in memory, without higher harmonics, with its flag of validity
 
 
@@ -125,13 +125,13 @@ def read_new_views(comments: Sequence[object]) -> ExpectedScores | None:
 
 
 def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
-    """Return the column names of the base colour: ``f_dc_*``, or plain colours if a file has only these."""
+    """Return the column names of the base colour: ``f_dc_*``, or plain colours if a file has no ``f_dc_*``."""
     plain = (colors for colors in PLAIN_COLORS if set(colors) <= set(names or ()))
     return SH0 if names is None or SH0[0] in names else next(plain, SH0)
 
 
 def are_logarithms(scales: np.ndarray) -> bool:
-    """Return whether stored scales are logarithms, which are often negative, while standard deviations never are."""
+    """Return whether stored scales are logarithms: many are negative, while standard deviations never are."""
     return bool(np.count_nonzero(scales < 0) > MAX_STRAY * scales.size)
 
 
@@ -159,7 +159,7 @@ class Columns:
         return sh0_to_rgb(self.sh0)
 
     def along_curve(self) -> Columns:
-        """Return the rows in the order of a space-filling curve, so that neighbours in space are near in the file."""
+        """Return the rows in the order of a space-filling curve, which keeps neighbours in space close in the file."""
         return self.take(curve_order(self.means))
 
     def take(self, rows: np.ndarray) -> Columns:
@@ -186,9 +186,9 @@ def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:
 
 @dataclass(frozen=True)
 class Packed:
-    """``count`` Gaussians as a file packs them; ``unpack``, which is thread-safe, returns a block of them.
+    """``count`` Gaussians as a file packs them; the thread-safe function ``unpack`` returns a block of them.
 
-    To unpack all at once would take several times the memory of both the file and the result.
+    Blocks save memory: all Gaussians unpacked take several times the memory of both the file and the result.
     """
 
     count: int
@@ -208,12 +208,12 @@ class PackedRows:
 
     def __getitem__(self, block: slice) -> np.ndarray:
         start, stop, _ = block.indices(len(self))
-        num_higher, first, columns = _num_rest(self.dtype) // 3, 0, []
+        num_higher, part_start, columns = _num_rest(self.dtype) // 3, 0, []
         with np.errstate(all="ignore"):  # the reader accepts scales of 0, and sets aside rows that are not finite
             for part in self.parts:
-                inside = slice(max(start - first, 0), min(stop - first, part.count))
-                columns += [part.unpack(inside)] if inside.start < inside.stop else []
-                first += part.count
+                part_block = slice(max(start - part_start, 0), min(stop - part_start, part.count))
+                columns += [part.unpack(part_block)] if part_block.start < part_block.stop else []
+                part_start += part.count
             return _to_table(concatenate(columns, num_higher)).view(self.dtype)[:, 0]
 
 
@@ -240,13 +240,13 @@ class StoredRows:
     sizes: dict[str, int]  # bytes by attribute
     comments: tuple[str, ...] = ()
     extra_elements: tuple[str, ...] = ()
-    bytes_beside: int = 0  # of further files that hold rows
+    bytes_beside: int = 0  # bytes of further files with rows
     notes: tuple[str, ...] = ()  # how the content was adapted, one sentence each, without a full stop
     adapt: Callable[[np.ndarray], np.ndarray] | None = None  # converts a block of rows to the usual columns
 
 
 def pack_rows(parts: Sequence[Packed]) -> PackedRows:
-    """Make rows of a PLY file from packed Gaussians, with as many harmonics as the part with the most."""
+    """Make rows of a PLY file from packed Gaussians, with the largest number of harmonics of any part."""
     num_rest = 3 * max(part.num_higher for part in parts)
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS)
     return PackedRows(parts, np.dtype([(name, np.float32) for name in names]))
@@ -268,26 +268,29 @@ def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], mode: s
     )
 
 
-def most_in_memory(file_bytes: int) -> int:
+def max_array_bytes(file_bytes: int) -> int:
     """Return the bytes above which arrays are mapped, since harmonics may be many times as large as the file."""
     return max(1 << 25, 8 * file_bytes)
 
 
 def check_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
-    """Raise SceneError if the file is too small for ``count`` Gaussians, of which each takes ``packed_bytes``."""
-    harmonics = min(12 * num_higher * count, most_in_memory(budget.file_bytes))  # bytes in memory
+    """Raise SceneError if the file is too small for ``count`` Gaussians of ``packed_bytes`` each."""
+    harmonics = min(12 * num_higher * count, max_array_bytes(budget.file_bytes))  # bytes in memory
     num_bytes = count * (packed_bytes + GAUSSIAN_BYTES) + harmonics + _UNPACKING
     budget.check_memory(num_bytes, f"{count:,} Gaussians")
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
-    """Convert Gaussians to columns with harmonics up to ``max_degree``; ValueError if a row is not finite."""
+    """Convert Gaussians to columns with harmonics up to ``max_degree``; ValueError if a row is not finite.
+
+    ``first_row``: number of the first Gaussian, for the error.
+    """
 
     def check(values: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):
-            bad = np.argwhere(~np.isfinite(values.astype(np.float32)))  # no format holds larger numbers
-        if len(bad):
-            raise ValueError(f"expected finite Gaussians, got NaN or inf in row {first_row + int(bad[0, 0])}")
+            nonfinite = np.argwhere(~np.isfinite(values.astype(np.float32)))  # no format holds larger numbers
+        if len(nonfinite):
+            raise ValueError(f"expected finite Gaussians, got NaN or inf in row {first_row + int(nonfinite[0, 0])}")
         return values
 
     def array(values: Array) -> np.ndarray:
@@ -318,19 +321,26 @@ def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns
     """Return a function that rotates Gaussians by an orthogonal matrix ``[3,3]``, which may mirror them."""
     if np.array_equal(rotation, np.eye(3)):
         return lambda columns: columns
-    # Its determinant: a mirrored ellipsoid is the same as one turned by the negative matrix
+    # A mirror acts on an ellipsoid as the rotation by the negative matrix does; the sign is that of the determinant
     sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())
     quat = rotmat_to_quat(sign * rotation[None])[0]
-    turn = harmonics_rotation(num_higher, rotation) if num_higher else np.zeros((0, 0))
-    turn = np.where(np.abs(turn - np.round(turn)) < _EXACT, np.round(turn), turn)
-    is_diagonal = np.array_equal(turn, np.diag(np.diagonal(turn)))  # as for half turns
-    signs = np.diagonal(turn)[:, None] if is_diagonal else None
+    rotate_harmonics = _harmonics_rotator(rotation, num_higher)
     return lambda columns: replace(
         columns,
         means=matmul(columns.means, rotation.T),
         quats=multiply_quats(quat, columns.quats),
-        harmonics=apply_harmonics_rotation(columns.harmonics, turn) if signs is None else columns.harmonics * signs,
+        harmonics=rotate_harmonics(columns.harmonics),
     )
+
+
+def _harmonics_rotator(rotation: np.ndarray, num_higher: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that rotates ``harmonics [n,num_higher,3]`` by a matrix ``[3,3]``."""
+    matrix = harmonics_rotation(num_higher, rotation) if num_higher else np.zeros((0, 0))
+    matrix = np.where(np.abs(matrix - np.round(matrix)) < _EXACT, np.round(matrix), matrix)
+    signs = np.diagonal(matrix)[:, None]
+    if np.array_equal(matrix, np.diag(np.diagonal(matrix))):  # such as for a half turn
+        return lambda harmonics: harmonics * signs
+    return lambda harmonics: apply_harmonics_rotation(harmonics, matrix)
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:

@@ -21,10 +21,10 @@ _MOMENT = "save one moment as a .ply, with positions, rotations and opacities of
 class ColumnKind:
     """Columns with one meaning."""
 
-    what: str  # their content; empty: they do not change renders
-    names: str  # a pattern of their names
-    effect: str = ""  # the effect of leaving them out
-    remedy: str = ""  # for the error by which files with them are refused; empty: a note names the columns
+    what: str  # their content; empty for columns that do not change renders
+    names: str  # regular expression of their names
+    effect: str = ""  # what changes without them
+    remedy: str = ""  # files with these columns are refused with it; empty: a note names the columns
 
 
 # Kinds are tried in this order; the note lists columns of floats without a kind as unknown
@@ -69,7 +69,7 @@ COLUMN_KINDS = (
     ),
 )  # fmt: skip
 _PATTERNS = tuple(re.compile(kind.names, re.IGNORECASE) for kind in COLUMN_KINDS)
-_NUMBERS = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}  # of 1, 2 and 4 bytes
+_NUMBERS = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}  # types of 1, 2 and 4 bytes
 
 
 def _find_kind(name: str) -> ColumnKind | None:
@@ -81,8 +81,8 @@ def _find_kind(name: str) -> ColumnKind | None:
 def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
     """Return a note on unused columns and elements that would change renders; empty if there are none.
 
-    ``layers``: names of elements with more Gaussians. SceneError for columns without which the file is no scene, and
-    for columns of Gaussians that are whole numbers.
+    ``layers``: names of elements with more Gaussians. SceneError if a column shows that the file alone is no scene, or
+    if a column of Gaussians has whole numbers.
     """
     _check_types(path, row)
     by_kind: dict[ColumnKind | None, list[str]] = {}
@@ -107,10 +107,11 @@ def _check_types(path: Path, row: np.dtype[np.void]) -> None:
     """Raise SceneError if columns of Gaussians are whole numbers; plain colours may be bytes."""
     colors = arrays.color_columns(row.names)
     for name in row.names or ():
-        number, used = row[name], name in (*arrays.REQUIRED, *colors, arrays.FILTER) or name.startswith("f_rest_")
-        if used and number.kind != "f" and not (number == np.uint8 and name in colors and colors != arrays.SH0):
-            kind = _NUMBERS[number.kind][number.itemsize // 2]
-            problem = f"expected {name} as float, found {kind}, which may be half floats or indices of a codebook"
+        dtype, is_used = row[name], name in (*arrays.REQUIRED, *colors, arrays.FILTER) or name.startswith("f_rest_")
+        is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
+        if is_used and dtype.kind != "f" and not is_color_byte:
+            type_name = _NUMBERS[dtype.kind][dtype.itemsize // 2]
+            problem = f"expected {name} as float, found {type_name}, which may be half floats or indices of a codebook"
             raise SceneError(path, problem, "export it with floats")
 
 
@@ -121,7 +122,7 @@ def describes_places(name: str) -> bool:
 
 
 def list_names(names: Sequence[str]) -> str:
-    """List the names of columns for a message: the first six, and the number of the others."""
-    num_more = len(names) - _MAX_NAMES
+    """List the names of columns for a message: the first six names, and the number of further names."""
+    num_unlisted = len(names) - _MAX_NAMES
     listed = ", ".join(name[:_MAX_CHARACTERS] for name in names[:_MAX_NAMES])
-    return listed + (f" and {num_more} more" if num_more > 0 else "")
+    return listed + (f" and {num_unlisted} more" if num_unlisted > 0 else "")

@@ -1,4 +1,6 @@
-"""Read compressed PLY files (PlayCanvas, SuperSplat, gsplat): four packed words per Gaussian, ranges per chunk of 256.
+"""Read compressed PLY files of PlayCanvas, SuperSplat and gsplat.
+
+Each Gaussian has four packed words, and each chunk of 256 Gaussians has ranges of their values.
 
 The layout is that of PlayCanvas' reader. Positions and scales have 11, 10 and 11 bits between a chunk's minimum and
 maximum. Rotations are their three smaller components at 10 bits, colours and opacities have 8 bits, and harmonics are
@@ -10,7 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyListProperty
+from plyfile import PlyData, PlyElement, PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
@@ -19,24 +21,19 @@ from gsmerge.io.formats.arrays import PACKED
 from gsmerge.kernels.elementary import log, log1p
 
 CHUNK = 256  # Gaussians that share a range
-RANGES = (
-    *(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"),
-    *(f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"),
-)
-COLORS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
+_POSITION_RANGES = tuple(f"{bound}_{axis}" for bound in ("min", "max") for axis in "xyz")
+_SCALE_RANGES = tuple(f"{bound}_scale_{axis}" for bound in ("min", "max") for axis in "xyz")
+RANGES = (*_POSITION_RANGES, *_SCALE_RANGES)
+COLORS = tuple(f"{bound}_{channel}" for bound in ("min", "max") for channel in "rgb")
 SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
-_HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE  # of each byte
+_HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE  # by stored byte
 
 
 def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
     """Return the rows of a compressed PLY as rows of an ordinary PLY, with opacities as logits."""
     vertex, chunk = data["vertex"], data["chunk"]
-    for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
-        dtypes = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
-        wrong = next((name for name in needed if dtypes.get(name) not in types), None)
-        if wrong is not None:
-            where, kind = f"in element '{element.name}' of a compressed file", dtypes.get(wrong, "none")
-            raise SceneError(path, f"expected {wrong} {where} as {types[0]}, found {kind}", "export it again")
+    _check_types(path, vertex, PACKED, ("u4", "i4"))
+    _check_types(path, chunk, RANGES, ("f4", "f8"))
     count, num_chunks = vertex.count, -(-vertex.count // CHUNK)
     if count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices", "export it again")
@@ -47,10 +44,19 @@ def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
     return arrays.pack_rows([arrays.Packed(count, num_higher, lambda block: _unpack(data, num_higher, block))])
 
 
+def _check_types(path: Path, element: PlyElement, columns: tuple[str, ...], types: tuple[str, str]) -> None:
+    """Raise SceneError if an element lacks a column, or stores it in another type than ``types``."""
+    stored = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
+    wrong = next((name for name in columns if stored.get(name) not in types), None)
+    if wrong is not None:
+        place, found = f"in element '{element.name}' of a compressed file", stored.get(wrong, "none")
+        raise SceneError(path, f"expected {wrong} {place} as {types[0]}, found {found}", "export it again")
+
+
 def _unpack(data: PlyData, num_higher: int, block: slice) -> arrays.Columns:
     vertex, chunk = data["vertex"].data[block], data["chunk"].data
     words = {name: vertex[name].astype(np.uint32) for name in PACKED}
-    ids = np.arange(block.start, block.stop) // CHUNK
+    chunk_ids = np.arange(block.start, block.stop) // CHUNK
     *colors, alpha = _shares(words["packed_color"], (8, 8, 8, 8))
     largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # of wxyz
     smallest = np.stack(_shares(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
@@ -58,11 +64,11 @@ def _unpack(data: PlyData, num_higher: int, block: slice) -> arrays.Columns:
     for i in range(3 * num_higher):
         codes[:, i] = data["sh"].data[f"f_rest_{i}"][block]
     return arrays.Columns(
-        means=_between(_shares(words["packed_position"], (11, 10, 11)), chunk, RANGES[:6], ids),
+        means=_between(_shares(words["packed_position"], (11, 10, 11)), chunk, _POSITION_RANGES, chunk_ids),
         quats=arrays.from_smallest_three(largest, smallest * np.sqrt(2.0)),
-        log_scales=_between(_shares(words["packed_scale"], (11, 10, 11)), chunk, RANGES[6:], ids),
+        log_scales=_between(_shares(words["packed_scale"], (11, 10, 11)), chunk, _SCALE_RANGES, chunk_ids),
         opacities=log(alpha) - log1p(-alpha),  # infinite for 0 and 1, which the reader accepts
-        sh0=rgb_to_sh0(_between(colors, chunk, COLORS, ids)),
+        sh0=rgb_to_sh0(_between(colors, chunk, COLORS, chunk_ids)),
         harmonics=_HARMONICS[codes.reshape(len(vertex), 3, num_higher).transpose(0, 2, 1)],
     )
 
@@ -78,15 +84,19 @@ def _num_rest(path: Path, data: PlyData, count: int) -> int:
     return number
 
 
-def _between(shares: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...], ids: np.ndarray) -> np.ndarray:
-    """Interpolate between the minima and maxima of chunks to numbers ``[n,3]``; without ranges, return the shares.
+def _between(shares: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...], chunk_ids: np.ndarray) -> np.ndarray:
+    """Interpolate between the minima and maxima of chunks; return numbers ``[n,3]``.
+
+    If the file lacks these ranges, the shares are the numbers.
 
     ``shares``: three arrays ``[n]`` in [0, 1]. ``ranges``: names of the columns with the minima, then of the maxima.
-    ``ids``: the chunk of each Gaussian.
+    ``chunk_ids [n]``: the chunk of each Gaussian.
     """
     if all(name in (chunk.dtype.names or ()) and chunk.dtype[name].kind == "f" for name in ranges):
-        ends = [chunk[name][ids].astype(np.float32) for name in ranges]
-        shares = [low * (1 - share) + high * share for share, low, high in zip(shares, ends, ends[3:], strict=False)]
+        bounds = [chunk[name][chunk_ids].astype(np.float32) for name in ranges]
+        shares = [
+            low * (1 - share) + high * share for share, low, high in zip(shares, bounds[:3], bounds[3:], strict=True)
+        ]
     return np.stack(shares, 1)
 
 

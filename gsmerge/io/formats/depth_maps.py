@@ -18,7 +18,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project_points, rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, read_budget
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, StoredView, make_camera_file
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, FLIP, W2C_OPENCV, CameraFile, StoredView, make_camera_file
 from gsmerge.io.cameras.camera_source import CameraSource
 from gsmerge.io.cameras.npz_files import (
     array_names,
@@ -44,11 +44,11 @@ PLACES = (  # in a folder, besides the frames
 SIGMA, OPACITY = 0.6, 0.7  # standard deviation (pixels) and opacity of each Gaussian
 _GREY = 128
 _SAMPLE_PIXELS = 1000  # pixels of a view whose depths are compared with those of the next view
-_SAME = 0.05  # largest relative difference of depths that agree
+_MAX_DEPTH_DIFFERENCE = 0.05  # relative; depths with a smaller difference agree
 # With right poses at least 1.9 times as many pixels agree as with wrong poses, on each of 15 captures
 _MIN_AGREEMENT, _MIN_RATIO = 0.2, 1.5
-_PIXEL_BYTES = 11  # of a pixel before it is unpacked, at most: a float64 and three colours
-_KEPT_BYTES = 128 << 20  # of images in memory; if there are more, they are read at each use
+_PIXEL_BYTES = 11  # bytes of a packed pixel, at most: a float64 and three colours
+_KEPT_BYTES = 128 << 20  # images up to this size stay in memory; larger ones are read at each use
 
 
 def find_depth_maps(folder: Path) -> list[Path]:
@@ -133,32 +133,35 @@ def _read_views(path: Path) -> tuple[np.ndarray, CameraFile]:
 
 def _check_poses(path: Path, depths: np.ndarray, cameras: CameraFile) -> None:
     """Raise SceneError if depth maps agree far better with the poses of another convention."""
-    axes, given, inverted = np.diag([1.0, -1, -1, 1]), cameras.viewmats, invert(cameras.viewmats)
+    inverted = invert(cameras.viewmats)
     conventions = {
         "the inverse matrices": inverted,
-        "OpenGL's axes": matmul(axes, given),
-        "the inverse matrices and OpenGL's axes": matmul(axes, inverted),
+        "OpenGL's axes": matmul(FLIP, cameras.viewmats),
+        "the inverse matrices and OpenGL's axes": matmul(FLIP, inverted),
     }
     shares = ((_agreement(depths, replace(cameras, viewmats=poses)), name) for name, poses in conventions.items())
-    most, name = max(shares)
-    if most > max(_MIN_AGREEMENT, _MIN_RATIO * (share := _agreement(depths, cameras))):
+    best_share, best_name = max(shares)
+    share = _agreement(depths, cameras)
+    if best_share > max(_MIN_AGREEMENT, _MIN_RATIO * share):
         problem = f"expected poses with which depth maps agree, found {share:.0%} of pixels that agree"
-        raise SceneError(path, f"{problem}, but {most:.0%} with {name}", "write the poses in that convention")
+        raise SceneError(
+            path, f"{problem}, but {best_share:.0%} with {best_name}", "write the poses in that convention"
+        )
 
 
 def _agreement(depths: np.ndarray, cameras: CameraFile) -> float:
     """Return the share of sampled pixels whose depth agrees with the depth map of the next view."""
     (count, height, width), poses = depths.shape, cameras.viewmats
-    some = slice(None, None, max(1, height * width // _SAMPLE_PIXELS))
+    sample = slice(None, None, max(1, height * width // _SAMPLE_PIXELS))
     views = zip(depths, np.zeros((*depths.shape, 3), np.uint8), cameras.Ks, poses, strict=True)
-    points = np.stack([_pack(*view).unpack(some).means for view in views])
-    after = (np.arange(count) + 1) % count
-    with np.errstate(all="ignore"):  # of pixels without a depth, or behind a view
-        places, projected = project_points(points, poses[after], cameras.Ks[after])  # pixels and depths
-        inside = (projected > 0) & (places >= 0).all(-1) & (places < (width, height)).all(-1)
-        column, row = places[inside].astype(np.int64).T
-        ratios = depths[after[np.nonzero(inside)[0]], row, column] / projected[inside]
-    return float((np.abs(ratios - 1) < _SAME).sum() / max(inside.size, 1))
+    points = np.stack([_pack(*view).unpack(sample).means for view in views])
+    next_views = (np.arange(count) + 1) % count
+    with np.errstate(all="ignore"):  # pixels without a depth, or behind a view
+        pixels, projected_depths = project_points(points, poses[next_views], cameras.Ks[next_views])
+        inside = (projected_depths > 0) & (pixels >= 0).all(-1) & (pixels < (width, height)).all(-1)
+        columns, rows = pixels[inside].astype(np.int64).T
+        ratios = depths[next_views[np.nonzero(inside)[0]], rows, columns] / projected_depths[inside]
+    return float((np.abs(ratios - 1) < _MAX_DEPTH_DIFFERENCE).sum() / max(inside.size, 1))
 
 
 def _pack(depth: np.ndarray, image: np.ndarray, K: np.ndarray, viewmat: np.ndarray) -> Packed:

@@ -31,25 +31,25 @@ def read_extra_columns(info: FileInfo) -> np.ndarray:
 
 def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
     """Join the columns of files, row after row; also return the names of columns that are not the same in all files."""
-    kinds = [{name: part.dtype[name] for name in part.dtype.names or ()} for part in parts]
-    names = dict.fromkeys(name for kind in kinds for name in kind)
-    common = [name for name in names if len({kind.get(name) for kind in kinds}) == 1]
-    out = np.empty(sum(map(len, parts)), [(name, kinds[0][name]) for name in common])
+    types = [{name: part.dtype[name] for name in part.dtype.names or ()} for part in parts]  # by column, for each file
+    names = dict.fromkeys(name for file_types in types for name in file_types)
+    common = [name for name in names if len({file_types.get(name) for file_types in types}) == 1]
+    out = np.empty(sum(map(len, parts)), [(name, types[0][name]) for name in common])
     for name in common:
         out[name] = np.concatenate([part[name] for part in parts])
     return out, [name for name in names if name not in common]
 
 
-def describe_extra_columns(columns: np.ndarray, missing: Sequence[str], chosen: Format, *, moves: bool) -> list[str]:
-    """Note which columns a file of the ``chosen`` format keeps: one sentence each, without a full stop.
+def describe_extra_columns(columns: np.ndarray, missing: Sequence[str], format_: Format, *, moves: bool) -> list[str]:
+    """Note which columns a file of a format keeps: one sentence each, without a full stop.
 
-    ``missing``: columns that not all inputs have. ``moves``: whether Gaussians are moved or turned.
+    ``missing``: columns that some inputs lack. ``moves``: Gaussians are moved or rotated.
     """
     names, notes = list(columns.dtype.names or ()), list[str]()
     if missing:
         notes.append(f"columns that some files lack or have in other types are left out: {list_names(missing)}")
-    if names and chosen is not PLY:
-        notes.append(f"columns that {chosen.ending} cannot store are left out: {list_names(names)}")
+    if names and format_ is not PLY:
+        notes.append(f"columns that {format_.ending} cannot store are left out: {list_names(names)}")
     elif names:
         notes.append(f"columns that are copied unchanged: {list_names(names)}")
         positions = [name for name in names if describes_places(name)]

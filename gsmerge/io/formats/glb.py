@@ -3,8 +3,8 @@
 The axis y points up in glTF, and down in a ``.ply``. Therefore the writer rotates Gaussians by half a turn about z, and
 the reader rotates them back. Viewers that do not know the extension show points in the base colours.
 
-Drafts of the extension are read as well. They have logarithms of scales, of which some are negative, and attributes
-``_ROTATION``, ``_SCALE`` and ``COLOR_0``. Cesium writes a ``.spz`` instead of the values.
+Drafts of the extension are read as well. They store logarithms of scales, recognised by negative values, and use the
+attributes ``_ROTATION``, ``_SCALE`` and ``COLOR_0``. Cesium writes a ``.spz`` instead of the values.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
-_MAX_STRIDE = 252  # largest number of bytes from a value to the next that glTF allows
-_STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # of a budget's 20 microseconds
-_PLACEMENT = {"matrix", "rotation", "scale", "translation"}  # keys of a node with a transform of its own
+_MAX_STRIDE = 252  # bytes from a value to the next, the limit of glTF
+_STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadBudget
+_TRANSFORMS = {"matrix", "rotation", "scale", "translation"}  # keys of a node with a transform of its own
 _TOLERANCE = 1e-3  # largest difference of the scales of a node's axes, and largest cosine between two axes
 
 
@@ -64,30 +64,20 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     """
     columns = to_columns(gaussians, MAX_DEGREE)
     attributes = _attributes(turn_half(columns))
-    at, views = 0, []
-    accessors: list[dict[str, Any]] = []
-    for array in attributes.values():
-        padded = {"byteStride": 4} if array.strides[0] == 4 and array.shape[1] == 1 else {}
-        size = len(array) * array.strides[0]
-        views.append({"buffer": 0, "byteOffset": at, "byteLength": size, **padded, "target": _VERTICES})
-        kind = {"componentType": _COMPONENTS[array.dtype.str]} | (
-            {} if array.dtype.kind == "f" else {"normalized": True}
-        )
-        accessors.append({"bufferView": len(accessors), **kind, "count": len(array), "type": _TYPES[array.shape[1]]})
-        at += size
-    for name, end in (("min", np.min), ("max", np.max)):  # glTF asks for the bounds of positions
-        accessors[0][name] = end(attributes["POSITION"], axis=0).tolist()
+    views, accessors = _describe_arrays(list(attributes.values()))
+    for name, bound in (("min", np.min), ("max", np.max)):  # glTF asks for the bounds of positions
+        accessors[0][name] = bound(attributes["POSITION"], axis=0).tolist()
     content = b"".join((array if array.base is None else array.base).tobytes() for array in attributes.values())
     splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
     splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
-    places = {name: i for i, name in enumerate(attributes)}
+    accessor_ids = {name: i for i, name in enumerate(attributes)}
     document = {
         "asset": {"version": "2.0", "generator": "gsmerge"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "extensionsUsed": [NAME],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": places, "mode": _POINTS, "extensions": {NAME: splats}}]}],
+        "meshes": [{"primitives": [{"attributes": accessor_ids, "mode": _POINTS, "extensions": {NAME: splats}}]}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": len(content)}],
@@ -97,21 +87,36 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     return _HEADER.pack(b"glTF", 2, _HEADER.size + len(chunks)) + chunks
 
 
+def _describe_arrays(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return the buffer views and the accessors of glTF for arrays ``[n,width]`` that follow each other in a buffer."""
+    views, accessors, offset = list[dict[str, Any]](), list[dict[str, Any]](), 0
+    for view_id, array in enumerate(arrays):
+        row_bytes, width = array.strides[0], array.shape[1]
+        size = len(array) * row_bytes
+        stride = {"byteStride": 4} if row_bytes == 4 and width == 1 else {}  # rows of two bytes are padded
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, **stride, "target": _VERTICES})
+        number: dict[str, Any] = {"componentType": _COMPONENTS[array.dtype.str]}
+        number |= {} if array.dtype.kind == "f" else {"normalized": True}
+        accessors.append({"bufferView": view_id, **number, "count": len(array), "type": _TYPES[width]})
+        offset += size
+    return views, accessors
+
+
 def _attributes(columns: Columns) -> dict[str, np.ndarray]:
     """Return the attributes ``[n,width]`` by name; rows of two bytes are padded to four, as glTF requires."""
-    wide = np.zeros((len(columns), 2), "<u2")
-    wide[:, 0] = np.rint(columns.opacities.clip(0, 1) * 65535)
+    padded_opacities = np.zeros((len(columns), 2), "<u2")
+    padded_opacities[:, 0] = np.rint(columns.opacities.clip(0, 1) * 65535)
     values = {
         "POSITION": columns.means.astype("<f4"),
         f"{NAME}:ROTATION": np.rint(32767 * np.roll(columns.quats, -1, axis=1)).astype("<i2"),  # xyzw
         f"{NAME}:SCALE": exp(columns.log_scales).astype("<f4"),
-        f"{NAME}:OPACITY": wide[:, :1],
+        f"{NAME}:OPACITY": padded_opacities[:, :1],
         HARMONICS[0]: columns.sh0.astype("<f4"),
     }
     for name, harmonic in zip(HARMONICS[1:], columns.harmonics.transpose(1, 0, 2), strict=False):
         values[name] = harmonic.astype("<f4")
-    shown = np.concatenate([_to_linear(columns.colors.clip(0, 1)), columns.opacities[:, None]], 1)
-    return values | {"COLOR_0": to_bytes(255 * shown)}
+    rgba = np.concatenate([_to_linear(columns.colors.clip(0, 1)), columns.opacities[:, None]], 1)
+    return values | {"COLOR_0": to_bytes(255 * rgba)}
 
 
 def _to_linear(colors: np.ndarray) -> np.ndarray:
@@ -127,7 +132,7 @@ def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:
 def holds_gaussians(path: Path) -> bool:
     """Return whether a ``.glb`` uses the extension for Gaussians.
 
-    True also for a file that cannot be read, so that its reader reports the error.
+    A file that cannot be read also returns True, so that its reader reports the error.
     """
     try:
         with _damage(path), path.open("rb") as file:
@@ -139,12 +144,13 @@ def holds_gaussians(path: Path) -> bool:
 def read_rows(path: Path) -> StoredRows:
     """Read all Gaussians of a ``.glb`` in the frame of a ``.ply``; SceneError if it has none or is damaged."""
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
-    with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):  # rows with NaN or inf are set aside later
+    with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
         document = _read_document(file, budget)
         content = _Content(budget, file, document, file.tell(), budget.file_bytes)
-        for mesh, place in _walk_splats(document, budget):
+        for primitive, transform in _walk_splats(document, budget):
             budget.check_steps(_STEPS_PER_PART * len(parts), "steps for meshes")
-            parts.append(_read_splats(content, mesh, place, sizes, sum(part.count for part in parts)))
+            count_before = sum(part.count for part in parts)
+            parts.append(_read_splats(content, primitive, transform, sizes, count_before))
     if not parts:
         problem = f"expected Gaussians ({NAME}), found a .glb of points or a mesh"
         raise SceneError(path, problem, "name the .ply that the model wrote beside it")
@@ -168,26 +174,26 @@ class _ForeignError(ValueError):
 
 @dataclass(frozen=True)
 class _Values:
-    """Stored values ``[n,width]`` of an accessor; a block of them is returned as float64."""
+    """Stored values ``[n,width]`` of an accessor; an index with a slice returns its rows as float64."""
 
     stored: np.ndarray
-    most: int  # stored number of the value 1
+    unit: int  # stored number of the value 1; 1 if values are stored as they are
 
     def __getitem__(self, block: slice) -> np.ndarray:
         rows = self.stored[block]
-        return np.maximum(rows / self.most, -1) if self.most > 1 else rows.astype(np.float64)
+        return np.maximum(rows / self.unit, -1) if self.unit > 1 else rows.astype(np.float64)
 
 
 @dataclass(frozen=True)
 class _Content:
-    """The content of a ``.glb``, whose binary chunk is read part by part."""
+    """The content of a ``.glb``; its binary chunk is read part by part."""
 
     budget: ReadBudget
     file: IO[bytes]
     document: dict[str, Any]
     start: int  # of the binary chunk, in bytes from the start of the file
     end: int
-    num_read: list[int] = field(default_factory=lambda: [0])  # bytes of all parts so far, at most those of the chunk
+    num_read: list[int] = field(default_factory=lambda: [0])  # bytes read so far, at most the size of the chunk
 
     def packed(self, view_id: int) -> bytes:
         """Read the bytes of a buffer view, which must lie in the chunk."""
@@ -215,13 +221,14 @@ class _Content:
         if view.get("extensions") or view["buffer"] != 0 or "uri" in self.document["buffers"][0]:
             raise _ForeignError(f"one with compressed values or values in another file ({list(view)})")
         dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
-        each, first = dtype.itemsize * width, accessor.get("byteOffset", 0)
-        count, stride = check_whole(accessor["count"], "count", 1), view.get("byteStride", each)
-        span, at = (count - 1) * stride + each, self.start + view.get("byteOffset", 0) + first
-        self.num_read[0] += count * each
-        inside = first >= 0 and first + span <= view["byteLength"] and self.start <= at and at + span <= self.end
-        if not each <= stride <= _MAX_STRIDE or not inside:
-            raise _ForeignError(f"a truncated one, of {self.end} bytes without {count} values of {each} bytes")
+        row_bytes, offset = dtype.itemsize * width, accessor.get("byteOffset", 0)
+        count, stride = check_whole(accessor["count"], "count", 1), view.get("byteStride", row_bytes)
+        span, at = (count - 1) * stride + row_bytes, self.start + view.get("byteOffset", 0) + offset
+        self.num_read[0] += count * row_bytes
+        in_view = offset >= 0 and offset + span <= view["byteLength"]
+        in_chunk = self.start <= at and at + span <= self.end
+        if not row_bytes <= stride <= _MAX_STRIDE or not (in_view and in_chunk):
+            raise _ForeignError(f"a truncated one, of {self.end} bytes without {count} values of {row_bytes} bytes")
         rows = np.ndarray((count, width), dtype, self._read(at, span), strides=(stride, dtype.itemsize))
         return _Values(np.ascontiguousarray(rows), np.iinfo(dtype).max if accessor.get("normalized") else 1)
 
@@ -248,20 +255,20 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> dict[str, Any]:
 
 
 def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Yield the primitives that hold Gaussians, each with its matrix ``[4,4]`` into the frame of a ``.ply``."""
-    scenes, nodes, seen = document.get("scenes") or [{}], document.get("nodes", []), set[int]()
+    """Yield each primitive of Gaussians with the matrix ``[4,4]`` from its frame to that of a ``.ply``."""
+    scenes, nodes, visited = document.get("scenes") or [{}], document.get("nodes", []), set[int]()
     budget.check_steps(_STEPS_PER_NODE * len(nodes), "steps for nodes")
     stack = [(node_id, _HALF_TURN) for node_id in scenes[document.get("scene", 0)].get("nodes", [])]
     while stack:
-        node_id, above = stack.pop()
-        if node_id in seen:
+        node_id, parent_transform = stack.pop()
+        if node_id in visited:
             raise _ForeignError(f"one with two parents of node {node_id}")
-        seen.add(node_id)
+        visited.add(node_id)
         node = nodes[node_id]
-        place = above if _PLACEMENT.isdisjoint(node) else matmul(above, _node_matrix(node))
+        transform = parent_transform if _TRANSFORMS.isdisjoint(node) else matmul(parent_transform, _node_matrix(node))
         primitives = document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []
-        yield from ((primitive, place) for primitive in primitives if NAME in primitive.get("extensions", {}))
-        stack += [(child, place) for child in reversed(node.get("children", []))]
+        yield from ((primitive, transform) for primitive in primitives if NAME in primitive.get("extensions", {}))
+        stack += [(child, transform) for child in reversed(node.get("children", []))]
 
 
 def _node_matrix(node: dict[str, Any]) -> np.ndarray:
@@ -275,60 +282,98 @@ def _node_matrix(node: dict[str, Any]) -> np.ndarray:
 
 
 def _read_splats(
-    content: _Content, primitive: dict[str, Any], place: np.ndarray, sizes: dict[str, int], count_before: int
+    content: _Content, primitive: dict[str, Any], transform: np.ndarray, sizes: dict[str, int], count_before: int
 ) -> Packed:
-    """Read one primitive, move it by the matrix ``place [4,4]``, and add its bytes to ``sizes`` by attribute.
+    """Read one primitive, apply the matrix ``transform [4,4]``, and add its bytes to ``sizes`` by attribute.
 
     ``count_before``: number of Gaussians in the primitives before it; all share the file's budget.
     """
-    splats, attributes = primitive["extensions"][NAME], primitive.get("attributes", {})
-    kernel, space = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
-    more = dict(splats.get("extensions") or {})
-    spz_part = next((more.pop(name) for name in SPZ_NAMES if name in more), None)
-    if more or (kernel, space) != ("ellipse", COLOR_SPACE):
-        raise _ForeignError(f"Gaussians of another kind ({', '.join(map(str, more or (kernel, space)))})")
-    if spz_part is not None:
-        rows, _, _, parts = spz.unpack_rows(content.budget, content.packed(spz_part["bufferView"]), count_before)
-        sizes.update({name: sizes.get(name, 0) + size for name, size in parts.items()})
-        turn = _mover(place, rows.num_higher)
-        return replace(rows, unpack=lambda block: turn(rows.unpack(block)))
+    spz_extension = _find_spz(primitive["extensions"][NAME])
+    if spz_extension is None:
+        return _read_attributes(_Attributes(content, primitive.get("attributes", {}), sizes), transform)
+    packed = content.packed(spz_extension["bufferView"])
+    rows, _, _, spz_sizes = spz.unpack_rows(content.budget, packed, count_before)
+    sizes.update({name: sizes.get(name, 0) + size for name, size in spz_sizes.items()})
+    transform_columns = _transformer(transform, rows.num_higher)
+    return replace(rows, unpack=lambda block: transform_columns(rows.unpack(block)))
 
-    def read(kind: str, width: int, *names: str) -> _Values:
-        name = next((name for name in names if name in attributes), None)
+
+def _find_spz(splats: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the extension of a primitive that names a ``.spz``; None if the values are stored as attributes."""
+    kernel, space = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
+    unknown = dict(splats.get("extensions") or {})
+    spz_extension = next((unknown.pop(name) for name in SPZ_NAMES if name in unknown), None)
+    if unknown or (kernel, space) != ("ellipse", COLOR_SPACE):
+        raise _ForeignError(f"Gaussians of another kind ({', '.join(map(str, unknown or (kernel, space)))})")
+    return spz_extension
+
+
+@dataclass(frozen=True)
+class _Attributes:
+    """The attributes of a primitive; ``read`` adds the bytes of each to ``sizes``."""
+
+    content: _Content
+    accessor_ids: dict[str, Any]  # by name of the attribute
+    sizes: dict[str, int]  # bytes by attribute of Gaussians
+
+    def read(self, kind: str, width: int, *names: str) -> _Values:
+        """Read the first of the named attributes that exists, whose values have ``width`` numbers."""
+        name = next((name for name in names if name in self.accessor_ids), None)
         if name is None:
             raise _ForeignError(f"one whose Gaussians have no {names[0]}")
-        before = content.num_read[0]
-        values = content.values(attributes[name])
+        bytes_before = self.content.num_read[0]
+        values = self.content.values(self.accessor_ids[name])
         if values.stored.shape[1] != width:
             raise _ForeignError(f"one with {values.stored.shape[1]} numbers of {name} per Gaussian")
-        sizes[kind] = sizes.get(kind, 0) + content.num_read[0] - before
+        self.sizes[kind] = self.sizes.get(kind, 0) + self.content.num_read[0] - bytes_before
         return values
 
-    means, scales = read("means", 3, "POSITION"), read("scales", 3, f"{NAME}:SCALE", "_SCALE")
-    quats, names = read("quats", 4, f"{NAME}:ROTATION", "_ROTATION"), _harmonic_names(attributes)
-    if names:
-        sh0, *harmonics = [read("shN" if i else "sh0", 3, name) for i, name in enumerate(names)]
-        opacities = read("opacities", 1, f"{NAME}:OPACITY")
+
+@dataclass(frozen=True)
+class _Colors:
+    """The attributes of colours and opacities: two attributes, or RGBA as ``sh0`` alone in drafts."""
+
+    sh0: _Values
+    opacities: _Values | None  # None: ``sh0`` is RGBA
+
+    @property
+    def attributes(self) -> list[_Values]:
+        return [self.sh0] if self.opacities is None else [self.sh0, self.opacities]
+
+    def unpack(self, block: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Return harmonics of degree 0 ``[b,3]`` and opacities ``[b]``."""
+        colors = self.sh0[block]
+        if self.opacities is None:
+            return rgb_to_sh0(colors[:, :3]), colors[:, 3]
+        return colors, self.opacities[block][:, 0]
+
+
+def _read_attributes(attributes: _Attributes, transform: np.ndarray) -> Packed:
+    """Read Gaussians that are stored as attributes, and apply the matrix ``transform [4,4]``."""
+    means, scales = attributes.read("means", 3, "POSITION"), attributes.read("scales", 3, f"{NAME}:SCALE", "_SCALE")
+    quats = attributes.read("quats", 4, f"{NAME}:ROTATION", "_ROTATION")
+    harmonic_names = _harmonic_names(attributes.accessor_ids)
+    if harmonic_names:
+        sh0, *harmonics = [attributes.read("shN" if i else "sh0", 3, name) for i, name in enumerate(harmonic_names)]
+        colors = _Colors(sh0, attributes.read("opacities", 1, f"{NAME}:OPACITY"))
     else:
-        sh0, harmonics, opacities = read("sh0", 4, "COLOR_0"), [], None
+        colors, harmonics = _Colors(attributes.read("sh0", 4, "COLOR_0"), None), []
     count = len(means.stored)
-    columns = (quats, scales, sh0, *([] if opacities is None else [opacities]), *harmonics)
-    if any(len(column.stored) != count for column in columns):
+    if any(len(values.stored) != count for values in (quats, scales, *colors.attributes, *harmonics)):
         raise _ForeignError(f"one whose attributes do not all have {count} values, one per Gaussian")
-    are_logs, move = are_logarithms(scales.stored), _mover(place, len(harmonics))
+    are_logs, transform_columns = are_logarithms(scales.stored), _transformer(transform, len(harmonics))
 
     def unpack(block: slice) -> Columns:
-        colors = sh0[block]
-        return move(
+        sh0, opacities = colors.unpack(block)
+        no_harmonics = np.zeros((len(sh0), 0, 3))
+        return transform_columns(
             Columns(
                 means=means[block],
-                quats=np.roll(quats[block], 1, axis=1),
+                quats=np.roll(quats[block], 1, axis=1),  # xyzw to wxyz
                 log_scales=scales[block] if are_logs else log(scales[block]),
-                opacities=colors[:, 3] if opacities is None else opacities[block][:, 0],
-                sh0=rgb_to_sh0(colors[:, :3]) if opacities is None else colors,
-                harmonics=np.stack([values[block] for values in harmonics], 1)
-                if harmonics
-                else np.zeros((len(colors), 0, 3)),
+                opacities=opacities,
+                sh0=sh0,
+                harmonics=np.stack([values[block] for values in harmonics], 1) if harmonics else no_harmonics,
             )
         )
 
@@ -337,20 +382,26 @@ def _read_splats(
 
 def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
     """List the attributes of harmonics up to the highest degree that a primitive contains; empty for drafts."""
-    return HARMONICS[: max(((d + 1) ** 2 for d in range(MAX_DEGREE + 1) if HARMONICS[d**2] in attributes), default=0)]
+    degrees = [degree for degree in range(MAX_DEGREE + 1) if HARMONICS[degree**2] in attributes]
+    return HARMONICS[: (max(degrees) + 1) ** 2] if degrees else []
 
 
-def _mover(place: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
-    """Return a function that moves Gaussians by the matrix ``[4,4]`` of their node, which must be a similarity."""
-    scale = np.sqrt((place[:3, :3] ** 2).sum(0)).mean()
-    rotation = place[:3, :3] / scale
-    oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
-    mirrored = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
-    if mirrored or not (np.isfinite(place).all() and oblique < _TOLERANCE):
+def _transformer(transform: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
+    """Return a function that applies the matrix ``[4,4]`` of a node to Gaussians.
+
+    The matrix must be a similarity: a rotation, a uniform scale and a translation.
+    """
+    scale = np.sqrt((transform[:3, :3] ** 2).sum(0)).mean()
+    rotation, translation = transform[:3, :3] / scale, transform[:3, 3]
+    deviation = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
+    is_mirror = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
+    if is_mirror or not (np.isfinite(transform).all() and deviation < _TOLERANCE):
         raise _ForeignError("one with a node that stretches or mirrors its Gaussians")
-    turn = turner(rotation, num_higher)
-    return lambda columns: replace(
-        turned := turn(columns),
-        means=scale * turned.means + place[:3, 3],
-        log_scales=columns.log_scales + float(log(scale)),
-    )
+    rotate = turner(rotation, num_higher)
+
+    def apply(columns: Columns) -> Columns:
+        rotated = rotate(columns)
+        log_scales = columns.log_scales + float(log(scale))
+        return replace(rotated, means=scale * rotated.means + translation, log_scales=log_scales)
+
+    return apply

@@ -30,7 +30,7 @@ from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 from gsmerge.version import __version__
 
 SCHEMA = 3  # version of the whole file; gsmerge 0.3.0 and earlier wrote lower ones
-HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; the second was written by 0.1
+HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; gsmerge 0.1 wrote the second
 SCENE, FEATURES = "scene", "features"  # kinds
 REMEDY = "run extend again with all batches"
 # Each entry of the header, with its type
@@ -38,7 +38,7 @@ ENTRIES: Mapping[str, type] = {
     "schema": int, "gsmerge": str, "kind": str, "width": int, "height": int, "names": list, "about": dict,
 }  # fmt: skip
 NUM_HIGHER = (0, 3, 8, 15, 24)  # harmonics above degree 0
-_LEAST_SCALE = 1e-30  # whose logarithm is one
+_LEAST_SCALE = 1e-30  # scale that replaces 0, so that its logarithm is finite
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class GsmFile:
         return SceneError(self.path, problem, "copy it again, or " + REMEDY)
 
     def array(self, name: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
-        """Return an array of a type and shape (None: any size); SceneError if it is missing or has another one."""
+        """Return an array of a type and shape (None: any size); SceneError if no array has these."""
         array = self.arrays.get(name)
         expected = f"{name}: expected {dtype.__name__} {['n' if n is None else n for n in shape]}"
         if array is None:
@@ -78,19 +78,21 @@ def write_gsm(path: StrPath, header: Mapping[str, Any], arrays: Mapping[str, np.
     data = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     with atomic_output(path, overwrite=overwrite) as temporary:
         header["checksums"] = _checksums(header, data)
-        temporary.write_bytes(save(data, {HEADER: json.dumps(header)}))  # one entry, since the order of more varies
+        temporary.write_bytes(
+            save(data, {HEADER: json.dumps(header)})
+        )  # one entry, since safetensors varies the order of several
 
 
 def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
     """Compute the CRC-32 of the header without its checksums, and of each array."""
     plain = {name: value for name, value in header.items() if name != "checksums"}
-    text = json.dumps(json.loads(json.dumps(plain)), sort_keys=True)  # with the keys that a reader gets
+    text = json.dumps(json.loads(json.dumps(plain)), sort_keys=True)  # converts keys to text, as a reader sees them
     sums = {"header": zlib.crc32(text.encode("utf-8", "replace"))}
     return sums | {name: zlib.crc32(np.ascontiguousarray(array).tobytes()) for name, array in sorted(arrays.items())}
 
 
 def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
-    """Read a ``.gsm`` of one ``kind``, or of any if it is None; SceneError for other files or a wrong checksum."""
+    """Read a ``.gsm`` of a ``kind``, or of any kind (None); SceneError for other files or a wrong checksum."""
     path = Path(path)
     metadata, arrays = read_tensors(path, "a .gsm file", REMEDY)
     header = _parse_header(path, metadata)
@@ -110,7 +112,7 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Parse the header of a file; SceneError if it is no header of this schema."""
+    """Parse the header of a file; SceneError if there is none or it has another schema."""
     text = metadata.get(HEADER, metadata.get(ENCODED))
     if text is None:
         raise SceneError(path, "expected a .gsm of gsmerge, found another safetensors file", "name the .gsm")
@@ -122,12 +124,12 @@ def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     if schema != SCHEMA:
         newer = isinstance(schema, int) and schema > SCHEMA
         remedy = f"update gsmerge, this is {__version__}" if newer else REMEDY
-        by = header.get("gsmerge") if isinstance(header, dict) else None
-        writer = f" of gsmerge {by!s:.20}" if by else ""
+        version = header.get("gsmerge") if isinstance(header, dict) else None
+        writer = f" of gsmerge {version!s:.20}" if version else ""
         problem = f"expected a .gsm of schema {SCHEMA}, which gsmerge {__version__} reads, found schema {schema!r:.40}"
         raise SceneError(path, f"{problem}{writer}", remedy)
-    for name, entry in ENTRIES.items():
-        if type(header.get(name)) is not entry:
+    for name, entry_type in ENTRIES.items():
+        if type(header.get(name)) is not entry_type:
             raise SceneError(path, f"expected {name} in the header, found {header.get(name)!r:.40}", REMEDY)
     if header["kind"] not in (SCENE, FEATURES):
         problem = f"expected the kind {SCENE} or {FEATURES} in the header, found {header['kind']!r:.40}"
@@ -165,8 +167,8 @@ def read_rows(path: Path) -> StoredRows:
 
     sizes = {name: as_array(column).nbytes for name, column in vars(rows).items()}
     comments, batches = (file.header["about"].get(name) for name in ("comments", "batches"))
-    count = len(batches) if isinstance(batches, list) else 0
-    stored = to_stored([Packed(n, num_higher, unpack)], f"{count} batch(es) of views", sizes)
+    num_batches = len(batches) if isinstance(batches, list) else 0
+    stored = to_stored([Packed(n, num_higher, unpack)], f"{num_batches} batch(es) of views", sizes)
     copied = copied_comments(comments if isinstance(comments, list) else ())
     return replace(stored, format="binary little-endian", comments=copied, notes=_picture_notes(file.header["about"]))
 
@@ -179,14 +181,17 @@ def _picture_notes(about: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def list_batches(path: Path) -> list[dict[str, Any]]:
-    """List the batches in the header of a ``.gsm``: for each, its counts and the names of its views in the file."""
-    numbers, batches = ("num_views", "num_input", "num_new"), read_header(path)["about"].get("batches")
-    listed = []
-    for batch in filter(lambda one: isinstance(one, dict), batches if isinstance(batches, list) else ()):
-        facts: dict[str, Any] = {name: value for name in numbers if isinstance(value := batch.get(name), int)}
-        views = batch.get("views")
-        listed.append(facts | {"views": [*map(str, views.values())] if isinstance(views, dict) else []})
-    return listed
+    """List the batches in the header of a ``.gsm``, each with its counts and the names of its views in the file."""
+    batches = read_header(path)["about"].get("batches")
+    return [_describe_batch(batch) for batch in batches if isinstance(batch, dict)] if isinstance(batches, list) else []
+
+
+def _describe_batch(batch: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the counts of a batch, and the names of its views in the file; entries of other types are left out."""
+    views = batch.get("views")
+    counts = {name: batch.get(name) for name in ("num_views", "num_input", "num_new")}
+    known: dict[str, Any] = {name: count for name, count in counts.items() if isinstance(count, int)}
+    return known | {"views": [*map(str, views.values())] if isinstance(views, dict) else []}
 
 
 def holds_views(path: Path) -> bool:

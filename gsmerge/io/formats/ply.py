@@ -10,6 +10,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from io import BufferedReader, FileIO, TextIOWrapper
 from pathlib import Path
@@ -34,16 +35,16 @@ MAX_DEGREE = 3  # of the harmonics in results; splat-transform 3.7 and gsply ref
 COMMENT_BYTES = len(f"comment {arrays.new_views_comment(arrays.ExpectedScores(-100, -100, -100, -100))}\n")
 MAX_READ_DEGREE = 4
 THIN = 1e-3  # third scale of a 2D Gaussian, relative to its smaller scale
-MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
-BLOCK_BYTES = 1 << 19  # of rows that are converted at a time; they stay in the cache for all columns
+MAX_LOGIT = 16.0  # from 16.6 on, the sigmoid rounds to 1 in float32, whose logit is infinite
+BLOCK_BYTES = 1 << 19  # rows converted at a time; they stay in the processor's cache for all columns
 
 _PREFIXED = "the prefix {!r} of the columns' names, as CloudCompare writes it, is ignored"
 _AGAIN = "copy or export it again"
 MAX_HEADER_BYTES = 1 << 20
-MAX_LINE = 1 << 20  # characters of a row of text, since its words take many times as much memory
-MAX_LIST_VALUES = 1_000_000  # of elements with lists, which are read one value at a time
-_LIST_BYTES = 140  # of memory for each of these values
-_STEPS_PER_ELEMENT = 50  # of a budget's 20 microseconds, since several readers open a file one after the other
+MAX_LINE = 1 << 20  # characters of a row of text; its words take many times as much memory
+MAX_LIST_VALUES = 1_000_000  # lists of an element; they are read one value at a time
+_LIST_BYTES = 140  # memory of each list
+_STEPS_PER_ELEMENT = 50  # steps of 20 microseconds in a ReadBudget; several readers open a file in turn
 _TYPES = {  # PLY's names of types by NumPy's
     "i1": "char", "i2": "short", "i4": "int", "f4": "float", "u1": "uchar", "u2": "ushort", "u4": "uint", "f8": "double"
 }  # fmt: skip
@@ -58,22 +59,15 @@ _SIZES = {
 def read_rows(path: Path) -> arrays.StoredRows:
     """Open the rows of a PLY file for :func:`open_rows`; SceneError if it holds no Gaussians."""
     data = open_ply(path)
-    elements = {e.name: {p.name for p in e.properties} for e in data.elements}
+    elements = {element.name: {column.name for column in element.properties} for element in data.elements}
     compressed = "chunk" in elements and elements.get("vertex", set()) >= set(arrays.PACKED)
     rows, prefix = (_PACKED_ROWS(path, data), "") if compressed else _vertex_rows(path, data)
     extra_elements = tuple(name for name in elements if name != "vertex")
     layers = [f"element {name}" for name in extra_elements if {"opacity", arrays.QUATS[0]} <= elements[name]]
     unused = check_columns(path, rows.dtype, layers)
     names = tuple(rows.dtype.names or ())
-    comments = (*data.comments, *(c for e in data.elements for c in e.comments))
-    colors, white, notes = arrays.color_columns(names), 1.0, list[str]()
-    linear = colors == arrays.PLAIN_COLORS[1] and not arrays.are_logarithms(_read_column(path, rows, arrays.SCALES[0]))
-    if linear:
-        notes += ["scales are read as linear, since the columns are r, g and b and hardly any scale is negative"]
-    float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
-    if float_colors and np.nanmedian(_read_column(path, rows, colors[0])) > 1:
-        white = 255.0
-        notes += [f"colours are read as 0 to 255, since half of the values of {colors[0]} are above 1"]
+    comments = (*data.comments, *(comment for element in data.elements for comment in element.comments))
+    linear, white, notes = _value_conventions(path, rows)
     if arrays.SCALES[2] not in names:
         notes += [f"2D Gaussians have two scales; the third is set to {THIN:g} of the smaller one"]
         comments += (arrays.FLAT_COMMENT,)
@@ -90,26 +84,42 @@ def read_rows(path: Path) -> arrays.StoredRows:
     )
 
 
+def _value_conventions(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[bool, float, list[str]]:
+    """Find how scales and plain colours are stored.
+
+    Returns whether scales are linear, the stored value of a full colour channel, and notes on both.
+    """
+    colors, notes = arrays.color_columns(rows.dtype.names), list[str]()
+    linear = colors == arrays.PLAIN_COLORS[1] and not arrays.are_logarithms(_read_column(path, rows, arrays.SCALES[0]))
+    if linear:
+        notes += ["scales are read as linear, since the columns are r, g and b and hardly any scale is negative"]
+    float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
+    if float_colors and np.nanmedian(_read_column(path, rows, colors[0])) > 1:
+        notes += [f"colours are read as 0 to 255, since half of the values of {colors[0]} are above 1"]
+        return linear, 255.0, notes
+    return linear, 1.0, notes
+
+
 def read_columns(path: Path, rows: np.ndarray | arrays.PackedRows, names: Sequence[str]) -> np.ndarray:
     """Read some columns of a file's rows, block by block, as a structured array ``[n]`` of little-endian values."""
     out = np.empty(len(rows), [(name, rows.dtype[name].newbyteorder("<")) for name in names])
-    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
+    block_rows = max(1, BLOCK_BYTES // rows.dtype.itemsize)
     with open_rows(path, rows) as read:
-        for first in range(0, len(rows), size):
-            block = read(slice(first, first + size))
+        for start in range(0, len(rows), block_rows):
+            block = read(slice(start, start + block_rows))
             for name in names:
-                out[name][first : first + size] = block[name]
+                out[name][start : start + block_rows] = block[name]
     return out
 
 
-def _read_column(path: Path, rows: np.ndarray, name: str) -> np.ndarray:
+def _read_column(path: Path, rows: np.ndarray | arrays.PackedRows, name: str) -> np.ndarray:
     return np.asarray(read_columns(path, rows, [name])[name])
 
 
 def _adapt_rows(rows: np.ndarray, *, linear: bool, white: float) -> np.ndarray:
-    """Return a block of rows with log scales and, where there are only two, a third, thin one.
+    """Return a block of rows with three log scales; 2D Gaussians get a thin third scale.
 
-    ``linear``: scales are stored as they are, not as logarithms. ``white``: stored value of a full colour channel.
+    ``linear``: the stored scales are linear, not logarithms. ``white``: stored value of a full colour channel.
     """
     columns = {name: rows[name] for name in rows.dtype.names or ()}
     if white != 1:
@@ -158,16 +168,16 @@ def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
 
     CloudCompare writes "scalar_" before names that are not its own, and "scalar_scal_" if it writes the file again.
     """
-    names, last = tuple(rows.dtype.names or ()), arrays.QUATS[0]
-    prefix = next((name.removesuffix(last) for name in names if name.endswith(last)), "")
+    names, known_name = tuple(rows.dtype.names or ()), arrays.QUATS[0]
+    prefix = next((name.removesuffix(known_name) for name in names if name.endswith(known_name)), "")
     stripped = [name.removeprefix(prefix) for name in names]
-    if last in names or rows.dtype.hasobject or len(set(stripped)) < len(names):
+    if known_name in names or rows.dtype.hasobject or len(set(stripped)) < len(names):
         return rows, ""
-    kinds = [rows.dtype[name] for name in names]
-    fields: Any = rows.dtype.fields
+    types = [rows.dtype[name] for name in names]
+    fields: Any = rows.dtype.fields  # name -> type and offset in bytes
     offsets = [fields[name][1] for name in names]
-    named: Any = {"names": stripped, "formats": kinds, "offsets": offsets, "itemsize": rows.dtype.itemsize}
-    return rows.view(np.dtype(named)), prefix
+    layout: Any = {"names": stripped, "formats": types, "offsets": offsets, "itemsize": rows.dtype.itemsize}
+    return rows.view(np.dtype(layout)), prefix
 
 
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
@@ -193,18 +203,19 @@ def _layout_name(names: tuple[str, ...], num_rest: int, *, compressed: bool) -> 
 
 def _bytes_by_attribute(row: np.dtype[Any], count: int) -> dict[str, int]:
     """Count the bytes of ``count`` rows by attribute."""
-    groups = {
+    columns = {
         "means": arrays.MEANS,
         "normals": arrays.NORMALS,
         "sh0": arrays.color_columns(row.names),
         "opacities": ("opacity",),
+        "scales": arrays.SCALES,
+        "quats": arrays.QUATS,
     }
-    groups |= {"scales": arrays.SCALES, "quats": arrays.QUATS}
-    kinds = {name: kind for kind, names in groups.items() for name in names}
+    attributes = {name: attribute for attribute, names in columns.items() for name in names}
     sizes: Counter[str] = Counter()
     for name in row.names or ():
-        kind = kinds.get(name, "shN" if name.startswith("f_rest_") else "extra")
-        sizes[kind] += row[name].itemsize * count
+        attribute = attributes.get(name, "shN" if name.startswith("f_rest_") else "extra")
+        sizes[attribute] += row[name].itemsize * count
     return dict(sizes)
 
 
@@ -245,7 +256,7 @@ def open_ply(path: Path) -> PlyData:
 
 
 def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
-    """Open a PLY file for the parser, which gets no bytes beyond ASCII in the header, and no empty lines of text."""
+    """Open a PLY file for the parser, without bytes beyond ASCII in the header and without empty lines of text."""
     if text:
         return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
     file = _BinaryRows(FileIO(str(path)))
@@ -264,7 +275,7 @@ class _TextRows(TextIOWrapper):
 
 
 class _BinaryRows(BufferedReader):
-    """A binary PLY file, in whose header "?" stands for bytes beyond ASCII."""
+    """A binary PLY file; bytes beyond ASCII in its header are read as "?"."""
 
     end = 0  # of the header, in bytes
 
@@ -279,8 +290,8 @@ class _BinaryRows(BufferedReader):
 def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Callable[[slice], np.ndarray]]:
     """Yield a thread-safe function that returns blocks of a PLY file's rows.
 
-    Rows of a mapped file are read from the file: a mapped file that becomes shorter would end the process, while here
-    it raises SceneError.
+    Rows of a mapped file are read from the file, not from its memory. Access to a mapped file that became shorter would
+    end the process; reading the file raises SceneError.
     """
     if not isinstance(rows, np.memmap):
         yield rows.__getitem__
@@ -325,7 +336,7 @@ def header_counts(path: Path) -> tuple[int, int]:
 
 
 def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
-    """Return the content that the first 4 KiB of a PLY file show: a result of gsmerge, Gaussians, or other columns.
+    """Guess from the first 4 KiB of a PLY file whether it is a result of gsmerge, has Gaussians, or has other columns.
 
     A file that cannot be read, or has a longer header, counts as Gaussians.
     """
@@ -339,54 +350,77 @@ def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
         return "result"
     columns = re.findall(rb"^property .*?(\w+)\s*$", header, re.MULTILINE) if end else []
     expected = (b"scale_", b"rot_", b"f_dc_", b"packed_")
-    has_gaussians = any(part in name for name in columns for part in expected)  # names may have a prefix
+    has_gaussians = any(stem in name for name in columns for stem in expected)  # names may have a prefix
     return "Gaussians" if has_gaussians or not columns else "other"
 
 
 def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
-    """Return the bytes of a header and whether rows are text; SceneError if the file is too short for its rows.
+    """Return the size of a header in bytes and whether rows are text; SceneError if the file is too short for its rows.
 
-    ``start``: the first bytes of the file. The parser checks everything else in the header.
+    ``start``: the first bytes of the file. The parser checks the rest of the header.
     """
     path, size = Path(budget.path), budget.file_bytes
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
-    last = newline + b"end_header" + newline
-    end = start.find(last)
+    last_line = newline + b"end_header" + newline
+    end = start.find(last_line)
     if end < 0:
         found = f"no 'end_header' within {MAX_HEADER_BYTES >> 20} MiB" if size > len(start) else "an early end of file"
         raise SceneError(path, f"expected a PLY header, found {found}", _AGAIN)
     words = [line.split() for line in start[:end].decode("latin-1").split(newline.decode())]
-    text = ["format", "ascii", "1.0"] in words
-    elements: list[tuple[str, int, list[list[str]]]] = []
-    for line in words:
-        if line[:1] == ["element"] and len(line) == 3 and re.fullmatch(r"[+-]?\d[\d_]*", line[2]):
-            elements.append((line[1], int(line[2]), []))
-        elif line[:1] == ["property"] and len(line) > 2 and elements:
-            elements[-1][2].append(line[1:-1])
+    is_text = ["format", "ascii", "1.0"] in words
+    elements = _parse_elements(words)
     budget.check_steps(_STEPS_PER_ELEMENT * len(elements), "steps for elements")
-    left = size - end - len(last)
-    for name, count, properties in elements:
-        lists = any(kind[0] == "list" for kind in properties)
-        if count < 0:
-            raise SceneError(path, f"expected a number of rows, found {count} rows of element '{name}'", _AGAIN)
-        if count and not properties:
-            raise SceneError(path, f"expected columns, found element '{name}' of {count} rows without any", _AGAIN)
-        if lists and name == "vertex":
-            raise SceneError(path, "expected one number per column and vertex, found a list property", _AGAIN)
-        if lists and count * len(properties) > MAX_LIST_VALUES:
-            problem = f"expected at most {MAX_LIST_VALUES:,} lists, found element '{name}' with lists in {count:,} rows"
-            raise SceneError(path, problem, "export it without this element")
-        if lists:
-            budget.check_memory(_LIST_BYTES * count * len(properties), f"lists in {count:,} rows")
-        each = sum(2 if text else _SIZES.get((kind[1:2] or kind)[0], 1) for kind in properties)
-        before, left = left, left - count * each
-        if left < -1:  # the last row of a text may end without a new line
-            raise _truncated(path, f"element '{name}' with {count} rows", before // each, "early end of file")
-    return end + len(last), text
+    bytes_left = size - end - len(last_line)
+    for element in elements:
+        _check_element(budget, element)
+        row_bytes = sum(2 if is_text else _SIZES.get((words[1:2] or words)[0], 1) for words in element.properties)
+        bytes_before, bytes_left = bytes_left, bytes_left - element.count * row_bytes
+        if bytes_left < -1:  # the last row of a text may end without a new line
+            expected = f"element '{element.name}' with {element.count} rows"
+            raise _truncated(path, expected, bytes_before // row_bytes, "early end of file")
+    return end + len(last_line), is_text
+
+
+@dataclass(frozen=True)
+class _Element:
+    """An element in the header of a PLY file."""
+
+    name: str
+    count: int  # number of rows
+    # The words between "property" and the name: a type, or "list", the type of its length and the type of its values
+    properties: list[list[str]] = field(default_factory=list)
+
+
+def _parse_elements(lines: list[list[str]]) -> list[_Element]:
+    """Return the elements of a header, whose ``lines`` are split into words."""
+    elements: list[_Element] = []
+    for words in lines:
+        if words[:1] == ["element"] and len(words) == 3 and re.fullmatch(r"[+-]?\d[\d_]*", words[2]):
+            elements.append(_Element(words[1], int(words[2])))
+        elif words[:1] == ["property"] and len(words) > 2 and elements:
+            elements[-1].properties.append(words[1:-1])
+    return elements
+
+
+def _check_element(budget: ReadBudget, element: _Element) -> None:
+    """Raise SceneError if an element has no columns, a negative count, or lists in vertices or in too many rows."""
+    path, name, count, num_columns = Path(budget.path), element.name, element.count, len(element.properties)
+    has_lists = any(words[0] == "list" for words in element.properties)
+    if count < 0:
+        raise SceneError(path, f"expected a number of rows, found {count} rows of element '{name}'", _AGAIN)
+    if count and not num_columns:
+        raise SceneError(path, f"expected columns, found element '{name}' of {count} rows without any", _AGAIN)
+    if has_lists and name == "vertex":
+        raise SceneError(path, "expected one number per column and vertex, found a list property", _AGAIN)
+    if has_lists and count * num_columns > MAX_LIST_VALUES:
+        problem = f"expected at most {MAX_LIST_VALUES:,} lists, found element '{name}' with lists in {count:,} rows"
+        raise SceneError(path, problem, "export it without this element")
+    if has_lists:
+        budget.check_memory(_LIST_BYTES * count * num_columns, f"lists in {count:,} rows")
 
 
 def _truncated(path: Path, expected: str, num_whole: int, reason: str) -> SceneError:
-    """Make the error of a file that ends early, or is damaged, after some complete rows."""
+    """Make the SceneError for a file that ends early or is damaged after ``num_whole`` complete rows."""
     return SceneError(path, f"truncated or damaged: expected {expected}, found {num_whole} complete ({reason})", _AGAIN)
 
 
@@ -464,7 +498,7 @@ def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     """
     if not 0 <= sh_degree <= MAX_READ_DEGREE:
         raise ValueError(f"sh_degree: expected 0 to {MAX_READ_DEGREE}, got {sh_degree}")
-    least = file_bytes(1, sh_degree) + COMMENT_BYTES
-    if max_bytes < least:
-        raise UsageError(f"budget: expected at least {least} bytes for one Gaussian, got {max_bytes}")
+    min_bytes = file_bytes(1, sh_degree) + COMMENT_BYTES
+    if max_bytes < min_bytes:
+        raise UsageError(f"budget: expected at least {min_bytes} bytes for one Gaussian, got {max_bytes}")
     return bisect_right(range(max_bytes), max_bytes - COMMENT_BYTES, key=lambda count: file_bytes(count, sh_degree)) - 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,13 +26,13 @@ from gsmerge.types import Gaussians, StrPath
 _READ_FRAMES = LazyFunction("gsmerge.io.formats.depth_maps", "read_frames")
 MIN_PADDING = 16  # number of equal rows at the origin that are padding; fewer may be Gaussians
 MIN_FINITE = 0.002  # least share of finite rows; a file with fewer is refused
-MAX_HARMONIC = 1e6  # rendered values of such harmonics can still be squared and summed in float32
+MAX_HARMONIC = 1e6  # larger harmonics are clipped, so that float32 can square and sum the rendered values
 FREED_ROWS = 1 << 17  # rows after which the memory of large columns is freed
-_MIN_JUDGED = 100  # least number of Gaussians or values from which scales and encodings are judged
-_SCALE_GAUSSIANS = 20_000  # number of Gaussians whose scales are judged
-_MAX_WIDTH = 0.25  # standard deviations above this share of the scene's width are wrong
-# Linear scales that are taken for logarithms are larger than this, in units of the scene's width over the root of the
-# number of Gaussians. Sound files have 0.3 to 2, such files 10 to 1,000.
+_MIN_JUDGED = 100  # least number of Gaussians or values for a judgement of scales or encodings
+_SCALE_GAUSSIANS = 20_000  # size of the sample for the judgement of scales
+_MAX_WIDTH = 0.25  # scales are wrong if half of the standard deviations exceed this share of the scene's width
+# Bound on half of the standard deviations, in units of the scene's width divided by the square root of the number of
+# Gaussians. Sound files have 0.3 to 2. Files with linear scales, read as logarithms, have 10 to 1,000.
 _MAX_SPACINGS = 6.0
 _RAW_ROUNDING = 0.01  # opacities that were rounded to half floats may exceed [0, 1] by this
 
@@ -44,12 +45,12 @@ class FileInfo:
     layout: str  # name of the column layout, as "17-column export" or "INRIA, SH degree 3"
     format: str  # "ascii", "binary little-endian" or "binary big-endian"
     count: int  # number of rows, including unusable ones
-    file_bytes: int  # for an index of levels, including the chunks of the level that is read
+    file_bytes: int  # an index of levels counts with the chunks of the level that is read
     # Bytes of the rows by attribute: means, normals, sh0, shN, opacities, scales, quats, extra. For an ascii file, the
     # bytes of the binary types; for .spz, before compression; for .sog, of the textures (sh0 includes the opacities)
     bytes_by_attribute: dict[str, int]
     columns: tuple[str, ...]  # all columns of the vertex element, in the file's order
-    extra_columns: tuple[str, ...]  # those of them that are ignored
+    extra_columns: tuple[str, ...]  # the columns that do not belong to Gaussians
     extra_elements: tuple[str, ...]  # elements besides ``vertex``
     byte_columns: tuple[str, ...]  # columns that are stored as bytes
     comments: tuple[str, ...]  # of the header
@@ -164,163 +165,189 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
     """
     path = Path(path)
     path = path / META if path.is_dir() and (path / META).is_file() else path
-    chosen = find_format(path)
-    if chosen.read is None:
-        problem = f"expected one of {', '.join(SCENE_SUFFIXES)}, found {chosen.ending}, which is written and not read"
+    format_ = find_format(path)
+    if format_.read is None:
+        problem = f"expected one of {', '.join(SCENE_SUFFIXES)}, found {format_.ending}, which is written and not read"
         raise SceneError(path, problem, "name the file that it was made from")
-    if chosen.read is ply.read_rows:
+    if format_.read is ply.read_rows:
         return read_ply(path, opacity=opacity)
-    return convert_files([path], [chosen.read(path)], "auto")
+    return convert_files([path], [format_.read(path)], "auto")
 
 
 def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice) -> GaussianFile:
     """Convert the rows of files to Gaussians, file by file; facts that are not sums are those of the first file."""
     path, stored, dtype = paths[0], parts[0], parts[0].rows.dtype
     names = tuple(dtype.names or ())
-    num_higher = sum(name.startswith("f_rest_") for name in names) // 3
-    n = sum(len(part.rows) for part in parts)
-    wide = any(dtype[name].kind == "f" and dtype[name].itemsize == 8 for name in arrays.MEANS)
-    shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
     file_bytes = sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True))
-    most = arrays.most_in_memory(file_bytes)
-    out = {"means": make_array((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
-    out |= {name: make_array(shape, np.float32, most) for name, shape in shapes.items()}
-    out |= {arrays.FILTER: np.empty(n, np.float32)} if arrays.FILTER in names else {}
-    num_clipped = num_zero_quats = first = 0
-    for name, part in zip(paths, parts, strict=True):
-        part_rows = slice(first, first + len(part.rows))
-        clipped, zero = _convert_file(name, part, {key: column[part_rows] for key, column in out.items()})
-        num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, part_rows.stop
+    out = _make_arrays(dtype, sum(len(part.rows) for part in parts), file_bytes)
+    num_clipped, num_zero_quats = _fill_arrays(paths, parts, out)
     empty = find_empty(path, out)
     encoding, is_guess = _choose_encoding(paths, parts, out["opacities"], empty, opacity)
     _activate(out["opacities"], out["valid"], encoding)
-    notes = _apply_filter(out) if arrays.FILTER in out else ()
-    num_bad = clear_invalid(path, out)
+    filter_notes = _apply_filter(out) if arrays.FILTER in out else ()
+    num_nonfinite = clear_invalid(path, out)
     clear_rows(out, empty)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
     if byte_columns == arrays.NORMALS:
         _spread_low_degree(out["shN"])
-    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS, arrays.FILTER}
-    extra = tuple(name for name in names if name not in used and not name.startswith("f_rest_"))
     info = FileInfo(
         path=str(path),
         layout=stored.layout,
         format=stored.format,
-        count=n,
+        count=len(out["valid"]),
         file_bytes=file_bytes,
         bytes_by_attribute={name: sum(part.sizes[name] for part in parts) for name in stored.sizes},
         columns=names,
-        extra_columns=extra,
+        extra_columns=_extra_columns(names),
         extra_elements=stored.extra_elements,
         byte_columns=byte_columns,
         comments=stored.comments,
-        sh_degree=arrays.sh_degree(num_higher),
+        sh_degree=arrays.sh_degree(out["shN"].shape[1]),
         opacity_encoding=encoding,
         opacity_guessed=is_guess,
-        num_nonfinite=num_bad,
+        num_nonfinite=num_nonfinite,
         num_empty=len(empty),
         num_clipped_scales=num_clipped,
         num_zero_quats=max(0, num_zero_quats - len(empty)),  # empty rows usually have zero quaternions
         odd_scales=_describe_wrong_scales(out["means"], out["scales"], out["valid"]),
-        adapted=(*notes, *stored.notes, *_describe_incomplete(out["valid"])),
+        adapted=(*filter_notes, *stored.notes, *_describe_incomplete(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
 
+def _make_arrays(dtype: np.dtype[Any], n: int, file_bytes: int) -> dict[str, np.ndarray]:
+    """Make the uninitialised arrays of ``n`` Gaussians, with ``valid`` and the filter if the file has one.
+
+    ``dtype``: the columns of the stored rows. ``file_bytes``: the size of the files, which bounds arrays in memory.
+    """
+    names = tuple(dtype.names or ())
+    num_higher = sum(name.startswith("f_rest_") for name in names) // 3
+    has_float64 = any(dtype[name].kind == "f" and dtype[name].itemsize == 8 for name in arrays.MEANS)
+    shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
+    max_bytes = arrays.max_array_bytes(file_bytes)
+    out = {"means": make_array((n, 3), np.float64 if has_float64 else np.float32), "valid": np.empty(n, np.bool_)}
+    out |= {name: make_array(shape, np.float32, max_bytes) for name, shape in shapes.items()}
+    return out | ({arrays.FILTER: np.empty(n, np.float32)} if arrays.FILTER in names else {})
+
+
+def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Fill arrays with the rows of all files; return the numbers of clipped Gaussians and of zero quaternions."""
+    num_clipped = num_zero_quats = start = 0
+    for path, part in zip(paths, parts, strict=True):
+        part_rows = slice(start, start + len(part.rows))
+        clipped, zero_quats = _convert_file(path, part, {name: array[part_rows] for name, array in out.items()})
+        num_clipped, num_zero_quats, start = num_clipped + clipped, num_zero_quats + zero_quats, part_rows.stop
+    return num_clipped, num_zero_quats
+
+
+def _extra_columns(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the columns that do not belong to Gaussians, in the file's order."""
+    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS, arrays.FILTER}
+    return tuple(name for name in names if name not in used and not name.startswith("f_rest_"))
+
+
 def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
     """Fill arrays with the rows of a file; return the numbers of clipped Gaussians and of zero quaternions."""
-    n, size = len(stored.rows), max(1, ply.BLOCK_BYTES // stored.rows.dtype.itemsize)
+    n, block_rows = len(stored.rows), max(1, ply.BLOCK_BYTES // stored.rows.dtype.itemsize)
     with ply.open_rows(path, stored.rows) as read:
 
         def convert(start: int) -> tuple[int, int]:
-            block = slice(start, min(start + size, n))
+            block = slice(start, min(start + block_rows, n))
             rows = read(block) if stored.adapt is None else stored.adapt(read(block))
-            parts = {name: column[block] for name, column in out.items()}
-            if arrays.FILTER in parts:
+            out_block = {name: array[block] for name, array in out.items()}
+            if arrays.FILTER in out_block:
                 with np.errstate(all="ignore"):
-                    parts[arrays.FILTER][:] = rows[arrays.FILTER]
-            counts = _convert(rows, parts)
-            if start % FREED_ROWS < size:
+                    out_block[arrays.FILTER][:] = rows[arrays.FILTER]
+            counts = _convert(rows, out_block)
+            if start % FREED_ROWS < block_rows:  # the first block after every FREED_ROWS rows
                 free_pages(out.values())
             return counts
 
-        num_clipped, num_zero = map(sum, zip(*parallel_map(convert, range(0, n, size)), strict=True))
+        num_clipped, num_zero = map(sum, zip(*parallel_map(convert, range(0, n, block_rows)), strict=True))
     return num_clipped, num_zero
 
 
 def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays of one block of rows, without a conversion of opacities; return counts as _convert_file."""
-    plain = _convert_plain(rows, out)
-    out["valid"][:plain] = True
-    if plain == len(rows):
+    """Fill the arrays of a block of rows, with opacities as stored; return counts as :func:`_convert_file`."""
+    num_plain = _convert_plain(rows, out)
+    out["valid"][:num_plain] = True
+    if num_plain == len(rows):
         return 0, 0
-    return _convert_columns(rows[plain:], {name: array[plain:] for name, array in out.items()})
+    return _convert_columns(rows[num_plain:], {name: array[num_plain:] for name, array in out.items()})
 
 
 def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
     """Fill arrays with the rows before the first one that needs special treatment, and return their number.
 
-    :func:`gsmerge.kernels.stored_rows.convert_rows` says which rows do. The number is 0 for rows of other columns or
-    types than float32.
+    :func:`gsmerge.kernels.stored_rows.convert_rows` defines these rows. The number is 0 if a used column is missing or
+    any column is not float32.
     """
-    columns, num_higher = dict(rows.dtype.fields or {}), out["shN"].shape[1]
+    columns: dict[str, Any] = dict(rows.dtype.fields or {})  # name -> type and offset in bytes
+    num_higher = out["shN"].shape[1]
     rest = [f"f_rest_{channel * num_higher + j}" for j in range(num_higher) for channel in range(3)]
     used = (*arrays.MEANS, *arrays.SH0, *rest, *arrays.SCALES, *arrays.QUATS, "opacity")
     types = {out["means"].dtype, *(kind for kind, *_ in columns.values())}
     if types != {np.dtype(np.float32)} or not columns.keys() >= set(used):
         return 0
-    places = np.array([columns[name][1] // 4 for name in used], np.int32)
+    offsets = [offset for _, offset, *_ in (columns[name] for name in used)]
+    column_ids = np.array([offset // np.dtype(np.float32).itemsize for offset in offsets], np.int32)
     values = rows.view(np.float32).reshape(len(rows), -1)
     sh0, shN = (out[name].reshape(len(rows), -1) for name in ("sh0", "shN"))
     limits = MAX_HARMONIC, arrays.MAX_LOG_SCALE
-    return convert_rows(values, places, *limits, out["means"], out["quats"], out["scales"], out["opacities"], sh0, shN)
+    return convert_rows(
+        values, column_ids, *limits, out["means"], out["quats"], out["scales"], out["opacities"], sh0, shN
+    )
+
+
+class _FloatColumns:
+    """The columns of rows as float32, which records the rows that need a closer check or were clipped."""
+
+    def __init__(self, rows: np.ndarray) -> None:
+        self.rows = rows
+        self.total = np.zeros(len(rows), np.float32)  # not finite if any column read so far is not finite
+        self.clipped = np.zeros(len(rows), np.bool_)
+
+    def read(self, name: str) -> np.ndarray:
+        """Return a column as float32."""
+        column = self.rows[name].astype(np.float32)
+        np.add(self.total, column, out=self.total)
+        return column
+
+    def read_clipped(self, name: str, limit: float) -> np.ndarray:
+        """Return a column as float32 within +-``limit``."""
+        column = self.read(name)
+        size = np.abs(column)
+        if not size.max() <= limit:  # also for NaN
+            np.logical_or(self.clipped, size > limit, out=self.clipped)
+            np.clip(column, -limit, limit, out=column)
+        return column
 
 
 def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
     """Fill the arrays of rows of any kind, column by column; return counts as :func:`_convert_file`."""
+    columns, num_higher = _FloatColumns(rows), out["shN"].shape[1]
     with np.errstate(all="ignore"):
-        total = np.zeros(len(rows), np.float32)  # not finite if any column is not, so one test is enough
-
-        def take(name: str) -> np.ndarray:
-            column = rows[name].astype(np.float32)
-            np.add(total, column, out=total)
-            return column
-
         for j, name in enumerate(arrays.MEANS):
-            column = take(name)
+            column = columns.read(name)
             out["means"][:, j] = column if out["means"].dtype == np.float32 else rows[name]
-        clipped = np.zeros(len(rows), np.bool_)
-
-        def take_harmonic(name: str) -> np.ndarray:
-            column = take(name)
-            size = np.abs(column)
-            if not size.max() <= MAX_HARMONIC:
-                np.logical_or(clipped, size > MAX_HARMONIC, out=clipped)
-                np.clip(column, -MAX_HARMONIC, MAX_HARMONIC, out=column)
-            return column
-
         for j, name in enumerate(arrays.color_columns(rows.dtype.names)):
-            column = take_harmonic(name)
+            column = columns.read_clipped(name, MAX_HARMONIC)
             if name not in arrays.SH0:
                 column = rgb_to_sh0(column / (255 if rows.dtype[name].kind == "u" else 1))
             out["sh0"][:, 0, j] = column
-        num_higher = out["shN"].shape[1]
         for channel in range(3):
             for j in range(num_higher):
-                out["shN"][:, j, channel] = take_harmonic(f"f_rest_{channel * num_higher + j}")
+                name = f"f_rest_{channel * num_higher + j}"
+                out["shN"][:, j, channel] = columns.read_clipped(name, MAX_HARMONIC)
         for j, name in enumerate(arrays.SCALES):
-            column = take(name)
-            clipped |= np.abs(column) > arrays.MAX_LOG_SCALE
-            np.clip(column, -arrays.MAX_LOG_SCALE, arrays.MAX_LOG_SCALE, out=column)
-            out["scales"][:, j] = exp(column)
-        quats = [take(name) for name in arrays.QUATS]
-        zero = _normalise(quats, out["quats"])
-        out["opacities"][:] = take("opacity")
-        valid = np.isfinite(total, out=out["valid"])
+            out["scales"][:, j] = exp(columns.read_clipped(name, arrays.MAX_LOG_SCALE))
+        zero_quats = _normalise([columns.read(name) for name in arrays.QUATS], out["quats"])
+        out["opacities"][:] = columns.read("opacity")
+        valid = np.isfinite(columns.total, out=out["valid"])
         doubtful = np.flatnonzero(~valid)  # the sum also overflows, or has an infinite logit or log scale
         if len(doubtful):
             valid[doubtful] = _are_usable(rows[doubtful], num_higher)
-    return int((clipped & valid).sum()), int((zero & valid).sum())
+    return int((columns.clipped & valid).sum()), int((zero_quats & valid).sum())
 
 
 def _are_usable(rows: np.ndarray, num_higher: int) -> np.ndarray:
@@ -336,7 +363,7 @@ def _are_usable(rows: np.ndarray, num_higher: int) -> np.ndarray:
 
 
 def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions to ``out [n,4]``, and the identity for zero quaternions; return the mask of these."""
+    """Write unit quaternions to ``out [n,4]``, or the identity for zero quaternions; return the mask of the latter."""
     w, x, y, z = quats
     squared = w * w + x * x + y * y + z * z
     inverse = 1 / np.sqrt(squared)
@@ -354,29 +381,29 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
 
 
 def _choose_encoding(
-    paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray, empty: np.ndarray, named: OpacityChoice
+    paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray, empty: np.ndarray, choice: OpacityChoice
 ) -> tuple[str, bool]:
     """Choose the encoding of opacities, and return whether it is guessed; ``empty`` rows are not considered."""
-    if named == "raw":
+    if choice == "raw":
         _check_raw(paths[0], opacities)
-    if named != "auto":
-        return named, False
-    judged = opacities if len(empty) == 0 else opacities.copy()
-    judged[empty] = np.nan
-    declared = _declared_encoding(paths, parts, judged)
-    return declared or _guess_encoding(judged), declared is None
+    if choice != "auto":
+        return choice, False
+    values = opacities if len(empty) == 0 else opacities.copy()
+    values[empty] = np.nan
+    declared = _declared_encoding(paths, parts, values)
+    return declared or _guess_encoding(values), declared is None
 
 
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
     """Return the encoding of opacities that the parts declare; None if no part declares one.
 
-    SceneError if the encodings of parts differ. For that, the encoding of a part that declares none is guessed from its
-    values if there are enough.
+    SceneError if the encodings of parts differ. If a part declares no encoding, this check guesses it from the part's
+    values, unless they are too few.
     """
-    first, part_names = 0, dict[str, str]()  # encoding -> name of the first part that has it
+    start, part_names = 0, dict[str, str]()  # encoding -> name of the first part that has it
     for path, part in zip(paths, parts, strict=True):
-        values = opacities[first : first + len(part.rows)]
-        first += len(values)
+        values = opacities[start : start + len(part.rows)]
+        start += len(values)
         is_clear = len(parts) > 1 and np.isfinite(values).sum() >= _MIN_JUDGED
         encoding = part.encoding or (_guess_encoding(values) if is_clear else None)
         if encoding is not None:
@@ -402,12 +429,12 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
 
 def _apply_filter(out: dict[str, np.ndarray]) -> tuple[str]:
     """Add the filter of Mip-Splatting to the scales, and reduce opacities by the growth; return a note."""
-    widths, scales, most = out.pop(arrays.FILTER), out["scales"], np.float32(exp(arrays.MAX_LOG_SCALE))
+    widths, scales, max_scale = out.pop(arrays.FILTER), out["scales"], np.float32(exp(arrays.MAX_LOG_SCALE))
     out["valid"] &= np.isfinite(widths)
 
     def widen(start: int) -> None:
         block = slice(start, start + FREED_ROWS)
-        before, added = scales[block].copy(), np.minimum(np.abs(widths[block]), most)[:, None]
+        before, added = scales[block].copy(), np.minimum(np.abs(widths[block]), max_scale)[:, None]
         scales[block] = np.sqrt(before * before + added * added)
         out["opacities"][block] *= (before / scales[block]).prod(1)
 
@@ -428,8 +455,8 @@ def _check_raw(path: Path, opacities: np.ndarray) -> None:
 def _guess_encoding(opacities: np.ndarray) -> str:
     """Return "raw" if the finite stored opacities lie in [0, 1], except for roundings and damage; else "logit".
 
-    The density of logits continues beyond 0 and 1, while that of opacities ends there. Therefore values are opacities
-    if hardly any lies outside [0, 1], and fewer than lie inside close to 0 or 1.
+    The density of logits continues beyond 0 and 1, while the density of opacities ends there. Therefore values are
+    opacities if hardly any value lies outside [0, 1], and more values lie inside, close to 0 or 1, than outside.
     """
     finite = np.isfinite(opacities)
     excess = np.abs(opacities[finite] - 0.5) - 0.5  # distance outside [0, 1]; negative inside
@@ -449,9 +476,9 @@ def _describe_wrong_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndar
     width, sizes = float((high - low).max()), gather(scales, sample)
     size = float(np.median(sizes.max(1)))
     text = f"half of the Gaussians have a standard deviation above {size:.3g} in a scene of width {width:.3g}"
-    most = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
+    max_size = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
     stored = float(log(size))
-    if stored <= most < size and not arrays.are_logarithms(log(sizes)):
+    if stored <= max_size < size and not arrays.are_logarithms(log(sizes)):
         signs = f"the stored scales are hardly ever negative (median {stored:.3g})"
         return f"scales seem to be linear, but logarithms are expected: {signs}, and {text}"
     if size > _MAX_WIDTH * width:
@@ -467,32 +494,33 @@ def _spread_low_degree(shN: np.ndarray) -> None:
     if shN.shape[1] != 15:
         return
     columns = shN.transpose(0, 2, 1).reshape(len(shN), 45)
-    last = int(np.flatnonzero(columns.any(0)).max(initial=-1))
-    for higher in (3, 8):
-        if 0 <= last < 3 * higher:
+    last_used = int(np.flatnonzero(columns.any(0)).max(initial=-1))
+    for num_higher in (3, 8):  # of degrees 1 and 2
+        if 0 <= last_used < 3 * num_higher:
             shN[:] = 0
-            shN[:, :higher] = columns[:, : 3 * higher].reshape(-1, 3, higher).transpose(0, 2, 1)
+            shN[:, :num_higher] = columns[:, : 3 * num_higher].reshape(-1, 3, num_higher).transpose(0, 2, 1)
             return
 
 
 def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
     """Make invalid rows transparent, in place, and return their number; SceneError if hardly a row is valid."""
     valid = out["valid"]
-    bad = np.flatnonzero(~valid)
-    num_good = len(valid) - len(bad)
-    if len(bad) and num_good < MIN_FINITE * len(valid):
-        number = f"{len(bad):,} of" if num_good else "all"
+    invalid = np.flatnonzero(~valid)
+    num_valid = len(valid) - len(invalid)
+    if len(invalid) and num_valid < MIN_FINITE * len(valid):
+        number = f"{len(invalid):,} of" if num_valid else "all"
         problem = f"expected finite Gaussians, found NaN or inf in {number} {len(valid):,} rows"
         raise SceneError(path, problem, "export it again")
-    clear_rows(out, bad)
-    return len(bad)
+    clear_rows(out, invalid)
+    return len(invalid)
 
 
 def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     """Return the valid rows that only pad the file.
 
-    These are rows at the origin that are not rotated, round and grey, as rows of zeros are, and rows at the origin that
-    are all equal, as VolSplat pads its files. If a file has no other rows, a few are Gaussians; SceneError for many.
+    A row at the origin pads the file if it is not rotated, round and grey, as a row of zeros is. Rows at the origin
+    that are all equal also pad the file; VolSplat writes these. If a file has no other rows, a few of them count as
+    Gaussians; SceneError for many.
     """
     rows = np.flatnonzero((out["means"] == 0).all(1) & out["valid"])
     if len(rows) == 0:
@@ -500,8 +528,8 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     scales, sh0 = out["scales"][rows], out["sh0"][rows, 0]
     empty = (out["quats"][rows] == (1, 0, 0, 0)).all(1) & (scales == scales[:, :1]).all(1) & (sh0 == 0).all(1)
     if len(rows) >= MIN_PADDING:
-        shape = np.concatenate([scales, out["opacities"][rows, None], sh0], 1)
-        empty |= (shape == lower_median(shape)).all(1)
+        attributes = np.concatenate([scales, out["opacities"][rows, None], sh0], 1)
+        empty |= (attributes == lower_median(attributes)).all(1)
     rows = rows[empty]
     if len(rows) == np.count_nonzero(out["valid"]):
         if len(rows) < MIN_PADDING:
@@ -512,27 +540,27 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
-    """Make ``rows`` invalid and transparent, in place; they get the position and scales of the Gaussian before."""
+    """Make ``rows`` invalid and transparent, in place; they get the position and scales of the valid row before."""
     if len(rows) == 0:
         return
     out["valid"][rows] = False
-    good = np.flatnonzero(out["valid"])
-    before = good[np.maximum(np.searchsorted(good, rows) - 1, 0)]
+    valid_rows = np.flatnonzero(out["valid"])
+    previous = valid_rows[np.maximum(np.searchsorted(valid_rows, rows) - 1, 0)]
     for name in ("means", "scales"):
-        out[name][rows] = out[name][before]
+        out[name][rows] = out[name][previous]
     for name, value in {"quats": (1, 0, 0, 0), "opacities": 0, "sh0": 0, "shN": 0}.items():
         out[name][rows] = value
 
 
 def _describe_incomplete(valid: np.ndarray) -> tuple[str, ...]:
     """Note a file whose export seems incomplete, because its last rows or most of its rows are no Gaussians."""
-    good = np.flatnonzero(valid)
-    num_last = len(valid) - 1 - int(good[-1])  # rows after the last Gaussian
-    num_bad = len(valid) - len(good)
-    if num_last > 1 and num_last > num_bad - num_last:
+    valid_rows = np.flatnonzero(valid)
+    num_last = len(valid) - 1 - int(valid_rows[-1])  # rows after the last Gaussian
+    num_invalid = len(valid) - len(valid_rows)
+    if num_last > 1 and num_last > num_invalid - num_last:
         which, remedy = f"the last {num_last:,}", "export it again, since the export may have been interrupted"
-    elif num_bad > len(good):
-        which, remedy = f"{num_bad:,}", "export the file again unless a mask emptied them"
+    elif num_invalid > len(valid_rows):
+        which, remedy = f"{num_invalid:,}", "export the file again unless a mask emptied them"
     else:
         return ()
     return (f"{which} of {len(valid):,} rows are no Gaussians; {remedy}",)

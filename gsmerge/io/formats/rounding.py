@@ -12,41 +12,45 @@ from gsmerge.io.formats.table import PLY, output_format
 from gsmerge.io.formats.write import write_gaussians
 from gsmerge.types import Gaussians, StrPath
 
-# Mean square of the moves of Gaussians above which renders change: by .05 dB of 27. A move is in units of the
-# Gaussian's size and at most 1. Scenes around their origin have at most a tenth of this.
+# Renders change above this mean square of the moves of Gaussians: by .05 dB of 27. A move is in units of the Gaussian's
+# size and at most 1. Scenes around their origin have at most a tenth of this.
 SHOWN = 0.005
 SAMPLE = 1 << 17  # number of Gaussians from which the mean is estimated
 
 
 def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
     """Note how far a file's rounding moves Gaussians, and the remedy; empty if renders do not change visibly."""
-    chosen = output_format(path, levels=True, cameras=True)
     if len(gaussians) == 0:
         return []
-    columns, step = gaussians.numpy(), len(gaussians) // SAMPLE + 1
-    ends = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # formats choose their steps by these
-    rows = np.unique(np.concatenate([np.arange(0, len(columns), step), *ends]))
+    format_, columns = output_format(path, levels=True, cameras=True), gaussians.numpy()
+    rows = _sample_rows(columns.means)
     means, sizes = columns.means[rows].astype(np.float64), np.median(columns.scales[rows], axis=1)
     with np.errstate(over="ignore"):
-        moves = np.abs(chosen.round_means(means) - means).max(axis=1)
-    moved = float(np.square(np.minimum(moves / np.maximum(sizes, 1e-30), 1)).mean())
-    if moved <= SHOWN:
+        moves = np.abs(format_.round_means(means) - means).max(axis=1)
+    mean_square = float(np.square(np.minimum(moves / np.maximum(sizes, 1e-30), 1)).mean())
+    if mean_square <= SHOWN:
         return []
-    middle = np.median(means, axis=0)
-    shift = ",".join(f"{-float(f'{value:.3g}'):.0f}" for value in middle)
+    center = np.median(means, axis=0)
+    shift = ",".join(f"{-float(f'{coordinate:.3g}'):.0f}" for coordinate in center)
     remedy = f"move the input and its cameras near the origin first, with gsmerge convert --translate={shift}"
-    if np.abs(middle).max() < np.abs(means - middle).max():  # the scene is wider than its distance from the origin
-        remedy = ("" if chosen.round_means is PLY.round_means else "write a .ply, or ") + "crop far Gaussians"
-    lost = f"positions so far from the origin lose digits in {chosen.ending}"
-    return [f"{lost}, and Gaussians move by about {100 * moved**0.5:.0f} % of their size; {remedy}"]
+    if np.abs(center).max() < np.abs(means - center).max():  # the scene is wider than its distance from the origin
+        remedy = ("" if format_.round_means is PLY.round_means else "write a .ply, or ") + "crop far Gaussians"
+    problem = f"positions so far from the origin lose digits in {format_.ending}"
+    return [f"{problem}, and Gaussians move by about {100 * mean_square**0.5:.0f} % of their size; {remedy}"]
+
+
+def _sample_rows(means: np.ndarray) -> np.ndarray:
+    """Return evenly spaced rows, and the rows with the extreme positions, from which formats choose their steps."""
+    extremes = means.argmin(axis=0), means.argmax(axis=0)
+    return np.unique(np.concatenate([np.arange(0, len(means), len(means) // SAMPLE + 1), *extremes]))
 
 
 def as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
     """Write Gaussians in the format of a path and read them back; return them unchanged if rounding is invisible."""
     if not rounding_notes(path, gaussians):
         return gaussians
-    chosen = output_format(path, levels=True, cameras=True)
-    name = f"a{chosen.kept_as or chosen.ending}"
+    format_ = output_format(path, levels=True, cameras=True)
+    name = f"a{format_.kept_as or format_.ending}"
     with TemporaryDirectory() as folder:
         write_gaussians(Path(folder) / name, gaussians)
         return read_gaussians(Path(folder) / name).gaussians

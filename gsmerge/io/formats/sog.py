@@ -41,19 +41,19 @@ FILES = (
     "means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp", "shN_centroids.webp", "shN_labels.webp",
     META,
 )  # fmt: skip
-FIRST_MODE = 252  # alpha of a rotation whose first component is the largest; the next three stand for the others
+FIRST_MODE = 252  # alpha of a rotation with w as the largest component; 253 to 255 stand for x, y and z
 PALETTE_BITS = 16
 PALETTE_COLUMNS = 64  # sets of harmonics side by side in the texture of the palette
 _LOSSLESS = 101  # OpenCV's WebP quality
-PACKED_BYTES = 19  # of a Gaussian in the decoded textures
-CODES = 256  # values of a codebook
-_CELLS = 1 << 11  # number of cells of equal width, and of cells with equally many values, before merging
-_MAX_STEPS = 200  # of Lloyd's algorithm
+PACKED_BYTES = 19  # bytes of a Gaussian in the decoded textures
+CODES = 256  # number of values in a codebook
+_CELLS = 1 << 11  # number of cells of equal width, and of cells with equal counts of values, before mergers
+_MAX_STEPS = 200  # steps of Lloyd's algorithm
 
 
 @dataclass(frozen=True)
 class _Bundle:
-    """Files of a ``.sog`` by name, in a zip; a file that unpacks to more bytes than the whole zip has is refused."""
+    """Files of a ``.sog`` by name, in a zip; a file is refused if it unpacks to more bytes than the whole zip."""
 
     archive: zipfile.ZipFile
     size: int  # bytes of the zip
@@ -157,12 +157,13 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
 
 def _image_size(data: bytes) -> tuple[int, int]:
     """Return width and height of a lossless WebP image; ValueError for any other file."""
-    at = 12
+    at = 12  # bytes of "RIFF", the file's size and "WEBP"
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        # A chunk has 4 bytes of name, 4 bytes of size, and content that is padded to an even number of bytes
         while at + 8 <= len(data) and data[at : at + 4] in (b"VP8X", b"ICCP"):  # chunks before the image
             at += 8 + (int.from_bytes(data[at + 4 : at + 8], "little") + 1) // 2 * 2
         if data[at : at + 4] == b"VP8L" and len(data) >= at + 13:
-            bits = int.from_bytes(data[at + 9 : at + 13], "little")
+            bits = int.from_bytes(data[at + 9 : at + 13], "little")  # after the signature: 14 bits each, less 1
             return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     raise ValueError("no WebP texture without loss")
 
@@ -189,10 +190,10 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
 
     def texture(key: str, index: int = 0, channels: int = 3) -> np.ndarray:
         pixels = _read_texture(files, meta[key]["files"][index], count, budget)
-        return pixels[:, :channels].copy()  # which frees the memory of unused channels
+        return pixels[:, :channels].copy()  # a copy, so that unused channels take no memory
 
     low, high = (_check_numbers(meta["means"][key], 3) for key in ("mins", "maxs"))
-    lower, upper, scales = texture("means"), texture("means", 1), texture("scales")
+    low_bytes, high_bytes, scales = texture("means"), texture("means", 1), texture("scales")
     quats, sh0 = texture("quats", channels=4), texture("sh0", channels=4)
     scale_codes, color_codes = (_check_numbers(meta[key]["codebook"], CODES) for key in ("scales", "sh0"))
     if quats[:, 3].min() < FIRST_MODE:
@@ -201,11 +202,11 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
     harmonic_codes = np.zeros(CODES) if labels is None else _check_numbers(meta["shN"]["codebook"], CODES)
 
     def unpack(block: slice) -> arrays.Columns:
-        modes, smallest = quats[block, 3].astype(int) - FIRST_MODE, (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
-        codes = np.zeros((len(modes), 0, 3), np.uint8) if labels is None else palette[labels[block]]
+        largest, smallest = quats[block, 3].astype(int) - FIRST_MODE, (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
+        codes = np.zeros((len(largest), 0, 3), np.uint8) if labels is None else palette[labels[block]]
         return arrays.Columns(
-            means=_decode_means(lower[block] + 256.0 * upper[block], low, high),
-            quats=arrays.from_smallest_three(modes, smallest),
+            means=_decode_means(low_bytes[block] + 256.0 * high_bytes[block], low, high),
+            quats=arrays.from_smallest_three(largest, smallest),
             log_scales=scale_codes[scales[block]],
             opacities=sh0[block, 3] / 255,
             sh0=color_codes[sh0[block, :3]],
@@ -223,10 +224,10 @@ def _check_numbers(values: Any, length: int) -> np.ndarray:
     return numbers
 
 
-def _read_palette(files: _Files, part: dict[str, Any], count: int, budget: ReadBudget) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each Gaussian its index ``[count]`` in the palette, and the palette ``[n,num_higher,3]`` of codes."""
-    size, num_higher = check_whole(part["count"], "count", 1, 2**PALETTE_BITS), (part["bands"] + 1) ** 2 - 1
-    name, labels_name = part["files"]
+def _read_palette(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index of each Gaussian in the palette ``[count]``, and the palette ``[n,num_higher,3]`` of codes."""
+    size, num_higher = check_whole(meta["count"], "count", 1, 2**PALETTE_BITS), (meta["bands"] + 1) ** 2 - 1
+    name, labels_name = meta["files"]
     labels = _read_texture(files, labels_name, count, budget)[:, :2].copy().view("<u2")[:, 0]
     rows = max(-(-size // PALETTE_COLUMNS), int(labels.max()) // PALETTE_COLUMNS + 1)
     centroids = _read_texture(files, name, rows * PALETTE_COLUMNS * num_higher, budget)[:, :3]
@@ -265,8 +266,8 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
         textures.update(files)
 
     fixed, low, high = _quantise_means(columns.means)
-    halves = {"means_l.webp": _texture(fixed & 255), "means_u.webp": _texture(fixed >> 8)}
-    add("means", halves, mins=low, maxs=high)
+    means_bytes = {"means_l.webp": _texture(fixed & 255), "means_u.webp": _texture(fixed >> 8)}
+    add("means", means_bytes, mins=low, maxs=high)
     scales, sh0 = fit_codebook(columns.log_scales), fit_codebook(columns.sh0)
     add("scales", {"scales.webp": _texture(nearest_codes(scales, columns.log_scales))}, codebook=_shorten(scales))
     largest, smallest = arrays.smallest_three(columns.quats)
@@ -275,19 +276,24 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
     colors = np.concatenate([nearest_codes(sh0, columns.sh0), arrays.to_bytes(255 * columns.opacities)[:, None]], 1)
     add("sh0", {"sh0.webp": _texture(colors)}, codebook=_shorten(sh0))
     if columns.harmonics.size:
-        num_higher = columns.harmonics.shape[1]
-        palette, labels = fit_palette(columns.harmonics.reshape(count, -1), PALETTE_BITS)
-        codebook = fit_codebook(palette)
-        rows = -(-len(palette) // PALETTE_COLUMNS)
-        centroids = np.zeros((rows * PALETTE_COLUMNS, num_higher, 3), np.uint8)
-        centroids[: len(palette)] = nearest_codes(codebook, palette).reshape(-1, num_higher, 3)
-        files = {
-            "shN_centroids.webp": _webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
-            "shN_labels.webp": _texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
-        }
-        bands = arrays.sh_degree(num_higher)
-        add("shN", files, count=len(palette), bands=bands, codebook=_shorten(codebook))
+        files, numbers = _encode_palette(columns.harmonics)
+        add("shN", files, **numbers)
     return {**textures, META: json.dumps(meta).encode("ascii")}
+
+
+def _encode_palette(harmonics: np.ndarray) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Encode ``harmonics [n,num_higher,3]`` as a palette; return its textures, and its numbers in ``meta.json``."""
+    count, num_higher = harmonics.shape[:2]
+    palette, labels = fit_palette(harmonics.reshape(count, -1), PALETTE_BITS)
+    codebook = fit_codebook(palette)
+    rows = -(-len(palette) // PALETTE_COLUMNS)
+    centroids = np.zeros((rows * PALETTE_COLUMNS, num_higher, 3), np.uint8)
+    centroids[: len(palette)] = nearest_codes(codebook, palette).reshape(-1, num_higher, 3)
+    files = {
+        "shN_centroids.webp": _webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
+        "shN_labels.webp": _texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
+    }
+    return files, {"count": len(palette), "bands": arrays.sh_degree(num_higher), "codebook": _shorten(codebook)}
 
 
 def round_means(means: np.ndarray) -> np.ndarray:
@@ -326,60 +332,66 @@ def _texture(values: np.ndarray) -> bytes:
 
 def _webp(image: np.ndarray) -> bytes:
     """Encode a lossless WebP image; only the colours of pixels whose alpha is 0 may change."""
-    order = [2, 1, 0, 3][: image.shape[2]]
-    _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., order]), [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS])
+    bgra = [2, 1, 0, 3][: image.shape[2]]  # OpenCV's order of channels
+    _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., bgra]), [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS])
     return data.tobytes()
 
 
 def fit_codebook(values: np.ndarray) -> np.ndarray:
     """Choose ``[256]`` rising values that represent finite numbers of any shape, by 1-D k-means.
 
-    The values are first divided into thousands of narrow cells. The two neighbours whose merger adds the least squared
-    error are merged (Ward 1963) until 256 cells are left, so that values far from all others keep their own codes.
-    Lloyd's algorithm improves these. Unused codes repeat the last one.
+    The values are first divided into thousands of narrow cells. Each step merges the two neighbours with the least
+    added squared error (Ward 1963), until 256 cells are left. Isolated values thus keep their own codes. Lloyd's
+    algorithm then improves the codes. Unused codes repeat the last one.
     """
     ordered = np.sort(values, axis=None)
     distinct = np.unique(ordered)
     if len(distinct) <= CODES:
         return np.pad(distinct, (0, CODES - len(distinct)), "edge" if len(distinct) else "constant")
     sums = np.concatenate([[0], np.cumsum(ordered)])
-    even = np.searchsorted(ordered, np.linspace(ordered[0], ordered[-1], _CELLS))
-    ends = np.unique([*even, *np.linspace(0, len(ordered), _CELLS).astype(int)])
+    equal_width = np.searchsorted(ordered, np.linspace(ordered[0], ordered[-1], _CELLS))
+    equal_count = np.linspace(0, len(ordered), _CELLS).astype(int)
+    ends = np.unique([*equal_width, *equal_count])
     codes = _merge_cells(np.diff(ends).astype(float), np.diff(sums[ends]) / np.diff(ends))
     for _ in range(_MAX_STEPS):
         ends = np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2)
         ends = np.concatenate([[0], ends, [len(ordered)]])
-        number, total = np.diff(ends), np.diff(sums[ends])
-        moved = np.where(number > 0, total / np.maximum(number, 1), codes)
-        if np.array_equal(moved, codes):
+        numbers, totals = np.diff(ends), np.diff(sums[ends])
+        cell_means = np.where(numbers > 0, totals / np.maximum(numbers, 1), codes)
+        if np.array_equal(cell_means, codes):
             break
-        codes = np.sort(moved)
+        codes = np.sort(cell_means)
     return codes
 
 
 def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Merge neighbouring cells until 256 are left, and return their means."""
-    n, m = numbers.tolist(), means.tolist()
-    left, right = list(range(-1, len(n) - 1)), list(range(1, len(n) + 1))
+    """Merge neighbouring cells until 256 are left, and return their means.
 
-    def cost(i: int) -> tuple[float, int, int, float, float]:
-        j = right[i]
-        return n[i] * n[j] / (n[i] + n[j]) * (m[i] - m[j]) ** 2, i, j, n[i], n[j]
+    ``numbers [n]``: values in each cell. ``means [n]``: the mean of these values.
+    """
+    count, mean = numbers.tolist(), means.tolist()
+    previous, following = list(range(-1, len(count) - 1)), list(range(1, len(count) + 1))
 
-    heap = [cost(i) for i in range(len(n) - 1)]
+    def merger(i: int) -> tuple[float, int, int, float, float]:
+        """Return the squared error that the merger of a cell with the next one adds, both cells, and their counts."""
+        j = following[i]
+        return count[i] * count[j] / (count[i] + count[j]) * (mean[i] - mean[j]) ** 2, i, j, count[i], count[j]
+
+    heap = [merger(i) for i in range(len(count) - 1)]
     heapq.heapify(heap)
-    for _ in range(len(n) - CODES):
-        _, i, j, *sizes = heapq.heappop(heap)
-        while right[i] != j or [n[i], n[j]] != sizes:  # one of the two was merged meanwhile
-            _, i, j, *sizes = heapq.heappop(heap)
-        m[i], n[i], n[j] = (n[i] * m[i] + n[j] * m[j]) / (n[i] + n[j]), n[i] + n[j], 0.0
-        right[i] = right[j]
-        if right[i] < len(n):
-            left[right[i]] = i
-            heapq.heappush(heap, cost(i))
-        if left[i] >= 0:
-            heapq.heappush(heap, cost(left[i]))
-    return np.array([mean for mean, number in zip(m, n, strict=True) if number > 0])
+    for _ in range(len(count) - CODES):
+        _, i, j, *counts = heapq.heappop(heap)
+        while following[i] != j or [count[i], count[j]] != counts:  # an earlier merger changed one of the two cells
+            _, i, j, *counts = heapq.heappop(heap)
+        mean[i] = (count[i] * mean[i] + count[j] * mean[j]) / (count[i] + count[j])
+        count[i], count[j] = count[i] + count[j], 0.0
+        following[i] = following[j]
+        if following[i] < len(count):
+            previous[following[i]] = i
+            heapq.heappush(heap, merger(i))
+        if previous[i] >= 0:
+            heapq.heappush(heap, merger(previous[i]))
+    return np.array([m for m, n in zip(mean, count, strict=True) if n > 0])
 
 
 def nearest_codes(codebook: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -41,7 +41,7 @@ def read_rows(path: Path) -> StoredRows:
         rows = np.fromfile(path, ROW)
     sizes = {"means": 12, "scales": 12, "sh0": 3, "opacities": 1, "quats": 4}
     packed = Packed(len(rows), 0, lambda block: _unpack(rows[block]))
-    return to_stored([packed], ".splat", {name: each * len(rows) for name, each in sizes.items()})
+    return to_stored([packed], ".splat", {name: row_bytes * len(rows) for name, row_bytes in sizes.items()})
 
 
 def _unpack(rows: np.ndarray) -> Columns:

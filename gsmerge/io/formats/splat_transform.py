@@ -1,4 +1,4 @@
-"""Run PlayCanvas' splat-transform for formats that gsmerge does not read or write itself, by a temporary ``.ply``."""
+"""Run PlayCanvas' splat-transform, by a temporary ``.ply``, for formats that gsmerge itself cannot read or write."""
 
 from __future__ import annotations
 
@@ -44,26 +44,28 @@ def holds_sog(path: Path) -> bool:
 
 
 def run_program(*words: object) -> None:
-    """Run the program on the CPU with arguments ``words``, of which the last is the file that it writes.
+    """Run the program on the CPU with arguments ``words``; the last argument is the file that it writes.
 
     GsmergeError if it fails or takes longer than ``TIME_LIMIT``, UsageError if it is not installed.
     """
     program = find_program()
     command = [program, "-q", "-w", "-g", "cpu", *map(str, words)]
     try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=TIME_LIMIT, check=False)
+        process = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=TIME_LIMIT, check=False
+        )
     except subprocess.TimeoutExpired as error:
         raise GsmergeError(f"{program}: expected it to end within {TIME_LIMIT} seconds, it was stopped") from error
-    if done.returncode or not Path(str(words[-1])).exists():
-        lines = (done.stderr or done.stdout).decode(errors="replace").strip().splitlines() or ["without output"]
+    if process.returncode or not Path(str(words[-1])).exists():
+        lines = (process.stderr or process.stdout).decode(errors="replace").strip().splitlines() or ["without output"]
         reason = next((line for line in lines if "Error: " in line), lines[-1]).rpartition("Error: ")[2]
-        problem = f"expected {Path(str(words[-1])).name}, it ended with code {done.returncode}"
+        problem = f"expected {Path(str(words[-1])).name}, it ended with code {process.returncode}"
         raise GsmergeError(f"{program}: {problem}: {' '.join(reason.split())[:MAX_OUTPUT]}")
 
 
 @contextmanager
 def name_file(path: Path) -> Iterator[None]:
-    """Let errors on temporary files that the program wrote name the user's file ``path`` instead."""
+    """Replace the program's temporary file by the user's file ``path`` in errors."""
     try:
         yield
     except SceneError as error:
@@ -77,9 +79,9 @@ def read_rows(path: Path) -> StoredRows:
     """
     check_file(path)
     with TemporaryDirectory(prefix="gsmerge-") as folder:
-        made = Path(folder) / "scene.ply"
+        converted = Path(folder) / "scene.ply"
         try:
-            run_program(path.absolute(), "-L", 0, made)
+            run_program(path.absolute(), "-L", 0, converted)
         except UsageError as error:
             target = path.with_name("scene.ply") if path.suffix == ".json" else path.with_suffix(".ply")
             command = shlex.join(["npx", PACKAGE, str(path), "-L", "0", str(target)])
@@ -88,8 +90,8 @@ def read_rows(path: Path) -> StoredRows:
         except GsmergeError as error:
             raise SceneError(path, f"cannot be read by {error}") from error
         with name_file(path):
-            stored = ply.read_rows(made)
-            with ply.open_rows(made, stored.rows) as read:
+            stored = ply.read_rows(converted)
+            with ply.open_rows(converted, stored.rows) as read:
                 rows = read(slice(None))
     is_single_file = path.suffix.lower() == ".ksplat"  # the other formats have several files in a folder
     beside = [] if is_single_file else [file for file in path.parent.iterdir() if file.is_file() and file != path]

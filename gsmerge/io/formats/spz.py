@@ -29,14 +29,14 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
-from gsmerge.types import SH_C0, Gaussians
+from gsmerge.types import SH_C0, Gaussians, StrPath
 
-VERSION, MAX_DEGREE = 3, 3  # that are written; Spark 2.2 does not read version 4
+VERSION, MAX_DEGREE = 3, 3  # of written files; Spark 2.2 does not read version 4
 MAGIC = 0x5053474E
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, number of streams or zero
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
-MIP_FLAG = 1  # the Gaussians are to be rendered antialiased
+MIP_FLAG = 1  # render the Gaussians antialiased
 EXTENSIONS_FLAG = 2  # records of extensions are before the table in version 4, and after the columns in older versions
 RECORD = struct.Struct("<II")  # kind of an extension, and its number of bytes
 AXES_KIND = 0xADBE0003  # of SPZ_ADOBE_coordinate_system; its content is 1 for the first of AXES, or 0 for unknown
@@ -45,17 +45,18 @@ AXES = (
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
 )  # fmt: skip
 PLY_AXES = "RDF"
-_REVERSED = {"LFD", "RFD", "LBU", "RBU"}  # in which Niantic's library writes and reads y and z with the wrong sign
+_REVERSED = {"LFD", "RFD", "LBU", "RBU"}  # Niantic's library writes and reads their y and z with the wrong sign
 _OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
-_MAX_EXTENSIONS = 1 << 20  # bytes of all records
+_MAX_EXTENSIONS = 1 << 20  # bytes of all extension records
 GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # first bytes of versions 1 to 3, and of 4
-SYSTEM, UNIX = 9, b"\3"  # place of the operating system in a gzip header, and the value that is always written
+SYSTEM, UNIX = 9, b"\3"  # byte of a gzip header that names the operating system, and the value that is always written
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel if the scene fills 1,000 pixels
 MAX_FRACTION = 23
 LARGEST = 2**23 - 1
-COLOR_SCALE = 0.15  # of sh0, so that colours slightly outside [0, 1] can be stored
+_SHIFTS = (20, 10, 0)  # of the three smaller components of a rotation in its word
+COLOR_SCALE = 0.15  # factor of sh0, so that colours slightly outside [0, 1] can be stored
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
-MAX_READ_DEGREE = 4  # some programs write it in version 3
+MAX_READ_DEGREE = 4  # some programs write degree 4 in version 3
 FOUND_EARLY_END = "expected a .spz file, found an early end of file"
 AGAIN = "copy or export it again"
 
@@ -92,10 +93,10 @@ def read_rows(path: Path) -> arrays.StoredRows:
             packed = file.read()
     rows, header, extensions, sizes = unpack_rows(ReadBudget(path, len(packed)), packed)
     axes = _stored_axes(path, extensions) if header.flags & EXTENSIONS_FLAG else PLY_AXES
-    turn = arrays.turner(_axes_turn(axes), header.num_higher)
-    turned = replace(rows, unpack=lambda block: turn(rows.unpack(block)))
+    rotate = arrays.turner(_axes_rotation(axes), header.num_higher)
+    rotated = replace(rows, unpack=lambda block: rotate(rows.unpack(block)))
     mode = arrays.MIP if header.flags & MIP_FLAG else None
-    stored = arrays.to_stored([turned], f".spz version {header.version}", sizes, mode)
+    stored = arrays.to_stored([rotated], f".spz version {header.version}", sizes, mode)
     notes = (f"Gaussians are turned from the file's axes {axes} to those of a .ply, {PLY_AXES}",)
     return stored if axes == PLY_AXES else replace(stored, notes=notes)
 
@@ -105,7 +106,7 @@ def unpack_rows(
 ) -> tuple[arrays.Packed, Header, bytes, dict[str, int]]:
     """Return the Gaussians in the file's axes, header, extensions and bytes by attribute; SceneError if damaged.
 
-    ``budget``: budget of the file that they are in. ``count_before``: number of Gaussians in earlier parts of it.
+    ``budget``: budget of the file with these bytes. ``count_before``: number of Gaussians in earlier parts of the file.
     """
     read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
     header, parts, extensions = read(budget, packed, count_before)
@@ -133,10 +134,10 @@ def _stored_axes(path: Path, extensions: bytes) -> str:
     return PLY_AXES
 
 
-def _axes_turn(axes: str) -> np.ndarray:
-    """Return the matrix ``[3,3]`` from axes to those of a ``.ply``, which mirrors if the handedness differs."""
-    turn = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
-    return turn * (1, -1, -1) if axes in _REVERSED else turn
+def _axes_rotation(axes: str) -> np.ndarray:
+    """Return the matrix ``[3,3]`` from axes to those of a ``.ply``; it mirrors if the handedness differs."""
+    rotation = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
+    return rotation * (1, -1, -1) if axes in _REVERSED else rotation
 
 
 def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int], count_before: int) -> Header:
@@ -202,23 +203,12 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tu
 
     path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,), count_before)
     sizes = [header.count * width for width in header.widths if width]
-    try:
-        (at,) = TABLE_START.unpack_from(packed, HEADER.size)
-        table = [TABLE_ROW.unpack_from(packed, at + i * TABLE_ROW.size) for i in range(header.num_streams)]
-    except struct.error as error:
-        raise SceneError(path, FOUND_EARLY_END, AGAIN) from error
-    if [row[1] for row in table] != sizes:
-        problem = f"damaged: expected columns of {sizes} bytes for {header.count} Gaussians, found others"
-        raise SceneError(path, problem, AGAIN)
-    ends = at + len(table) * TABLE_ROW.size + np.cumsum([0, *(row[0] for row in table)], dtype=object)
-    if ends[-1] > len(packed):
-        problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(packed)}"
-        raise SceneError(path, problem, AGAIN)
+    table_start, ends = _read_table(path, packed, header, sizes)
     unpacker = zstandard.ZstdDecompressor()
     try:  # unpacks at most one byte more than expected, whatever size a stream states
         columns = [
-            unpacker.stream_reader(packed[i:j]).read(size + 1)
-            for (i, j), size in zip(pairwise(ends), sizes, strict=True)
+            unpacker.stream_reader(packed[start:end]).read(size + 1)
+            for (start, end), size in zip(pairwise(ends), sizes, strict=True)
         ]
     except zstandard.ZstdError as error:
         raise SceneError(path, "damaged: expected Zstandard streams of .spz version 4, found others", AGAIN) from error
@@ -228,7 +218,29 @@ def _zstandard_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tu
     columns += [b""] * (len(header.widths) - len(columns))
     parts = [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
     start = HEADER.size + TABLE_START.size
-    return header, parts, packed[start : min(at, start + _MAX_EXTENSIONS)]
+    return header, parts, packed[start : min(table_start, start + _MAX_EXTENSIONS)]
+
+
+def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) -> tuple[int, np.ndarray]:
+    """Return the start of the table of version 4, and the start of each stream with the end of the last one.
+
+    All are in bytes from the start of the file. ``sizes``: bytes of each unpacked column. SceneError if the table does
+    not fit to these sizes or to the file.
+    """
+    try:
+        (table_start,) = TABLE_START.unpack_from(packed, HEADER.size)
+        table = [TABLE_ROW.unpack_from(packed, table_start + i * TABLE_ROW.size) for i in range(header.num_streams)]
+    except struct.error as error:
+        raise SceneError(path, FOUND_EARLY_END, AGAIN) from error
+    if [unpacked_size for _, unpacked_size in table] != sizes:
+        problem = f"damaged: expected columns of {sizes} bytes for {header.count} Gaussians, found others"
+        raise SceneError(path, problem, AGAIN)
+    streams_start = table_start + len(table) * TABLE_ROW.size
+    ends = streams_start + np.cumsum([0, *(packed_size for packed_size, _ in table)], dtype=object)
+    if ends[-1] > len(packed):
+        problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(packed)}"
+        raise SceneError(path, problem, AGAIN)
+    return table_start, ends
 
 
 def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
@@ -255,7 +267,7 @@ def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
         w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
         return np.concatenate([w, xyz], 1)
     words = stored.view("<u4")[:, 0]  # the top two bits name the largest of xyzw
-    parts = np.stack([words >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)], 1)
+    parts = np.stack([words >> np.uint32(shift) & np.uint32(1023) for shift in _SHIFTS], 1)
     smallest = np.where(parts & 512, -1.0, 1.0) * (parts & 511) / (511 * np.sqrt(2.0))
     return np.roll(arrays.from_smallest_three((words >> np.uint32(30)).astype(int), smallest), 1, axis=1)
 
@@ -279,9 +291,9 @@ def choose_fraction(means: np.ndarray, fine: int) -> int:
     if not len(means):
         return 0
     size = np.median(reduce(np.maximum, (np.abs(axis - np.median(axis)) for axis in means.T)))
-    enough = fine - _octave(max(size, 1e-6))
-    room = _octave(LARGEST / max(np.abs(means).max(), 1e-6))
-    return int(np.clip(min(enough, room), 0, MAX_FRACTION))
+    fine_enough = fine - _octave(max(size, 1e-6))
+    no_overflow = _octave(LARGEST / max(np.abs(means).max(), 1e-6))
+    return int(np.clip(min(fine_enough, no_overflow), 0, MAX_FRACTION))
 
 
 def fix_means(means: np.ndarray, fraction: int) -> np.ndarray:
@@ -297,25 +309,38 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> 
     columns = arrays.to_columns(gaussians, max_degree)
     fraction = choose_fraction(columns.means, FINE)
     fixed = fix_means(columns.means, fraction)
-    steps = np.where(np.arange(columns.harmonics.shape[1]) < 3, 8, 16)[:, None]  # of degree 1, and above
-    stepped = (np.round(np.clip(columns.harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
-    # rotations from the top: index of the largest of xyzw, then sign and magnitude of the others
-    largest, smallest = arrays.smallest_three(np.roll(columns.quats, -1, axis=1))
-    codes = np.minimum(np.floor(511 * np.abs(smallest) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
-    codes |= (smallest < 0).astype(np.uint32) << np.uint32(9)
-    words = largest.astype(np.uint32) << np.uint32(30)
-    for i, shift in enumerate((20, 10, 0)):
-        words |= codes[:, i] << np.uint32(shift)
     parts = (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes a coordinate
         arrays.to_bytes(255 * columns.opacities)[:, None],
         arrays.to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)),
         arrays.to_bytes(16 * (columns.log_scales + 10)),
-        words.astype("<u4")[:, None].view(np.uint8),
-        np.clip(stepped, 0, 255).astype(np.uint8).reshape(len(stepped), 3 * stepped.shape[1]),
+        _pack_rotations(columns.quats),
+        _quantise_harmonics(columns.harmonics),
     )
     degree = arrays.sh_degree(columns.harmonics.shape[1])
     return HEADER.pack(MAGIC, VERSION, len(columns), degree, fraction, MIP_FLAG * mip, 0), parts
+
+
+def _quantise_harmonics(harmonics: np.ndarray) -> np.ndarray:
+    """Quantise ``harmonics [n,num_higher,3]`` to bytes ``[n,3 num_higher]``; degree 1 in steps of 8, others of 16."""
+    count, num_higher = harmonics.shape[:2]
+    steps = np.where(np.arange(num_higher) < 3, 8, 16)[:, None]
+    stepped = (np.round(np.clip(harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
+    return np.clip(stepped, 0, 255).astype(np.uint8).reshape(count, 3 * num_higher)
+
+
+def _pack_rotations(quats: np.ndarray) -> np.ndarray:
+    """Pack unit quaternions ``[n,4]`` wxyz to bytes ``[n,4]``, which :func:`_read_rotations` unpacks.
+
+    From the highest bit, a word has the index of the largest of xyzw, then sign and magnitude of the other components.
+    """
+    largest, smallest = arrays.smallest_three(np.roll(quats, -1, axis=1))
+    codes = np.minimum(np.floor(511 * np.abs(smallest) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
+    codes |= (smallest < 0).astype(np.uint32) << np.uint32(9)
+    words = largest.astype(np.uint32) << np.uint32(30)
+    for i, shift in enumerate(_SHIFTS):
+        words |= codes[:, i] << np.uint32(shift)
+    return words.astype("<u4")[:, None].view(np.uint8)
 
 
 def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:

@@ -1,8 +1,8 @@
 """Read and write Streamed SOG version 1 (developer.playcanvas.com, "The Streamed SOG Format"): levels of detail.
 
-The index ``lod-meta.json`` is a tree of boxes. A leaf names, for each level, a run of rows in a chunk. A chunk is a
-``.sog`` that is not zipped, in a folder of its own. A viewer loads the chunks that are visible, at the level that fits.
-It shows the Gaussians of the ``environment`` with every level. PlayCanvas' splat-transform writes all these files.
+The index ``lod-meta.json`` is a tree of boxes. A leaf names, for each level, a run of rows in a chunk. A chunk is an
+unzipped ``.sog`` in a folder of its own. A viewer loads the visible chunks at the level that suits their distance, and
+always shows the Gaussians of the ``environment``. PlayCanvas' splat-transform writes all these files.
 """
 
 from __future__ import annotations
@@ -84,20 +84,23 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
         for level, gaussians in enumerate(contents.levels):
             words += [ply := Path(folder) / f"{level}.ply", "-l", level]
             write_ply(ply, gaussians, sh_degree=min(gaussians.sh_degree, MAX_DEGREE), comments=contents.comments)
-        made = Path(folder) / "made" / INDEX
-        run_program(*words, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", ITERATIONS, made)
+        program_index = Path(folder) / "made" / INDEX
+        run_program(*words, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", ITERATIONS, program_index)
         with name_file(path):
-            _name_by_content(made)
-            levels = read_index(made).levels
-        index.write_bytes(made.read_bytes())
+            _name_by_content(program_index)
+            levels = read_index(program_index).levels
+        index.write_bytes(program_index.read_bytes())
         written = dict[Path, list[Path]]()
         for chunks in levels:
             files = [file for chunk in chunks for file in sorted(chunk.parent.iterdir())]
-            places = [path.parent / file.relative_to(made.parent) for file in files]
-            name = next(place for place in places if place.name == sog.META) if written else path
-            written[name] = [*([] if written else [index]), *map(add, places)]
-            for file, temporary in zip(files, written[name][-len(files) :], strict=True):
+            targets = [path.parent / file.relative_to(program_index.parent) for file in files]
+            temporaries = [add(target) for target in targets]
+            for file, temporary in zip(files, temporaries, strict=True):
                 temporary.write_bytes(file.read_bytes())
+            if not written:  # the finest level
+                written[path] = [index, *temporaries]
+            else:
+                written[next(target for target in targets if target.name == sog.META)] = temporaries
     return written
 
 
@@ -142,6 +145,22 @@ def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
     if version != VERSION:
         problem = f"expected Streamed SOG version {VERSION}, found {version}"
         raise SceneError(path, problem, f"export it as version {VERSION}")
+    levels = _list_levels(path, document)
+    if len({chunk for level in levels for chunk in level}) != sum(map(len, levels)):
+        raise ValueError("a chunk belongs to two levels")
+    environment = None if document.get("environment") is None else _inside(path, document["environment"])
+    if any(environment in level for level in levels):
+        raise ValueError("the environment is also a chunk of a level")
+    index = StreamedIndex(levels, environment)
+    counts = index.counts
+    for name, tree_count in {"counts": counts, "count": sum(counts)}.items():
+        if document.get(name, tree_count) != tree_count:  # older files have neither
+            raise ValueError(f"{name}: the tree has {tree_count}, and the document says {document[name]}")
+    return index
+
+
+def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int], ...]:
+    """Return the chunks of each level with their numbers of Gaussians; errors as in :func:`_check_index`."""
     names = document["filenames"]
     num_levels = check_whole(document["lodLevels"], "lodLevels", 1, MAX_LEVELS)
     if not isinstance(names, list) or not names:
@@ -153,27 +172,16 @@ def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
         offset, count = (check_whole(run[key], key, 0) for key in ("offset", "count"))
         if count:
             runs[check_whole(level, "level", 0, num_levels - 1)].append((file, offset, count))
-    levels = tuple(_cover(chunks, level) for level in runs)
-    if len({chunk for level in levels for chunk in level}) != sum(map(len, levels)):
-        raise ValueError("a chunk belongs to two levels")
-    environment = None if document.get("environment") is None else _inside(path, document["environment"])
-    if any(environment in level for level in levels):
-        raise ValueError("the environment is also a chunk of a level")
-    index = StreamedIndex(levels, environment)
-    counts = index.counts
-    for name, found in {"counts": counts, "count": sum(counts)}.items():
-        if document.get(name, found) != found:  # older files have neither
-            raise ValueError(f"{name}: the tree has {found}, and the document says {document[name]}")
-    return index
+    return tuple(_count_by_chunk(chunks, level_runs) for level_runs in runs)
 
 
 def _inside(index: Path, name: Any) -> Path:
     """Return the path of a chunk; ValueError if it is outside the folder of the index."""
-    place = PurePosixPath(str(name))
-    outside = place.is_absolute() or ".." in place.parts or "\\" in str(name) or "\0" in str(name)
-    if outside or place.name != sog.META:
+    chunk = PurePosixPath(str(name))
+    is_outside = chunk.is_absolute() or ".." in chunk.parts or "\\" in str(name) or "\0" in str(name)
+    if is_outside or chunk.name != sog.META:
         raise ValueError(f"{name!r:.80}: expected the path of a {sog.META} inside the folder")
-    return index.parent / place
+    return index.parent / chunk
 
 
 def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -192,7 +200,7 @@ def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
             yield from ((int(level), run) for level, run in node["lods"].items())
 
 
-def _cover(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict[Path, int]:
+def _count_by_chunk(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict[Path, int]:
     """Return the number of Gaussians of each chunk; ValueError if runs (file, offset, count) overlap or have gaps."""
     counts: dict[Path, int] = {}
     for file, offset, count in sorted(runs):
@@ -236,15 +244,15 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
 
     ``chunks``: path of each chunk -> its number of Gaussians in the index; None if the index has none.
     """
-    root, seen = os.path.realpath(path.parent), set[Path]()
+    root, real_paths = os.path.realpath(path.parent), set[Path]()
     contents: list[sog.SogContent] = []
     num_bytes, total, num_higher = check_file(path), 0, 0
     for chunk, count in chunks.items():
-        place = Path(os.path.realpath(chunk))
-        if not place.is_relative_to(root) or place in seen:
+        real_path = Path(os.path.realpath(chunk))
+        if not real_path.is_relative_to(root) or real_path in real_paths:
             problem = f"{chunk}: expected a separate file inside the folder, found a link to another file"
             raise SceneError(path, problem, "export it again")
-        seen.add(place)
+        real_paths.add(real_path)
         contents.append(sog.read_unbundled(chunk))
         packed = contents[-1].packed
         if count not in (None, packed.count):
@@ -257,9 +265,9 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
 
 
 def remove_unused_chunks(path: Path) -> None:
-    """Remove the chunks beside an index that it does not name, which are those of the index that it replaced.
+    """Remove chunks beside an index that it does not name; they belong to the index that it replaced.
 
-    Other files in their folders are kept. Chunks that cannot be removed are ignored.
+    Other files in their folders stay. Chunks that cannot be removed are ignored.
     """
     used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
     for folder in path.parent.iterdir():

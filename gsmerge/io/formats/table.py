@@ -33,7 +33,7 @@ NamedPhotos = Sequence[tuple[str, Path | None]]  # names in a model's folder of 
 
 @dataclass(frozen=True)
 class Contents:
-    """The content of an output; a format leaves out what it cannot store."""
+    """The content of an output; a format leaves out parts that it cannot store."""
 
     levels: Sequence[Gaussians]  # the finest first
     comments: Sequence[str] = ()  # lines for the header
@@ -41,13 +41,13 @@ class Contents:
     photos: NamedPhotos = ()  # of the cameras
     title: str = ""
     normals: bool = True  # of a ``.ply``, as in :func:`gsmerge.write_ply`
-    apart: bool = False  # whether the parts of a page are written to files beside it
+    apart: bool = False  # write the parts of a page to files beside it
     extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
 
 
 # A function that writes an output. Its arguments are the function of :func:`gsmerge.io.atomic_outputs` that adds a
-# file, the path of the output, its temporary file, which exists already, and the content. It returns the path of each
-# level, in order, with the temporary files of that level.
+# file, the path of the output, its existing temporary file, and the content. It returns the path of each level, in
+# order, with the temporary files of that level.
 WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]]
 
 
@@ -67,16 +67,18 @@ class Format:
     max_degree: int  # of the harmonics that are written; -1: the format is only read
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
-    finish: Callable[[Path], object] = lambda _: None  # is called with the path after all files were renamed
+    finish: Callable[[Path], object] = lambda _: None  # called with the path after all files were renamed
     holds: Callable[[Path], bool] = lambda _: True  # whether a file with this ending has Gaussians
 
     # Content of its files
-    levels: Literal["", "apart", "inside"] = "apart"  # of detail: a single one, one file for each, or all in one output
-    cameras: Literal["", "inside", "needed"] = ""  # of views: in a file beside it, inside it, or inside and required
+    # Levels of detail: a single one, one file for each, or all in one output
+    levels: Literal["", "apart", "inside"] = "apart"
+    # Cameras of views: in a file beside it, inside it, or inside it and required
+    cameras: Literal["", "inside", "needed"] = ""
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as the format does
-    kept_as: str = ""  # ending of the format whose rounding its Gaussians have, if that is another one
+    kept_as: str = ""  # ending of the format that rounds its Gaussians, if it stores them in another format
     columns: bool = False  # whether the user can choose which of INRIA's columns it has
-    marks: Sequence[str] | None = ()  # header comments of the input that it keeps; None: all that copies keep
+    marks: Sequence[str] | None = ()  # comments of the input that it keeps; None: all of ``copied_comments``
     lost: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
 
     # Its files besides the one that the path names
@@ -129,7 +131,7 @@ HTML = Format(
     ".html", "a page with a viewer and the .sog that it shows", None, None, 3,
     write=_page("site.write_output"), levels="", cameras="inside", round_means=_lazy("sog.round_means"),
     kept_as=".sog", site="index.html", beside=_page("site.files_beside"),
-    each=tuple(_IN_TEXT * each for each in _SOG), rest=_page("site.least_bytes"),
+    each=tuple(_IN_TEXT * sog_bytes for sog_bytes in _SOG), rest=_page("site.least_bytes"),
     measure=_page("site.measure"),
 )  # fmt: skip
 FILES = (  # the first ending that matches counts, so .compressed.ply comes before .ply
@@ -190,19 +192,19 @@ SCENE_SUFFIXES = tuple(
 )
 
 
-def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
-    """Return how many Gaussians fit into a file of at most ``max_bytes``; UsageError if none does.
+def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
+    """Return how many Gaussians fit into a file of at most ``max_bytes``; UsageError if none fits.
 
-    The number is exact for a ``.ply``, and approximate for other formats, whose size depends on their content.
+    The number is exact for a ``.ply``. It is approximate for other formats, since their size depends on the content.
     """
-    if chosen.count is not None:
-        return chosen.count(max_bytes, sh_degree)
-    each, rest = chosen.each[min(sh_degree, len(chosen.each) - 1)], chosen.rest()
-    if max_bytes < rest + each:
-        viewer = f"{rest / 1e6:.2f} MB for the viewer of a page and " if rest else ""
-        problem = f"expected at least {viewer}{each:.0f} bytes for one Gaussian"
-        raise UsageError(f"budget: {problem}, got {human_bytes(max_bytes) if rest else max_bytes}")
-    return int((max_bytes - rest) / each)
+    if format_.count is not None:
+        return format_.count(max_bytes, sh_degree)
+    gaussian_bytes, fixed_bytes = format_.each[min(sh_degree, len(format_.each) - 1)], format_.rest()
+    if max_bytes < fixed_bytes + gaussian_bytes:
+        viewer = f"{fixed_bytes / 1e6:.2f} MB for the viewer of a page and " if fixed_bytes else ""
+        problem = f"expected at least {viewer}{gaussian_bytes:.0f} bytes for one Gaussian"
+        raise UsageError(f"budget: {problem}, got {human_bytes(max_bytes) if fixed_bytes else max_bytes}")
+    return int((max_bytes - fixed_bytes) / gaussian_bytes)
 
 
 def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
@@ -234,7 +236,7 @@ def is_frame(path: Path) -> bool:
 
 
 def may_hold_gaussians(path: Path) -> bool:
-    """Return whether a file has an ending for Gaussians, and content with Gaussians if the ending has other uses."""
+    """Return whether a file has an ending for Gaussians, and for endings with other uses, whether it holds Gaussians."""
     return path.suffix.lower() in SCENE_SUFFIXES and find_format(path).holds(path)
 
 
@@ -243,18 +245,19 @@ def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False)
 
     ``levels``: allow an index of levels of detail. ``cameras``: allow a COLMAP model or a page, which have cameras.
     """
-    named = next((row for row in FORMATS if row.names(path)), None)
-    refused = named is not None and ((named.levels == "inside" and not levels) or (named.cameras and not cameras))
-    chosen, meant = None if refused else named, FOLDERS.get(Path(path).name, named)
-    if meant is not None and meant.cameras == "needed" and not cameras:
-        problem = f"expected a format without cameras, got {meant.about.partition(':')[0]}"
+    by_name = next((row for row in FORMATS if row.names(path)), None)
+    by_folder = FOLDERS.get(Path(path).name, by_name)
+    if by_folder is not None and by_folder.cameras == "needed" and not cameras:
+        problem = f"expected a format without cameras, got {by_folder.about.partition(':')[0]}"
         raise UsageError(f"{path}: {problem}; write a .ply, and convert that with --cameras")
-    if chosen is None or chosen.max_degree < 0:
-        read_only = "" if chosen is None else f"{chosen.ending} can be read but not written; "
+    if by_name is not None and ((by_name.levels == "inside" and not levels) or (by_name.cameras and not cameras)):
+        by_name = None
+    if by_name is None or by_name.max_degree < 0:
+        read_only = "" if by_name is None else f"{by_name.ending} can be read but not written; "
         inside = [row.ending for row in FORMATS if row.cameras == "inside" and row.ending[0] == "."]
         endings = join_words((*OUTPUT_FORMATS, *(inside if cameras else [])))
         index = f", or the name {INDEX}" if levels else ""
         folder = f", or a folder, or a folder named {' or '.join(FOLDERS)}" if cameras else ""
         raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{index}{folder}")
-    chosen.require()
-    return chosen
+    by_name.require()
+    return by_name

@@ -17,10 +17,10 @@ from gsmerge.types import Gaussians, StrPath
 
 def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:
     """Describe which harmonics a format leaves out; None if it stores all. UsageError for an unknown ending."""
-    chosen = output_format(path, levels=True, cameras=True)
-    if sh_degree <= chosen.max_degree:
+    format_ = output_format(path, levels=True, cameras=True)
+    if sh_degree <= format_.max_degree:
         return None
-    return chosen.lost.format(ending=chosen.ending, degree=chosen.max_degree)
+    return format_.lost.format(ending=format_.ending, degree=format_.max_degree)
 
 
 def output_notes(out: Path, sh_degree: int, photos: NamedPhotos) -> list[str]:
@@ -31,19 +31,19 @@ def output_notes(out: Path, sh_degree: int, photos: NamedPhotos) -> list[str]:
 
 def level_output(output: Path, level: int) -> Path:
     """Return the path of a coarser level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
-    cut = len(output.name) - len(output_format(output).ending)
-    return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")
+    stem_length = len(output.name) - len(output_format(output).ending)
+    return output.with_name(f"{output.name[:stem_length]}.level{level}{output.name[stem_length:]}")
 
 
-def write_apart(add: AddOutput, path: Path, first: Path, contents: Contents) -> dict[Path, list[Path]]:
+def write_apart(add: AddOutput, path: Path, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write each level to a separate file, as :data:`gsmerge.io.formats.table.WriteOutput`."""
-    written, ending = {path: [first]}, output_format(path).ending
+    written, ending = {path: [temporary]}, output_format(path).ending
     for level in range(1, len(contents.levels)):
         written[level_output(path, level)] = [add(level_output(path, level))]
     if ending == PLY.ending and contents.extra_columns is not None:
         (gaussians,), extra = contents.levels, contents.extra_columns
         degree = min(gaussians.sh_degree, PLY.max_degree)
-        _write_ply(first, gaussians, True, degree, contents.comments, contents.normals, extra)
+        _write_ply(temporary, gaussians, True, degree, contents.comments, contents.normals, extra)
         return written
     for (file,), gaussians in zip(written.values(), contents.levels, strict=True):
         write_gaussians(
@@ -85,14 +85,14 @@ def write_gaussians(
         >>> gaussians = gsmerge.compact("demo", effort="draft", budget=300).gaussians
         >>> gsmerge.write_gaussians("demo/small.splat", gaussians, overwrite=True)
     """
-    chosen = output_format(ending or path)
-    if chosen.encode is None:
-        degree = min(gaussians.sh_degree, chosen.max_degree)
+    format_ = output_format(ending or path)
+    if format_.encode is None:
+        degree = min(gaussians.sh_degree, format_.max_degree)
         _write_ply(path, gaussians, overwrite, degree, comments, normals)
         return
     check_readable(gaussians, comments)
     with atomic_output(path, overwrite=overwrite) as temporary:
-        temporary.write_bytes(chosen.encode(gaussians, comments))
+        temporary.write_bytes(format_.encode(gaussians, comments))
 
 
 @check_arguments
