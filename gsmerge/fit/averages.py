@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 
-RECENT = 10
+RECENT = 10  # numbers that a recent mean averages
 
 
 @dataclass
@@ -16,7 +16,7 @@ class RecentMean:
     """Mean of about the last ``RECENT`` numbers."""
 
     mean: float = 0.0
-    count: int = 0  # Numbers that count, at most RECENT
+    count: int = 0  # Numbers in the mean, at most RECENT
 
     def add(self, number: float) -> None:
         """Add a number."""
@@ -24,16 +24,16 @@ class RecentMean:
         self.mean += (number - self.mean) / self.count
 
     def restart(self) -> None:
-        """Let only the numbers from the next one on count."""
+        """Forget all numbers so far."""
         self.count = 0
 
 
 @dataclass
 class TailMean:
-    """Mean of the parameters ``[n,14]`` over the last steps, since those of one step are noisy."""
+    """Mean of the parameters ``[n,14]`` over the last steps, because the parameters after a single step are noisy."""
 
     total: np.ndarray | None = None
-    count: int = 0  # Steps that are added
+    count: int = 0  # Number of steps in the total
 
     def add(self, x: np.ndarray) -> None:
         """Add the parameters after a step; begin anew if the number of Gaussians has changed."""
@@ -43,7 +43,7 @@ class TailMean:
         self.total += x
 
     def of(self, x: np.ndarray) -> np.ndarray:
-        """Return the mean with normalised quaternions; ``x`` itself without steps with this number of Gaussians."""
+        """Return the mean with normalised quaternions; ``x`` itself if no step had its number of Gaussians."""
         if self.total is None or len(self.total) != len(x):
             return x
         mean = self.total / self.count

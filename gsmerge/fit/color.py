@@ -1,8 +1,8 @@
 """Fit the colours of Gaussians to the photos.
 
-While geometry, opacities and order stay, every pixel is linear in the colours. So the best colours solve a sparse
-linear system, whose matrix is one splat and one transposed splat. A few preconditioned conjugate-gradient steps are
-enough.
+With fixed geometry, opacities and order, every pixel is linear in the colours. So the best colours solve a sparse
+linear system. A product with its matrix takes one splat and one transposed splat. A few preconditioned
+conjugate-gradient steps are enough.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Gaussians
 
 MAX_RETRIES = 2
-# Factor on the share of held-out patches: few patches would misjudge a scene of few views, and the last steps use all
+# Factor on the share of held-out patches. Few patches would misjudge a scene of few views. The last steps use all
+# patches, so none is lost
 HOLDOUT = 4
 
 
@@ -56,9 +57,9 @@ def fit_colors(
 ) -> FitResult:
     """Fit base colours to the photos, and keep them only if held-out patches get better.
 
-    ``drawn`` are the same Gaussians in the photos, see :func:`draw`; ``seed`` chooses the held-out patches.
-    ``color_precision [n]`` weighs each present colour as a prior, by the pixels of earlier photos that it was fitted
-    to. Geometry, opacities and higher harmonics stay.
+    ``drawn`` are the same Gaussians in the photos, see :func:`draw`; ``seed`` chooses the held-out patches. The present
+    colours are a prior with the weights ``color_precision [n]``: the number of pixels of earlier photos to which each
+    colour was fitted. Geometry, opacities and higher harmonics stay.
     """
     train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
     precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)
@@ -89,7 +90,7 @@ class ColorSystem:
         return parallel_map(lambda view: self._image(view, x), range(len(self.photos)))
 
     def score(self, x: np.ndarray | None = None) -> float:
-        """Return the PSNR (dB) of the held-out patches; None: with the colours before the fit."""
+        """Return the PSNR (dB) of the held-out patches at offsets ``x``; None: with the colours before the fit."""
         images = self.drawn.images if x is None else self._images(x)
         return holdout_psnr(images, self.photos, self.train, self.options.tuning.min_gain)
 
@@ -140,8 +141,8 @@ class ColorSystem:
 def solve_colors(system: ColorSystem, start: np.ndarray, options: FitOptions) -> tuple[np.ndarray, FitReport]:
     """Solve for offsets ``[n,3]`` of the base colours; return ``start`` if the held-out patches get worse.
 
-    The first third of the steps uses equal weights. In the second third, badly fitting pixels count less and exposure
-    is compensated. The last third uses all pixels, including the held-out patches.
+    The first third of the steps uses equal weights. In the second third, pixels with large errors count less, and
+    exposure is compensated. The last third uses all pixels, including the held-out patches.
     """
     steps = options.tuning.iterations
     third = steps // 3
@@ -162,16 +163,17 @@ def solve_colors(system: ColorSystem, start: np.ndarray, options: FitOptions) ->
 def conjugate_gradients(system: ColorSystem, x: np.ndarray, iterations: int, prior_weight: float) -> np.ndarray:
     """Run Jacobi-preconditioned conjugate gradients (Hestenes and Stiefel 1952) from ``x [n,3]`` on.
 
-    They minimise sum |gain (prior + W x) - photo|^2 + (prior_weight mass + precision) |x|^2.
+    They minimise sum |gain (render + W x) - photo|^2 + (prior_weight mass + precision) |x|^2, where W are the blending
+    weights, and ``render`` is the image before the fit.
     """
     mass, r = system.residual(x)
-    back = prior_weight * mass + system.precision
-    r = r - back * x
+    prior = prior_weight * mass + system.precision
+    r = r - prior * x
     inverse = 1 / (mass * (1 + prior_weight) + system.precision + 1e-6)
     z = inverse * r
     p, rz = z, (r * z).sum(0)
     for _ in range(iterations):
-        ap = system.normal(p) + back * p
+        ap = system.normal(p) + prior * p
         step = rz / ((p * ap).sum(0) + 1e-12)
         x, r = x + step * p, r - step * ap
         z = inverse * r
@@ -181,6 +183,6 @@ def conjugate_gradients(system: ColorSystem, x: np.ndarray, iterations: int, pri
 
 
 def _add_offsets(sh0: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Add offsets to base colours; keep them in [-0.05, 1.05], or no farther outside than before."""
+    """Add offsets to base colours; clip the colours to [-0.05, 1.05], or to their value before if that is outside."""
     before = sh0_to_rgb(sh0)
     return rgb_to_sh0((before + offsets).clip(before.clip(None, -0.05), before.clip(1.05)))

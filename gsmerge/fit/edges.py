@@ -1,6 +1,6 @@
-"""Edges of the views, at which a fit cuts its Gaussians, since no photo says how far they reach beyond.
+"""Cut the Gaussians of a fit at the edges of the views, because no photo shows how far they reach beyond.
 
-To a viewer who steps back, Gaussians across the edges of all views are a soft rim and clouds around the scene.
+Gaussians across the edges of all views look like a soft rim and clouds around the scene to a viewer who steps back.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from gsmerge.pooling import principal_axes
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
-# How far the edges are moved out, in distances from one Gaussian to the next if the result were spread evenly over all
-# photos. Border pixels also show Gaussians that are centred outside of the picture
+# Distance by which the edges are moved out. Its unit is the distance between neighbouring Gaussians, if the result were
+# spread evenly over all photos. Border pixels also show Gaussians with centres outside of the picture
 MARGIN = 2.0
-ROWS = 16384  # Gaussians per piece of work
+ROWS = 16384  # Gaussians per task
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,25 +42,25 @@ def find_edges(cameras: Cameras, count: int) -> Edges:
     focals, middles = Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2]
     left, top = ((-margin - middles) / focals).T
     right, bottom = ((size + margin - middles) / focals).T
-    zero, one = np.zeros(num), np.ones(num)
-    sides = (-one, zero, left), (one, zero, -right), (zero, -one, top), (zero, one, -bottom)
-    local = np.stack([np.stack(side, 1) for side in sides], 1)  # in the camera's axes
-    local /= np.sqrt((local**2).sum(2, keepdims=True))
-    normals = np.stack([matmul(rows, viewmat[:3, :3]) for rows, viewmat in zip(local, viewmats, strict=True)])
+    zeros, ones = np.zeros(num), np.ones(num)
+    sides = (-ones, zeros, left), (ones, zeros, -right), (zeros, -ones, top), (zeros, ones, -bottom)
+    camera_normals = np.stack([np.stack(side, 1) for side in sides], 1)  # in the axes of each camera
+    camera_normals /= np.sqrt((camera_normals**2).sum(2, keepdims=True))
+    normals = np.stack([matmul(rows, viewmat[:3, :3]) for rows, viewmat in zip(camera_normals, viewmats, strict=True)])
     return Edges(normals, (normals * camera_centres(viewmats)[:, None]).sum(2))
 
 
 def cut_state(state: FitState, edges: Edges) -> None:
-    """Cut the Gaussians of a state at the edges of all views, in place, except those that are fixed.
+    """Cut the Gaussians of a state at the edges of all views, in place, except fixed Gaussians.
 
-    The limits of their means move to the centres of what is left; those of their scales stay.
+    The limits of means move to the means after the cut. The limits of scales stay.
     """
     splats, x = state.splats, state.x
     means, covars, is_cut = splats.means.copy(), np.empty((len(x), 3, 3)), np.zeros(len(x), np.uint8)
 
-    def cut(first: int) -> None:
-        last = min(first + ROWS, len(x))
-        cut_at_edges(splats.quats, splats.scales, edges.normals, edges.offsets, first, last, means, covars, is_cut)
+    def cut(start: int) -> None:
+        stop = min(start + ROWS, len(x))
+        cut_at_edges(splats.quats, splats.scales, edges.normals, edges.offsets, start, stop, means, covars, is_cut)
 
     parallel_map(cut, range(0, len(x), ROWS))
     rows = np.flatnonzero(is_cut.astype(bool) & ~state.fixed)

@@ -12,7 +12,7 @@ from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.raster import Splats
 from gsmerge.types import SH_C0, Gaussians, Region
 
-# What rows of a state carry along in addition to what follows from their parameters
+# Columns of a state that do not follow from its parameters, so they are copied with its rows
 CARRIED = ("x0", "m", "v", "units", "box_shares", "min_sizes", "origins", "fixed")
 
 
@@ -25,10 +25,10 @@ class FitState:
     m: np.ndarray  # First moment
     v: np.ndarray  # Second moment
     units: np.ndarray  # [n] size: geometric mean of the two largest scales at the start
-    box_shares: np.ndarray  # [n] share of the box about the start for means and scales
+    box_shares: np.ndarray  # [n] share of the box about the start within which means and scales may move
     min_sizes: np.ndarray  # [n] least log scale of each Gaussian
-    origins: np.ndarray  # [n] row of the start that each Gaussian comes from
-    fixed: np.ndarray  # [n] bool, whether each Gaussian stays as it is
+    origins: np.ndarray  # [n] row of the start from which each Gaussian comes
+    fixed: np.ndarray  # [n] bool, Gaussians that stay unchanged
     splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
     colors: np.ndarray  # [n,3] base colours, sRGB
 
@@ -40,7 +40,7 @@ class FitState:
         return state
 
     def keep_inside(self, region: Region) -> None:
-        """Move centres outside of a region to its border, in place, except those of fixed Gaussians."""
+        """Move centres outside of a region to its border, in place; fixed Gaussians stay."""
         rows = np.flatnonzero(~lies_inside(region, self.x[:, :SIZE]) & ~self.fixed)
         self.x[rows, :SIZE] = self.splats.means[rows] = clamp_inside(region, self.x[rows, :SIZE])
 

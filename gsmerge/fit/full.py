@@ -1,8 +1,9 @@
 """Fit all parameters of Gaussians to photos, by a short optimisation that is confined to a box about the start.
 
-Each step draws one view over a random background. Its loss is the L1 of pixels and of their differences, and structural
-similarity. Adam's rates are in units of each Gaussian's own size. The first steps draw samples of the photos' pixels.
-Long runs begin with fewer Gaussians than they may have, and add the rest where the error is.
+Each step draws one view over a random background. Its loss combines the L1 error of pixels, the L1 error of differences
+between neighbouring pixels, and structural similarity. Adam's rates are in units of each Gaussian's own size. The first
+steps draw samples of the photos' pixels. Long runs begin with fewer Gaussians than they may have, and add the rest at
+large errors.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def fit_full(
     """Fit all parameters of Gaussians to the photos of a run.
 
     Held-out patches are scored once the first steps are done. If they are no better than at the start, the start is
-    returned; otherwise the other steps follow, which use every patch.
+    returned. Otherwise the remaining steps follow, which use every patch.
 
     Args:
         gaussians: The n Gaussians to start from.
@@ -46,7 +47,7 @@ def fit_full(
     """
     fit = start_fit(gaussians, run, survey, fixed)
     while fit.step < fit.steps:
-        if fit.progress >= run.half_part:  # before it grows: halves that were never fitted show less
+        if fit.progress >= run.half_part:  # before the growth, because new halves score worse until they are fitted
             score_fit(fit)
         if fit.is_refused:
             break
@@ -60,7 +61,7 @@ def fit_full(
 
 @dataclass(eq=False)
 class FullFit:
-    """A full fit that is under way."""
+    """State of a running full fit."""
 
     run: FitRun
     optimiser: Optimiser
@@ -77,7 +78,7 @@ class FullFit:
 
     @property
     def progress(self) -> float:
-        """The share of the steps that are taken."""
+        """Share of the steps taken so far."""
         return self.step / self.steps
 
     @property
@@ -90,9 +91,9 @@ class FullFit:
         """The photos at half size, at the poses that the fit has reached."""
         return self.optimiser.photos[1]
 
-    def reaches(self, *parts: float) -> bool:
-        """Return whether the next step is the first one at or after one of the ``parts`` of the run."""
-        return any(self.last < part <= self.progress for part in parts)
+    def reaches(self, *milestones: float) -> bool:
+        """Return whether the next step is the first at or after one of the ``milestones``, shares of the steps."""
+        return any(self.last < milestone <= self.progress for milestone in milestones)
 
 
 def start_fit(gaussians: Gaussians, run: FitRun, survey: Survey | None, fixed: np.ndarray | None) -> FullFit:
@@ -112,9 +113,9 @@ def score_fit(fit: FullFit) -> None:
 
 
 def renew_state(fit: FullFit) -> None:
-    """Grow the state, drop its faint Gaussians, and cut it at the edges of the views, where each is due.
+    """Grow the state, drop its faint Gaussians, or cut it at the edges of the views, if one of these is due.
 
-    Its rows and axes then have another meaning, so the mean of the last steps begins anew.
+    The rows and axes of the state change their meaning, so the mean of the last steps begins anew.
     """
     job, options = fit.run.job, fit.run.job.options
     if not options.grows or not fit.reaches(GROWTH, *CLEARS, *CUTS):
@@ -129,7 +130,7 @@ def renew_state(fit: FullFit) -> None:
 
 
 def take_step(fit: FullFit) -> None:
-    """Take a step on a photo, and one on a view from outside where it is due."""
+    """Take a step on a photo, and also a step on a view from outside if one is due."""
     run, progress = fit.run, fit.progress
     step = fit.schedule.draw(fit.step + 1, progress, len(fit.state.x))
     if fit.reaches(run.half_part):  # whole photos have another error than samples
@@ -158,7 +159,7 @@ def report_step(fit: FullFit) -> None:
 
 
 def end_fit(fit: FullFit, start: Gaussians) -> FitResult:
-    """Return the result of a fit, which is the ``start`` if held-out patches got no better, and a report."""
+    """Return the result of a fit and a report; the result is the ``start`` if held-out patches got no better."""
     options, after = fit.run.job.options, fit.before if fit.after is None else fit.after
     if fit.is_refused:
         why = f"held-out patches of the photos were no better after {fit.step} steps"
@@ -175,11 +176,12 @@ def end_fit(fit: FullFit, start: Gaussians) -> FitResult:
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
     """Return the share ``[n]`` of its box that each Gaussian may use, and its least log scale ``[n]``.
 
-    The share is the effective number of photos that show the Gaussian, less 1, between ``single_view_share`` and 1. For
-    its blending weights w in the photos this number is (sum w)^2 / sum w^2. The least scale is ``min_scale`` pixels of
-    the largest photo that shows the Gaussian from nearest (the 3D filter of Mip-Splatting), and none if no photo does.
+    The share is the effective number of photos of the Gaussian minus 1, clipped to ``single_view_share`` and 1. The
+    effective number is (sum w)^2 / sum w^2, where w are the sums of the Gaussian's blending weights in each photo. The
+    least scale is ``min_scale`` times the finest pixel that shows the Gaussian (the 3D filter of Mip-Splatting). If no
+    photo shows the Gaussian, there is no least scale.
     """
-    photos_each = survey.sums**2 / np.maximum(survey.squares, 1e-12)
-    box_shares = np.clip(photos_each - 1, rates.single_view_share, 1).astype(np.float32)
+    num_photos = survey.sums**2 / np.maximum(survey.squares, 1e-12)
+    box_shares = np.clip(num_photos - 1, rates.single_view_share, 1).astype(np.float32)
     pixels = np.where(np.isfinite(survey.pixels), survey.pixels, 0)
     return box_shares, log(rates.min_scale * pixels).astype(np.float32)

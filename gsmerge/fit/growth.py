@@ -1,4 +1,4 @@
-"""Add Gaussians to those under optimisation by splitting the ones with the largest errors."""
+"""Add Gaussians during the optimisation, by splitting the Gaussians with the largest errors."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from gsmerge.raster import composite, splat_adjoint, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import in_turn
 
-# Distance of halves from the middle of their parent, in its standard deviations. Those of the halves shrink so that the
-# pair has the parent's
+# Distance of a half from the middle of its parent, in standard deviations of the parent. The standard deviations of
+# halves shrink, so that the pair together has the standard deviation of the parent
 OFFSET = 0.7
 FADED = 0.005  # opacity that counts as none; halves of more opaque Gaussians have 1 / 255 or more, so they are drawn
 FAINT = 0.02  # opacity of Gaussians that late in a run will fade away; without them the run takes .9 of the time
-# Optical depth of a half, as a share of its parent's. Halves are narrower, so that two of 0.7 cover as much as the
-# parent; a little more closes gaps
+# Optical depth of a half, as a share of the parent's depth. Halves are narrower than the parent, so two halves of 0.7
+# cover as much as the parent; a little more closes gaps
 DEPTH = 0.8
 
 
@@ -46,16 +46,34 @@ def grow_to(state: FitState, half: Photos, count: int, least: float = FADED) -> 
 def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.ndarray]:
     """Split the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
 
-    Each is split at most once, so the number at most doubles. Gaussians that no photo shows are not split. Both halves
-    inherit momentum, share of the box and least size. First halves keep the rows of their parents, second halves are
-    appended. Returns the state and its masses, of which each half has half of its parent's.
+    Each Gaussian is split at most once, so the number at most doubles. Gaussians that no photo shows are not split.
+    Both halves inherit momentum, share of the box and least size. First halves keep the rows of their parents, second
+    halves are appended. Returns the state and its masses; a half has half of its parent's mass.
     """
     num = min(count - len(state.x), int((masses > 0).sum()))
     if num <= 0:
         return state, masses
     worst = np.sort(np.argsort(-masses, kind="stable")[:num])
-    parents, rows = state.x[worst], np.arange(num)
-    longest = parents[:, SIZE:QUAT].argmax(1)
+    first_halves, second_halves = split_parameters(state.x[worst])
+    x = np.concatenate([state.x, second_halves])
+    x[worst] = first_halves
+    parents = np.concatenate([np.arange(len(state.x)), worst])
+    grown = state_of(x, state.splats.shN[parents])
+    is_half = np.zeros(len(x), bool)
+    is_half[worst] = is_half[len(state.x) :] = True
+    unsplit = ~is_half[: len(state.x)]
+    # halves start anew: the centre of their box and their unit of size follow from their own parameters
+    grown.x0[~is_half], grown.units[~is_half] = state.x0[unsplit], state.units[unsplit]
+    for name in set(CARRIED) - {"x0", "units"}:
+        getattr(grown, name)[:] = getattr(state, name)[parents]
+    masses = masses[parents]
+    masses[is_half] /= 2
+    return grown, masses
+
+
+def split_parameters(parents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split parameters ``[m,14]`` across the longest axis; return the parameters of the first and the second halves."""
+    rows, longest = np.arange(len(parents)), parents[:, SIZE:QUAT].argmax(1)
     reach = OFFSET * exp(parents[rows, SIZE + longest])
     rotations = quat_to_rotmat(parents[:, QUAT:LOGIT])
     shift = rotations[rows, :, longest] * reach[:, None]
@@ -63,27 +81,16 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
     halves[rows, SIZE + longest] += 0.5 * log(1 - OFFSET**2)
     transmittances = 1 / (1 + exp(halves[:, LOGIT].astype(np.float64)))  # 1 - opacity
     halves[:, LOGIT] = log(1 / power(transmittances, DEPTH) - 1)
-    x = np.concatenate([state.x, halves])
-    x[worst] = halves
-    x[worst, :3] -= shift
-    x[len(state.x) :, :3] += shift
-    source = np.concatenate([np.arange(len(state.x)), worst])
-    grown = state_of(x, state.splats.shN[source])
-    is_half = np.zeros(len(x), bool)
-    is_half[worst] = is_half[len(state.x) :] = True
-    unsplit = ~is_half[: len(state.x)]
-    grown.x0[~is_half], grown.units[~is_half] = state.x0[unsplit], state.units[unsplit]
-    for name in set(CARRIED) - {"x0", "units"}:
-        getattr(grown, name)[:] = getattr(state, name)[source]
-    masses = masses[source]
-    masses[is_half] /= 2
-    return grown, masses
+    first_halves, second_halves = halves, halves.copy()
+    first_halves[:, :SIZE] -= shift
+    second_halves[:, :SIZE] += shift
+    return first_halves, second_halves
 
 
 def error_masses(state: FitState, half: Photos) -> np.ndarray:
     """Sum each Gaussian's blending weight times the absolute pixel error over half-size photos: ``[n]``.
 
-    Errors count by the importance of their pixels.
+    Errors are multiplied by the importance of their pixels.
     """
 
     def one_view(view: int) -> np.ndarray:

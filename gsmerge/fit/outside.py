@@ -1,8 +1,8 @@
 """Views from outside of the capture, from which a fit removes fog and veils.
 
-Photos do not show the space between them or in front of other cameras, and a fit fills it with large Gaussians. To a
-viewer who steps back, they are fog where the input is empty, and veils in front of what it shows. So some steps of a
-fit draw views from behind, beside, above and below, and compare opacities and depths with those of the input.
+Photos do not show the space between them or in front of other cameras, and a fit fills it with large Gaussians. A
+viewer who steps back sees them as fog where the input is empty, and as veils in front of its surfaces. So some steps of
+a fit draw views from behind, beside, above and below, and compare their opacities and depths with the input's.
 """
 
 from __future__ import annotations
@@ -25,48 +25,49 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
-# Least and largest step back, as a share of the depth of what a view shows, and rotations about its middle to the
-# sides, and up or down, degrees. Without a step back the cameras would see the same as new views, in which a fit has to
-# fill gaps
+# Bounds of three numbers: the step back, as a share of the median depth of a view; the rotation to the sides about the
+# middle of the view, degrees; and the rotation up or down, degrees. Without a step back the cameras would see the same
+# as new views, in which a fit has to fill gaps
 LOW, HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
-# Steps of three numbers, modulo one, that fill a cube evenly, whatever their number (the R sequence of Roberts 2018)
+# Multiples of this vector, modulo one, fill a cube evenly, whatever their number (the R sequence of Roberts 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
-PLACES = 42  # views from outside, at most, or the number of photos if that is more
-SAMPLE = 2000  # Gaussians that measure how far away the middle of a view is
-# Gaussians for each photo, of at most PLACES photos, that stand for the whole input. They are made larger the fewer
-# they are, since a picture has the same number of pixels, however many photos there are
+PLACES = 42  # most views from outside, or the number of photos if that is more
+SAMPLE = 2000  # the depths of views are measured by at least this many Gaussians, if there are as many
+# Gaussians for each photo, of at most PLACES photos, that represent the whole input. The fewer they are, the larger
+# they are made, because a picture has the same number of pixels, however many photos there are
 ROWS = 4000
-NEAREST = 0.25  # near plane, as a share of the depth of what a view shows
-# Depths from FARTHEST times the quantile LAST on count as that, since a flyaway moves the mean depth of its pixels
+NEAREST = 0.25  # near plane, as a share of the median depth of a view
+# Larger depths are clipped to FARTHEST times the quantile LAST of the depths, because a flyaway moves the mean depth of
+# its pixels
 LAST, FARTHEST = 0.98, 4.0
 EMPTY, SOLID = 0.15, 0.9  # opacities of the input below which a pixel is empty, and above which it shows a surface
-# Distance from what the input shows, as a share of the width, within which pixels do not count: what stands beside an
-# outline fills what the foreground uncovers in new views
+# Empty pixels do not count within this distance of the input's outlines, as a share of the width, because Gaussians
+# beside an outline fill the background that the foreground uncovers in new views
 RIM = 0.04
-MARGIN = 0.15  # share of a surface's depth by which the mean depth of a pixel may be less before it counts as veiled
-# Gaussians of the start for each photo from which on fog weighs as much as errors of the photos. Fewer ones are larger
-# and reach from the borders of photos into empty space, and would leave both. LIGHT is the least weight of fog, VEIL
-# the weight of veils in units of that of fog
+MARGIN = 0.15  # a pixel is veiled if its loss (see veil_gradients) is larger: the mean depth is less by such a share
+# With at least MANY Gaussians of the start for each photo, fog weighs as much as errors of the photos. If there are
+# fewer, they are larger and reach from the borders of photos into empty space. With the full weight they would vanish
+# from both, so fog weighs less, but at least LIGHT. VEIL is the weight of veils relative to fog
 MANY, LIGHT, VEIL = 1000, 0.15, 30
 LEVEL = 3  # size of a picture's pixels in pixels of the photo; at 2 fog is as thin, at 4 it is a fifth thicker
 LEAST_WIDTH = 64  # least width of the pictures, pixels
-LEAST = 0.005  # share of a picture that must be empty or solid for the picture to count
-TOUCHED = 1e-9  # gradient of the opacity from which on a Gaussian takes part in a step
-SCORED = 12  # views, at most, in which the fog of a result is measured
+LEAST = 0.005  # a picture counts if more than this share of it is empty or solid
+TOUCHED = 1e-9  # a Gaussian takes part in a step if the gradient of its opacity is larger
+SCORED = 12  # most views in which the fog of a result is measured
 
 
 @dataclass(frozen=True, eq=False)
 class Outside:
-    """Views from outside, and the depth of what the input shows in each pixel."""
+    """Views from outside, and the depth of the input's surface in each pixel."""
 
     views: Photos  # Black pictures; weights [v,h,w] are 0 for pixels that do not count
-    # [v,h,w] camera z before which nothing should stand: infinite where the input is empty, 0 where anything may stand
+    # [v,h,w] least camera z of Gaussians in each pixel: infinite where the input is empty, 0 where there is no limit
     limits: np.ndarray
     near: np.ndarray  # [v] camera z of the near plane
-    far: np.ndarray  # [v] camera z that what is farther is given
+    far: np.ndarray  # [v] camera z to which larger depths are clipped
 
     def contradict(self, points: np.ndarray, share: float) -> np.ndarray:
-        """Return a mask ``[n]`` of points ``[n,3]`` that stand before a ``share`` of the limit in some view."""
+        """Return a mask ``[n]`` of the points ``[n,3]`` that some view sees nearer than a ``share`` of the limit."""
         cameras = Cameras(self.views.viewmats, self.views.Ks, self.views.width, self.views.height)
         pixels, z = project(points, cameras)
         inside = (z > self.near[:, None]) & is_inside(pixels, cameras)
@@ -79,52 +80,65 @@ class Outside:
 def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options: FitOptions) -> Outside | None:
     """Place views outside of the capture for a fit from a ``start``, and draw the scene in them to find their limits.
 
-    Cameras step back from those of ``photos``. Pictures are a third as large, at least ``LEAST_WIDTH`` wide. A scene
-    without Gaussians, as when blocks are joined, is replaced by the start. Returns None if no step draws such a view,
-    or if too few pixels of each would count.
+    The cameras are those of ``photos``, stepped back. Pictures are a third as large, at least ``LEAST_WIDTH`` wide. If
+    the scene has no Gaussians, as when blocks are joined, the start is drawn instead. Returns None if no step draws a
+    view from outside, or if too few pixels of each view would count.
     """
     num_steps = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
     if num_steps == 0:
         return None
-    rows = _sample(scene, ROWS * min(len(photos), PLACES)) if len(scene.gaussians) else start
-    if len(rows) == 0 or len(photos) == 0:
+    sample = _sample(scene, ROWS * min(len(photos), PLACES)) if len(scene.gaussians) else start
+    if len(sample) == 0 or len(photos) == 0:
         return None
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
-    points = rows.means[:: max(1, len(rows) // SAMPLE)]
+    points = sample.means[:: max(1, len(sample) // SAMPLE)]
     placed = outside_cameras(points, cameras, min(num_steps, max(PLACES, len(photos))), LOW, HIGH)
-    depths = [depths_inside(points, cameras[[view]]) for view in range(min(len(placed), len(cameras)))]
-    near, far = np.resize([np.quantile(of_view, (0.5, LAST)) for of_view in depths], (len(placed), 2)).T
-    near, far = NEAREST * near, FARTHEST * far
-    views, drawn = blank_photos(placed, min(LEVEL, photos.width / LEAST_WIDTH)), make_splats(rows)
-
-    def find_limits(view: int) -> np.ndarray:
-        depths, left = blend_depths(_tile(drawn, views, view, near[view]), far[view])
-        opacities = 1 - left
-        return np.where(mark_empty(opacities), np.inf, np.where(opacities > SOLID, depths, 0)).astype(np.float32)
-
-    limits = np.stack(list(in_turn(find_limits, range(len(views)))))
-    weight = np.float32(np.clip(len(start) / (MANY * len(photos)), LIGHT, 1.0))
-    weights = weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL, 0)).astype(np.float32)
+    near, far = _depth_range(points, cameras, len(placed))
+    views = blank_photos(placed, min(LEVEL, photos.width / LEAST_WIDTH))
+    limits = _find_limits(make_splats(sample), views, near, far)
+    fog_weight = np.float32(np.clip(len(start) / (MANY * len(photos)), LIGHT, 1.0))
+    weights = fog_weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL, 0)).astype(np.float32)
     ids = np.flatnonzero((limits > 0).mean((1, 2)) > LEAST).tolist()
     return Outside(replace(views[ids], weights=weights[ids]), limits[ids], near[ids], far[ids]) if ids else None
 
 
+def _depth_range(points: np.ndarray, cameras: Cameras, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the near plane and the largest depth of ``count`` views from outside, each ``[count]``.
+
+    They follow from the depths of ``points [n,3]`` in the ``cameras`` from which the views step back, in turn.
+    """
+    depths = [depths_inside(points, cameras[[view]]) for view in range(min(count, len(cameras)))]
+    median, last = np.resize([np.quantile(view_depths, (0.5, LAST)) for view_depths in depths], (count, 2)).T
+    return NEAREST * median, FARTHEST * last
+
+
+def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Draw the input in v views from outside; return the limits ``[v,h,w]`` of :class:`Outside`."""
+
+    def view_limits(view: int) -> np.ndarray:
+        depths, transmittance = blend_depths(_tile(splats, views, view, near[view]), far[view])
+        opacities = 1 - transmittance
+        return np.where(mark_empty(opacities), np.inf, np.where(opacities > SOLID, depths, 0)).astype(np.float32)
+
+    return np.stack(list(in_turn(view_limits, range(len(views)))))
+
+
 def _sample(scene: Scene, count: int) -> Gaussians:
-    """Return about ``count`` of a scene's Gaussians, evenly among the rows, enlarged to cover as much as all do."""
-    rows = np.arange(len(scene.gaussians))
-    step = max(1, len(rows) // max(1, count))
-    first = np.arange(0, len(rows) - step + 1, step)
-    sample = scene.gaussians[rows[first + (step * (EVEN[0] * np.arange(len(first)) % 1)).astype(np.int64)]]
+    """Return about ``count`` of a scene's Gaussians, evenly among the rows, enlarged to cover the same area."""
+    num_rows = len(scene.gaussians)
+    step = max(1, num_rows // max(1, count))
+    starts = np.arange(0, num_rows - step + 1, step)  # one Gaussian is taken from each run of `step` rows
+    sample = scene.gaussians[starts + (step * (EVEN[0] * np.arange(len(starts)) % 1)).astype(np.int64)]
     return replace(sample, scales=sample.scales * np.float32(math.sqrt(step)))
 
 
 def outside_cameras(
     means: np.ndarray, cameras: Cameras, count: int, low: Sequence[float], high: Sequence[float]
 ) -> Cameras:
-    """Return ``count`` cameras, each stepped back from the points ``[n,3]`` that a camera sees and rotated about them.
+    """Return ``count`` cameras: the given ``cameras`` in turn, each stepped back and rotated about the middle it sees.
 
-    The centre of the rotation is the middle of the points. ``low`` and ``high`` are the least and the largest step
-    back, rotation to the sides, and rotation up or down, in the units of ``LOW``.
+    The middle is at the middle depth of the points ``means [n,3]``. ``low`` and ``high`` are the least and the largest
+    step back, rotation to the sides, and rotation up or down, in the units of ``LOW``.
     """
     depths = [middle_depth(means, cameras[[view]]) for view in range(min(count, len(cameras)))]
     views, viewmats = [number % len(cameras) for number in range(count)], []
@@ -153,33 +167,36 @@ def _tiles_of(weights: np.ndarray) -> np.ndarray:
 
 
 def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
-    """Return the gradients of what stands before the limits of a view, for each Gaussian with a part in it.
+    """Return the gradients of the fog and the veils in a view, for each Gaussian with an effect on them.
 
-    The loss of a pixel is its opacity, less its blended depth over the limit; where the input is empty, it is the
-    opacity. The loss of the view is the weighted mean over pixels. Where the input shows a surface, pixels with a loss
-    of ``MARGIN`` or less do not count.
+    The loss of a pixel is its opacity minus the quotient of its blended depth and the limit. Where the input is empty,
+    the loss is the opacity. The loss of the view is the weighted mean over pixels. Where the input shows a surface,
+    pixels with a loss of ``MARGIN`` or less do not count.
     """
     views, limits = outside.views, outside.limits[view]
     assert views.weights is not None
     tiled = _tile(splats, views, view, outside.near[view], _tiles_of(views.weights[view]))
     depths = depth_colors(tiled, outside.far[view])
-    image, left = blend(tiled, depths, np.zeros(3, np.float32))
-    inverse = np.where(limits > 0, 1 / np.maximum(limits, np.float32(1e-12)), np.float32(0))
-    hidden = 1 - left - image[..., 0] * inverse
-    weights = np.where((hidden > MARGIN) | np.isinf(limits), views.weights[view], 0) / np.float32(limits.size)
-    wanted = np.zeros_like(image)
-    wanted[..., 0] = -weights * inverse
-    g = gradients_of(tiled, depths, image, left, wanted, -weights, with_viewmat=False)
+    image, transmittance = blend(tiled, depths, np.zeros(3, np.float32))  # the depth is in the first channel
+    inverse_limits = np.where(limits > 0, 1 / np.maximum(limits, np.float32(1e-12)), np.float32(0))
+    losses = 1 - transmittance - image[..., 0] * inverse_limits
+    weights = np.where((losses > MARGIN) | np.isinf(limits), views.weights[view], 0) / np.float32(limits.size)
+    image_gradient = np.zeros_like(image)
+    image_gradient[..., 0] = -weights * inverse_limits
+    g = gradients_of(tiled, depths, image, transmittance, image_gradient, -weights, with_viewmat=False)
     g.colors[:] = 0
-    return g[np.flatnonzero(g.opacities > TOUCHED)]  # what stands behind should not gain opacity
+    return g[np.flatnonzero(g.opacities > TOUCHED)]  # Gaussians behind the limit should not gain opacity
 
 
 def score_fog(splats: Splats, outside: Outside) -> float | None:
-    """Measure the mean opacity, in [0, 1], where the input is empty in a sample of the views; None if it is nowhere."""
+    """Measure the mean opacity, in [0, 1], of pixels at which the input is empty; None if there are none.
+
+    At most about ``SCORED`` evenly spaced views are drawn.
+    """
     fog, count = 0.0, 0
     for view in range(0, len(outside.views), -(-len(outside.views) // SCORED)):
         empty = np.isinf(outside.limits[view])
-        _, left = blend_depths(_tile(splats, outside.views, view, outside.near[view], _tiles_of(empty)))
-        fog += float((1 - left[empty]).sum(dtype=np.float64))
+        _, transmittance = blend_depths(_tile(splats, outside.views, view, outside.near[view], _tiles_of(empty)))
+        fog += float((1 - transmittance[empty]).sum(dtype=np.float64))
         count += int(empty.sum())
     return fog / count if count else None

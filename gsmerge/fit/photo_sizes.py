@@ -53,18 +53,21 @@ def _with_empty(photos: Photos, scene: PicturedScene) -> Photos:
 
 def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float, str | None]:
     """Choose the size of photos in a fit as a multiple of the views' size, at least 1; also say why it is reduced."""
-    wanted, largest = options.photo_scale, largest_scale(scene)
-    allowed = options.fit == "full" and options.half_res_part < 1
-    if wanted == "auto":
-        worth = allowed and auto and largest >= MIN_AUTO_SCALE
-        return (min(largest, AUTO_SCALE) if worth else 1.0), None
-    if wanted == 1:
+    requested, largest = options.photo_scale, largest_scale(scene)
+    can_enlarge = options.fit == "full" and options.half_res_part < 1
+    if requested == "auto":
+        enlarges = can_enlarge and auto and largest >= MIN_AUTO_SCALE
+        return (min(largest, AUTO_SCALE) if enlarges else 1.0), None
+    if requested == 1:
         return 1.0, None
-    if not allowed:
-        return 1.0, f"photo_scale {wanted:g} is 1: larger photos need the full fit, with steps on photos of full size"
-    if wanted > largest * (1 + ALIKE):
-        return largest, f"photo_scale {wanted:g} is {largest:.3g}: the photos are no larger"
-    return float(min(wanted, largest)), None
+    if not can_enlarge:
+        return (
+            1.0,
+            f"photo_scale {requested:g} is 1: larger photos need the full fit, with steps on photos of full size",
+        )
+    if requested > largest * (1 + ALIKE):
+        return largest, f"photo_scale {requested:g} is {largest:.3g}: the photos are no larger"
+    return float(min(requested, largest)), None
 
 
 def largest_scale(scene: Scene) -> float:
@@ -79,7 +82,7 @@ def largest_scale(scene: Scene) -> float:
 def large_photos(scene: Scene, scale: float) -> Photos:
     """Read the photos at ``scale`` times the views' size, at most :func:`largest_scale`, one by one.
 
-    They are uint8, because they may take as much memory as the scene. Their low-pass filter is that of a viewer of this
+    They are uint8, because they may take as much memory as the scene. They have the low-pass filter of a viewer at this
     size. Raises ValueError if the scene has no larger photos.
     """
     large, cameras = scene.large_photos, scene.cameras
@@ -100,7 +103,7 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
     """Return training weights ``[h,w]`` float32 per view: 0 on held-out patches, the photo's weights elsewhere.
 
-    Pixels with a weight below 1 are not held out; those with a weight of 0 get the weight ``HIDDEN``.
+    Pixels with a weight below 1 are not held out; a weight of 0 is replaced by ``HIDDEN``.
     """
     return [training_weight(photos, view, share, seed) for view in range(len(photos))]
 
@@ -108,7 +111,7 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
 def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.ndarray:
     """Return the training weights ``[h,w]`` float32 of one view; see :func:`training_weights`.
 
-    At least one of the patches in which the photo counts is held out, if there are several.
+    If the photo counts in several patches, at least one of them is held out.
     """
     size = max(1, min(PATCH, min(photos.height, photos.width) // 4))
     rows, columns = -(-photos.height // size), -(-photos.width // size)
@@ -116,9 +119,9 @@ def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.nd
     counting = np.ones((rows, columns), bool) if photos.weights is None else _counting_patches(photos, view, size)
     patches = (random.random((rows, columns)) < share) & counting
     if counting.any() and not patches.any():
-        places = np.argwhere(counting)
-        chosen = (random.integers(rows), random.integers(columns)) if counting.all() else random.choice(places)
-        patches[tuple(chosen)] = len(places) > 1
+        candidates = np.argwhere(counting)  # [p,2] row and column of patches
+        patch = (random.integers(rows), random.integers(columns)) if counting.all() else random.choice(candidates)
+        patches[tuple(patch)] = len(candidates) > 1
     full = np.repeat(np.repeat(~patches, size, 0), size, 1)[: photos.height, : photos.width]
     if photos.weights is None:
         return full.astype(np.float32)
@@ -144,7 +147,7 @@ def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
 def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
     """Return the PSNR (dB) of renders on the held-out patches, where ``weights [h,w]`` are 0.
 
-    Exposure of the photos that differs by a factor of ``min_gain`` or more is compensated.
+    If exposures of the photos differ by a factor of ``min_gain`` or more, they are compensated.
     """
     views = range(len(photos))
     clipped = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
@@ -168,8 +171,9 @@ def exposure_gains(
 ) -> np.ndarray:
     """Return factors ``[v,3]`` float32 from renders to the photos' exposure, with geometric mean one.
 
-    They are least-squares solutions on the weighted pixels, for each view and channel. All are 1 if no view differs by
-    ``min_gain``.
+    They are least-squares solutions on the weighted pixels, for each view and channel. They are clipped to the range
+    from ``1 / max_gain`` to ``max_gain`` and then divided by their geometric mean, so they may leave this range. If all
+    factors are between ``1 / min_gain`` and ``min_gain``, they are set to 1.
     """
 
     def one_view(view: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import Tuning
 
-EPS = 1e-15  # Adam's
+EPS = 1e-15  # added to the denominator of Adam's step
 
 
 @dataclass(eq=False)
@@ -21,9 +21,9 @@ class PoseState:
     """Motions of the cameras under optimisation. Their mean stays zero, so that the scene does not drift."""
 
     start: np.ndarray  # [v,4,4] viewmats before the fit
-    viewmats: np.ndarray  # [v,4,4] float64, which steps update; all sizes of the photos share it
-    # [v,6] motion of each camera, see gsmerge.geometry.motion_vectors. It is about the middle of the scene, where
-    # rotations and shifts of a camera show differently
+    viewmats: np.ndarray  # [v,4,4] float64; steps update it in place, and all sizes of the photos share it
+    # [v,6] motion of each camera, see gsmerge.geometry.motion_vectors. The centre of its rotation is the middle of the
+    # scene, where rotations and shifts of a camera look different
     x: np.ndarray
     m: np.ndarray  # First moment
     v: np.ndarray  # Second moment
@@ -31,18 +31,21 @@ class PoseState:
     pixel: float  # Angle of a pixel, radians; also its size at the scene's depth
 
     def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
-        """Take one Adam step of a view by the gradient ``[4,4]`` of its viewmat; steps fall to zero at the end."""
+        """Take one Adam step (Nadam) of a view along the gradient ``[4,4]`` of its viewmat.
+
+        The size of steps falls to zero at the end of the fit.
+        """
         local = matmul(self.viewmats[view, :3, :3].T, gradient[:3])
-        (_, ab, ac), (ba, _, bc), (ca, cb, _) = local[:, :3]
-        slope = np.array([cb - bc, ac - ca, ba - ab, *local[:, 3]])
+        (_, xy, xz), (yx, _, yz), (zx, zy, _) = local[:, :3]
+        slope = np.array([zy - yz, xz - zx, yx - xy, *local[:, 3]])  # of rotation and shift
         self.counts[view] += 1
         betas = first_decay(rates, self.counts[view]), rates.beta2
-        for moment, beta, value in zip((self.m, self.v), betas, (slope, slope**2), strict=True):
-            moment[view] += (1 - beta) * (value - moment[view])
-        ahead = betas[0] * self.m[view] + (1 - betas[0]) * slope
-        first_left, second_left = power(betas, self.counts[view] + np.array([1, 0]))
-        first, second = ahead / (1 - first_left), self.v[view] / (1 - second_left)
-        self.x[view] -= rates.poses_lr * self.pixel * (1 - progress) * first / (np.sqrt(second) + EPS)
+        for moments, beta, sample in zip((self.m, self.v), betas, (slope, slope**2), strict=True):
+            moments[view] += (1 - beta) * (sample - moments[view])
+        next_m = betas[0] * self.m[view] + (1 - betas[0]) * slope  # Nesterov's look-ahead
+        bias_m, bias_v = power(betas, self.counts[view] + np.array([1, 0]))
+        m_hat, v_hat = next_m / (1 - bias_m), self.v[view] / (1 - bias_v)
+        self.x[view] -= rates.poses_lr * self.pixel * (1 - progress) * m_hat / (np.sqrt(v_hat) + EPS)
         self.x -= self.x.mean(0)
         self.viewmats[:] = matmul(self.start, motion_matrices(self.x))
 

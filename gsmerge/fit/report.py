@@ -13,14 +13,14 @@ from gsmerge.types import Cameras, Gaussians
 
 SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, in units of one on all: .3 to .6 on two captures
 TIME_SPENT = "time budget spent"  # why a fit ended
-HAZE = 0.05  # far fog above which a result gets a note, as it is plain to see in a viewer
+HAZE = 0.05  # far fog above which a result gets a note, because it is plain to see in a viewer
 
 
 @dataclass(frozen=True)
 class FitReport:
     """Facts about a fit and its scores."""
 
-    method: str  # `"none"`, `"color"` or `"full"`: what the result comes from
+    method: str  # `"none"`, `"color"` or `"full"`: the fit from which the result comes
     accepted: bool  # Whether the held-out patches got better; if not, nothing was changed
     steps: int  # Steps of the full fit, or conjugate-gradient steps
     holdout_before: float  # PSNR (dB) on the held-out patches before the fit
@@ -29,7 +29,7 @@ class FitReport:
     viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
     # Mean opacity of the result, in [0, 1], seen from outside where the input is empty; None: it is nowhere empty
     fog: float | None = None
-    # [n] row of the start that each Gaussian comes from; None: unknown
+    # [n] row of the start from which each Gaussian comes; None: unknown
     origins: np.ndarray | None = field(default=None, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
@@ -45,8 +45,8 @@ class Fitted:
     """Gaussians after the fit."""
 
     gaussians: Gaussians  # Canonical Gaussians
-    cameras: Cameras  # The scene's cameras, canonical, moved where the fit moved them
-    report: FitReport | None  # What the fit did; None where nothing was fitted
+    cameras: Cameras  # The scene's cameras, canonical, at the poses after the fit
+    report: FitReport | None  # Report of the fit; None if nothing was fitted
     outside: Outside | None = None  # Views from outside that kept it clear of fog; None: none
 
 

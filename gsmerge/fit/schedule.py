@@ -1,4 +1,4 @@
-"""Plan the steps of a full fit: the view, background and Gaussians of each, how it draws them, and its rates."""
+"""Plan the steps of a full fit: the view, background, Gaussians, draw mode and rates of each step."""
 
 from __future__ import annotations
 
@@ -15,31 +15,34 @@ from gsmerge.raster.photos import WHOLE_PHOTO, Photos, Sample
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
 from gsmerge.types import Region
 
-GROWTH = 0.5  # part of the run after which Gaussians are added
-# Parts of the run after which Gaussians are cut at the edges of the views. The first cuts come early, so that photos
-# are fitted without what lies beyond. Gaussians grow again after a cut, so there are cuts until the mean of the last
-# steps begins
+GROWTH = 0.5  # share of the steps after which Gaussians are added
+# Shares of the steps after which Gaussians are cut at the edges of the views. The first cuts come early, so that photos
+# are fitted without Gaussians beyond the edges. Gaussians grow again after a cut, so there are cuts until the mean of
+# the last steps begins
 CUTS = (0.0, 0.15, 0.3, 0.5, 0.7)
-CLEARS = (0.6, 0.7, 0.8)  # parts after which faint Gaussians are dropped, of runs that grow
-FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
+CLEARS = (0.6, 0.7, 0.8)  # shares of the steps after which runs that grow drop faint Gaussians
+FEW_VIEWS = 5  # with at most this many views a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
 MANY_STEPS = 150
-# Most of the first steps draw a sample of a photo's pixels, each time another one. A sample costs as much as the photo
-# at half size, and shows details that are lost at half size.
+# Most of the first steps draw a sample of a photo's pixels, each time a different sample. A sample costs as much as the
+# photo at half size, and shows details that are lost at half size.
 STRIDE = 2
 OFFSETS = ((0, 0), (1, 1), (1, 0), (0, 1))  # columns and rows of the samples, one after the other
 SAMPLED_STEPS = 30  # shorter runs draw too few samples to see all pixels: .07 dB less at 20 steps, 1 dB at 7
 DROPOUT = 0.1  # share of the Gaussians that a step leaves out with few views
-LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS that draw each view LONG_ROUNDS times
+LONG_DROPOUT = 0.05  # the same share in runs of LONG_STEPS that draw each view LONG_ROUNDS times
 LONG_ROUNDS = 30
-LARGE_STEPS = (0, 2)  # of every five, those that draw larger photos; with more of them the views' own size gets worse
+LARGE_CYCLE = 5  # of this many steps, the steps LARGE_STEPS draw larger photos; more would worsen the views' own size
+LARGE_STEPS = (0, 2)
+HALF_CYCLE = 3  # with larger photos, one of this many half-size steps remains
+WHOLE_COST = 3  # most time of a step on a whole photo, in units of the time of one of the first steps
 PROBE = 6  # steps that are timed to keep to a time budget
 MAX_STEPS = 2000
-LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
-# Draw modes of steps, one after the other: 1 for half size or 0 for full size, the low-pass as a share of the viewers'
-# own, and whether small Gaussians are made fainter by what the low-pass adds to them. Some viewers do that. In a view
-# that is enlarged twice the low-pass is a quarter, and from afar it covers more of the scene. What is fitted to one
-# mode alone looks thin or fat in the other ones (Mip-Splatting, Yu et al. 2024). The first steps, in which Gaussians
-# find their sizes, have several modes too.
+LONG_RUN = 300  # in longer runs the last step sizes shrink in proportion to the number of steps
+# Draw modes of steps, one after the other. A mode is 1 for half size or 0 for full size, the low-pass as a share of the
+# viewers' own low-pass, and whether small Gaussians are made fainter to offset the low-pass, as some viewers do. In a
+# view that is enlarged twice, the low-pass is a quarter; from afar, it covers more of the scene. Gaussians that are
+# fitted to one mode alone look thin or fat in the other modes (Mip-Splatting, Yu et al. 2024). The first steps, in
+# which Gaussians find their sizes, have several modes too.
 FIRST_MODES = (0, 1.0, False), (0, 0.25, False), (0, 1.0, False), (1, 1.0, False)
 DRAW_MODES = (
     (0, 1.0, True), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
@@ -60,8 +63,8 @@ class FitJob:
     count: int = 0  # Gaussians to grow to, where the run is long enough
     seed: int = 0
     progress: Progress | None = None  # Called after each step
-    fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
-    # Number of the first photos that the result is scored on, where renders stand for photos; None: all photos
+    fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay unchanged; None: none
+    # If renders stand for photos, the result is scored on this number of first photos; None: on all photos
     num_scored: int | None = None
     outside: Outside | None = None  # Views from outside, in which some steps clear fog and veils; None: no such steps
     edges: Edges | None = None  # Edges of the views, at which Gaussians are cut; None: no cuts
@@ -79,7 +82,7 @@ class DrawMode:
 
     size: int  # Of the photos: 0 full, 1 half, 2 larger
     eps2d: float  # Low-pass, pixels squared of this size
-    antialiased: bool = False  # Whether small Gaussians are made fainter by what the low-pass adds to them
+    antialiased: bool = False  # Make small Gaussians fainter, to offset that the low-pass widens them
     stride: int = 1  # Distance of the pixels that are drawn; pixels in between are left out
 
 
@@ -92,7 +95,7 @@ class FitRun:
     # pixels that neither steps nor scores use, 1 elsewhere
     weights: list[np.ndarray]
     # [h,w] float32 weights in steps, of each photo at each size: 0 on hidden pixels, elsewhere the importance of the
-    # pixel. Held-out patches are 0 at half size alone
+    # pixel. Held-out patches are 0 only at half size
     step_weights: tuple[list[np.ndarray], ...]
     dropout: float  # Share of the Gaussians that a step leaves out
     half_part: float  # Share of the first steps, which draw a quarter of the pixels
@@ -117,54 +120,59 @@ class FitRun:
     def draw_mode(self, step: int, progress: float) -> DrawMode:
         """Return how step ``step`` (from 1) draws the scene.
 
-        The first steps draw samples of the photos, the other ones whole photos, both in the modes of different viewers.
-        Steps on larger photos in between show what an enlarged view shows.
+        The first steps draw samples of the photos, later steps draw whole photos, both in the modes of different
+        viewers. If there are larger photos, some of the later steps draw these, as an enlarged view does.
         """
-        photos, first = self.job.photos, progress < self.half_part
-        if first and not self.samples:
+        photos, is_early, has_larger = self.job.photos, progress < self.half_part, len(self.job.photos) > 2
+        if is_early and not self.samples:
             return DrawMode(1, photos[1].eps2d)
-        if len(photos) > 2 and first:  # larger photos will show the scene from near
+        if has_larger and is_early:  # larger photos will show the scene from near
             return DrawMode(0, photos[0].eps2d, stride=STRIDE)
-        if len(photos) > 2 and step % 5 in LARGE_STEPS:
+        if has_larger and step % LARGE_CYCLE in LARGE_STEPS:
             return DrawMode(2, photos[2].eps2d)
-        modes = FIRST_MODES if first else DRAW_MODES
-        size, share, antialiased = modes[step % len(modes)]
-        # Half-size photos cost short runs more than they gain. Where larger photos show the scene from near, a third of
+        modes = FIRST_MODES if is_early else DRAW_MODES
+        size, low_pass, antialiased = modes[step % len(modes)]
+        # Half-size photos cost short runs more than they gain. If larger photos show the scene from near, a third of
         # the half-size steps is enough
-        if not self.job.options.grows or (len(photos) > 2 and step % 3):
+        if not self.job.options.grows or (has_larger and step % HALF_CYCLE):
             size = 0
-        return DrawMode(size, share * photos[0].eps2d, antialiased, STRIDE if first and size == 0 else 1)
+        return DrawMode(size, low_pass * photos[0].eps2d, antialiased, STRIDE if is_early and size == 0 else 1)
 
 
 def prepare_fit(job: FitJob) -> FitRun:
     """Prepare a fit: held-out patches, pixels outside masks, and dropout where there are few views."""
     photos, options = job.photos, job.options
-    few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
-    long = options.steps >= max(LONG_STEPS, LONG_ROUNDS * len(photos[0]))
-    default = DROPOUT if few else LONG_DROPOUT if long else 0.0
-    dropout = default if options.dropout is None else options.dropout
+    dropout = default_dropout(options.steps, len(photos[0])) if options.dropout is None else options.dropout
     everywhere, *larger = (_weigh(_weights_of(level), level) for level in (photos[0], *photos[2:]))
-    weights = trained = _weights_of(photos[1])
+    weights = train_weights = _weights_of(photos[1])
     first_pixels = None
     if options.scored:
         whole = training_weights(photos[0], options.holdout, job.seed)
         first_pixels = tuple((weight != 0) & (weight != HIDDEN) for weight in whole)
         weights = reduced(whole, photos[1])
-        trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights]
-        if len(photos[0]) == 1:  # no other photo shows what is held out, so the fit is scored on all pixels
+        train_weights = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights]
+        if len(photos[0]) == 1:  # no other photo shows the held-out patches, so the fit is scored on all pixels
             weights = [np.where(weight == 1, np.float32(0), weight) for weight in weights]
-    step_weights = everywhere, _weigh(trained, photos[1]), *larger
+    step_weights = everywhere, _weigh(train_weights, photos[1]), *larger
     return FitRun(job, weights, step_weights, dropout, options.half_res_part, _can_sample(job), first_pixels)
 
 
-def _can_sample(job: FitJob) -> bool:
-    """Return whether the first steps may draw samples of photos, which takes as many pixels as there are Gaussians.
+def default_dropout(steps: int, num_photos: int) -> float:
+    """Return the share of the Gaussians that a step leaves out, for a run of ``steps`` on ``num_photos``."""
+    if num_photos <= FEW_VIEWS and steps >= MANY_STEPS:
+        return DROPOUT
+    return LONG_DROPOUT if steps >= max(LONG_STEPS, LONG_ROUNDS * num_photos) else 0.0
 
-    While cameras move, photos have to be blurred instead, so that a pose that is a pixel away still has a gradient.
+
+def _can_sample(job: FitJob) -> bool:
+    """Return whether the first steps may draw samples of photos.
+
+    The samples of all photos need at least as many pixels as there are Gaussians. While cameras move, photos have to be
+    blurred instead, so that a pose with an error of a pixel still has a gradient.
     """
     photos, options = job.photos[0], job.options
     pixels = len(photos) * (photos.width // STRIDE) * (photos.height // STRIDE)
-    is_long = options.steps >= SAMPLED_STEPS and options.time_budget is None  # which may leave few
+    is_long = options.steps >= SAMPLED_STEPS and options.time_budget is None  # a time budget may allow few steps
     return is_long and not options.move_cameras and max(1, job.count) <= pixels
 
 
@@ -196,16 +204,17 @@ class Step:
 
 
 class Schedule:
-    """Draws the order of views, the backgrounds and the dropped Gaussians of all steps from one seed.
+    """Draw the order of views, the backgrounds and the dropped Gaussians of all steps from one seed.
 
-    One generator draws everything, and a step's dropout after its background. A generator of its own for dropout would
+    One generator draws everything, and a step's dropout after its background. A second generator for dropout would
     change the results of few views and of long runs.
     """
 
     def __init__(self, run: FitRun):
         self.run, self.rng = run, np.random.default_rng(run.job.seed)
-        self.views_left: list[int] = []  # of the round over all views
-        self.samples = list(range(len(run.job.photos[0])))  # number of each view's next sample; views begin differently
+        self.views_left: list[int] = []  # views that the current round over all views has not drawn yet
+        # index of each view's next sample; views begin with different samples
+        self.samples = list(range(len(run.job.photos[0])))
 
     def draw(self, number: int, progress: float, count: int) -> Step:
         """Draw step ``number`` (from 1) for ``count`` Gaussians; a round over all views has each view once."""
@@ -232,15 +241,16 @@ def loss_weights(rates: Tuning, progress: float) -> tuple[float, float]:
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     """Return the step size of each of the fourteen parameters; it decays geometrically, and further in longer runs."""
     decay = rates.decay * min(1.0, LONG_RUN / steps)
-    each = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
-    return (np.repeat(each, [3, 3, 4, 1, 3]) * power(decay, progress)).astype(np.float32)
+    start_rates = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
+    widths = [3, 3, 4, 1, 3]  # columns of means, log scales, quaternions, opacity logit and colours
+    return (np.repeat(start_rates, widths) * power(decay, progress)).astype(np.float32)
 
 
 def first_decay(rates: Tuning, rounds: float) -> float:
     """Return the decay of Adam's first moment after a number of rounds over all views.
 
-    Momentum grows during the fit: it averages two steps that show a Gaussian at first, and one step more after every
-    four rounds. Early on gradients change from step to step; later they differ most between views.
+    Momentum grows during the fit. At first it averages two steps that show a Gaussian, and one step more after every
+    four rounds. Early gradients change from step to step; later gradients differ most between views.
     """
     return min(rates.beta1, 1 - 1 / (2 + rounds / 4))
 
@@ -248,11 +258,12 @@ def first_decay(rates: Tuning, rounds: float) -> float:
 def affordable_steps(seconds: float, run: FitRun) -> int:
     """Return how many steps fit into the time budget, given the ``seconds`` of the first PROBE steps.
 
-    A step on a whole photo takes up to three times as long as one of those. A step on a larger photo takes longer in
-    proportion to its pixels.
+    A step on a whole photo takes up to three times as long as one of the first steps. A step on a larger photo takes
+    longer in proportion to its pixels.
     """
-    budget, coarse = run.job.options.time_budget, run.half_part
+    budget, early_share = run.job.options.time_budget, run.half_part
     assert budget is not None
     pixels = [photos.height * photos.width for photos in run.job.photos]
-    mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse) * (1 + max(pixels) / pixels[0]) / 2)
+    late_cost = WHOLE_COST * (1 - early_share) * (1 + max(pixels) / pixels[0]) / 2
+    mean_step = seconds / PROBE * (early_share + late_cost)
     return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))

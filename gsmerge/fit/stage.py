@@ -24,8 +24,8 @@ from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
 CLOSE = 1.0  # gain of the held-out patches, dB, below which whole photos are compared as well
-ALWAYS = float("inf")  # the same after the full fit failed, as its start may be the end of another fit
-START = 0.57  # share of the Gaussians that a run which grows begins with
+ALWAYS = float("inf")  # the same bound after the full fit failed, because its start may be the end of another fit
+START = 0.57  # share of the final number of Gaussians at the start of a run that grows
 
 
 def fit_scene(
@@ -39,8 +39,8 @@ def fit_scene(
 ) -> Fitted:
     """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene, if a fit is asked for.
 
-    ``num_scored`` is the number of the first views that the result is scored on, where renders stand for photos. None:
-    there are photos, and it is scored on all.
+    If renders stand for photos, the result is scored on the first ``num_scored`` views. None: there are photos, and the
+    result is scored on all of them.
     """
     if options.fit == "none":
         return Fitted(decoded.gaussians, scene.cameras, None)
@@ -114,8 +114,8 @@ def _fit_colors(gaussians: Gaussians, job: FitJob) -> FitResult:
 def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport, close: float) -> FitResult:
     """Return the fitted Gaussians, or their start if whole photos got worse.
 
-    Photos are compared where held-out patches gained less than ``close`` dB. A fit of Gaussians that are fitted already
-    only scatters them, by steps of the default size.
+    Photos are compared only if held-out patches gained less than ``close`` dB. If Gaussians are fitted already, a
+    further fit with steps of the default size only scatters them.
     """
     if not report.accepted or report.holdout_after - report.holdout_before >= close:
         return after, report

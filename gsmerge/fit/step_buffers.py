@@ -20,7 +20,7 @@ from gsmerge.raster.gradient import viewmat_gradient
 from gsmerge.raster.tiled_view import cache_line_rows, hides_most
 from gsmerge.runtime.threads import parallel_map
 
-SPARE = 1.25  # room that is allocated, as a multiple of the intersections of a view that needs more
+SPARE = 1.25  # allocated room, as a multiple of the intersections of a view that needs more room
 OF_STATE = ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors")
 OF_SPLATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 # Arrays that each step sets, with their lengths
@@ -36,7 +36,7 @@ class StepBuffers:
     state: FitState
     threads: int
     moves_camera: bool = False  # Whether steps compute the gradient of the viewmat
-    gaussians: dict[str, np.ndarray] = field(default_factory=dict)  # Buffers over Gaussians, and those of a step
+    gaussians: dict[str, np.ndarray] = field(default_factory=dict)  # Buffers over Gaussians, and arrays of a step
     room: dict[str, np.ndarray] = field(default_factory=dict)  # Buffers over intersections
     tables: dict[tuple[int, int], tuple[FilledTable, list[Callable[[], None]]]] = field(default_factory=dict)
 

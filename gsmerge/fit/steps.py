@@ -22,7 +22,7 @@ from gsmerge.raster.photos import Photos
 from gsmerge.raster.tiled_view import camera_numbers
 from gsmerge.runtime.threads import parallel_map, use_threads
 
-ROWS = 16384  # Gaussians per piece of an Adam step
+ROWS = 16384  # Gaussians per task of an Adam step
 
 
 @dataclass(eq=False)
@@ -30,7 +30,7 @@ class Optimiser:
     """Optimiser of a full fit: takes its steps, and moves cameras where the options ask for it."""
 
     run: FitRun
-    photos: tuple[Photos, ...]  # Photos of the run's job; their poses are those that the fit has reached
+    photos: tuple[Photos, ...]  # Photos of the run's job, at the poses that the fit has reached
     poses: PoseState | None  # Motions of the cameras; None: cameras are fixed
     buffers: StepBuffers | None = None  # Of the state that took the last step
 
@@ -67,11 +67,11 @@ class Optimiser:
         """Take one Adam step along gradients, in place."""
         s, fixed, constants = state.splats, state.fixed.view(np.uint8), tuple(self.constants(state, step).values())
 
-        def move_rows(first: int) -> None:
-            last = min(first + ROWS, len(g.ids))
+        def move_rows(start: int) -> None:
+            stop = min(start + ROWS, len(g.ids))
             kernels.adam(
                 state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes, fixed, g.ids,
-                g.means, g.quats, g.scales, g.opacities, g.colors, *constants, step.number, first, last,
+                g.means, g.quats, g.scales, g.opacities, g.colors, *constants, step.number, start, stop,
                 s.means, s.quats, s.scales, s.opacities, state.colors,
             )  # fmt: skip
 
@@ -85,7 +85,7 @@ class Optimiser:
         return np.ascontiguousarray(photos.image(step.view, step.background, sample), np.float32), camera
 
     def drawn_opacities(self, state: FitState, step: Step) -> np.ndarray:
-        """Return the opacities ``[n]`` that a step draws: 0 where dropout leaves Gaussians out, and more elsewhere."""
+        """Return the opacities ``[n]`` that a step draws: 0 for Gaussians left out by dropout, raised for the rest."""
         if step.mask is None:
             return state.splats.opacities
         raised = state.splats.opacities / np.float32(1 - self.run.dropout)
@@ -106,13 +106,15 @@ class Optimiser:
     def _limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Limits of parameters before and after the growth of a run.
 
-        Before it no limit shortens long Gaussians, as no others come that could fill what they leave.
+        Before the growth no limit shortens long Gaussians, because no new Gaussians could fill the gaps beside them.
         """
         rates = self.run.job.options.tuning
         moves = rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change
-        widest = max(photos.width for photos in self.run.job.photos)  # the least scale counts pixels of this size
-        ratio, long = log(np.array([rates.max_ratio, rates.long_share * widest / (3 * max(rates.min_scale, 1e-9))]))
-        before, after = (np.array([*moves, most, long], np.float32) for most in (np.inf, ratio))
+        widest = max(photos.width for photos in self.run.job.photos)  # the unit of the least scale is its pixel
+        max_length = rates.long_share * widest / (3 * max(rates.min_scale, 1e-9))  # in units of the least scale
+        log_ratio, log_length = log(np.array([rates.max_ratio, max_length]))
+        before = np.array([*moves, np.inf, log_length], np.float32)
+        after = np.array([*moves, log_ratio, log_length], np.float32)
         return before, after
 
     def _buffers_of(self, state: FitState, threads: int) -> StepBuffers:

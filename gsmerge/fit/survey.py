@@ -1,4 +1,4 @@
-"""Survey what the photos show of each Gaussian of a fit, and score how well Gaussians show the photos."""
+"""Survey the weights of each Gaussian of a fit in the photos, and score renders of Gaussians against the photos."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from gsmerge.raster.photos import NEAR_PLANE, Photos, photo_errors, render_photo
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
-MOST_SCORED = 12  # photos, at most, that a fit is scored on
-ENOUGH = 6  # photos of a survey that are enough for a Gaussian that they may show
-FEWER = 0.03  # share of the Gaussians that a photo may show that may have fewer
-SAMPLE_GAUSSIANS = 4096  # Gaussians by which photos are chosen
+MOST_SCORED = 12  # most photos that a fit is scored on
+ENOUGH = 6  # a survey has enough photos of a Gaussian if its centre is inside this many of them
+FEWER = 0.03  # a photo is added to a survey if more than this share of its Gaussians has fewer photos than ENOUGH
+SAMPLE_GAUSSIANS = 4096  # the photos are chosen by at most about twice this many Gaussians
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +28,11 @@ class Survey:
     """Facts that half-size photos show about each of the n Gaussians that a fit starts from."""
 
     score: float  # PSNR (dB) of the held-out patches
-    inside: np.ndarray  # [n] bool, whether it may be in the frustum of some photo
+    inside: np.ndarray  # [n] bool, Gaussians that may reach into the frustum of some photo
     peaks: np.ndarray  # [n] float32 largest blending weight
     sums: np.ndarray  # [n] float64 blending weights summed over all photos, pixels
     squares: np.ndarray  # [n] float64 squares of each photo's sum, summed
-    pixels: np.ndarray  # [n] float32 size of the finest pixel that shows it, world units; inf if none does
+    pixels: np.ndarray  # [n] float32 size of the finest pixel that shows the Gaussian, world units; inf if none does
 
     def visible(self, min_weight: float) -> np.ndarray:
         """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or outside all frustums."""
@@ -44,9 +44,9 @@ class Survey:
 
 
 def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
-    """Draw Gaussians into the half-size photos of a fit, or some of them, and collect what these show of each.
+    """Draw Gaussians into half-size photos of a fit, see :func:`choose_views`, and collect the facts about each.
 
-    The size of the finest pixel is that of the largest photos.
+    The size of the finest pixel refers to the largest photos.
     """
     photos = run.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
@@ -60,33 +60,32 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
     views, scored, images = choose_views(gaussians, half), scored_views(len(half)), []
     inside, peaks = np.zeros(count, bool), np.zeros(count, np.float32)
     sums, squares, pixels = np.zeros(count), np.zeros(count), np.full(count, np.inf, np.float32)
-    for view, (ids, sizes, image, weights, most) in zip(views, in_turn(one_view, views), strict=True):
+    for view, (ids, pixel_sizes, image, weights, view_peaks) in zip(views, in_turn(one_view, views), strict=True):
         if view in scored:
             images.append(image)
         inside[ids] = True
-        peaks[ids] = np.maximum(peaks[ids], most)
-        pixels[ids] = np.minimum(pixels[ids], sizes)
+        peaks[ids] = np.maximum(peaks[ids], view_peaks)
+        pixels[ids] = np.minimum(pixels[ids], pixel_sizes)
         sums[ids] += weights
         squares[ids] += weights.astype(np.float64) ** 2
     return Survey(score_images(images, run, half), inside, peaks, sums, squares, pixels)
 
 
 def choose_views(gaussians: Gaussians, photos: Photos) -> list[int]:
-    """Choose the photos of a survey.
+    """Choose the photos of a survey: the scored photos, and further ones.
 
-    They are those that a fit is scored on, and each further one with many Gaussians that fewer than ``ENOUGH`` of the
-    photos so far may show.
+    A photo is added if it shows many Gaussians with fewer than ``ENOUGH`` photos so far.
     """
     means = gaussians.means[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
     pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
     inside = (depths > NEAR_PLANE) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
-    chosen = scored_views(len(photos))
-    num_photos = inside[chosen].sum(0)
+    views = scored_views(len(photos))
+    num_photos = inside[views].sum(0)
     for view in spread_views(len(photos)):
-        if view not in chosen and (inside[view] & (num_photos < ENOUGH)).sum() > FEWER * inside[view].sum():
-            chosen.append(view)
+        if view not in views and (inside[view] & (num_photos < ENOUGH)).sum() > FEWER * inside[view].sum():
+            views.append(view)
             num_photos += inside[view]
-    return sorted(chosen)
+    return sorted(views)
 
 
 def scored_views(count: int) -> list[int]:
@@ -95,7 +94,8 @@ def scored_views(count: int) -> list[int]:
 
 
 def spread_views(count: int) -> list[int]:
-    """Order views so that the first ones, whatever their number, are spread over all."""
+    """Order views so that any number of the first ones is spread evenly over all views."""
+    # the order of the reversed bits of the numbers (van der Corput)
     return sorted(range(count), key=lambda view: f"{view:032b}"[::-1])
 
 

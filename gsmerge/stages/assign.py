@@ -25,9 +25,9 @@ from gsmerge.types import Gaussians, Groups, Pixels, Scene
 def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Members:
     """Return all Gaussians of a canonical scene with pixels as members; UsageError if no view sees any Gaussian.
 
-    A Gaussian belongs to the superpixel of its pixel. ``by_contribution``: if views have no Gaussians of their own, it
-    belongs to the superpixel, of all views, that gets most of its blending weights (paper, supplement "Compaction of
-    Non-Pixel-Aligned FF Backbones"). Every view is drawn for that.
+    A Gaussian belongs to the superpixel of its pixel. With ``by_contribution``, if views have no Gaussians of their
+    own, it belongs to the one superpixel of all views with the largest sum of its blending weights (paper, supplement
+    "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure these sums.
     """
     members = scene_members(scene)
     if by_contribution and not scene.has_own_pixels:
@@ -61,7 +61,7 @@ class Owners:
 
 
 def find_owners(scene: Scene, groups: Groups) -> Owners:
-    """Find the superpixel, of all views, to which each Gaussian contributes most; of equals, that of the first view."""
+    """Find the one superpixel of all views to which each Gaussian contributes most; the first view wins a tie."""
     count, lock = len(scene.gaussians), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
@@ -86,13 +86,13 @@ def view_owners(tiled: TiledView, labels: np.ndarray, count: int) -> tuple[np.nd
 def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:
     """Return the middle pixel of each Gaussian's superpixel, ``[n]`` int64 over all views, -1 if unseen."""
     counts = np.asarray(groups.counts)
-    size, first = groups.labels[0].size, np.cumsum(counts) - counts
+    pixels_per_view, offsets = groups.labels[0].size, np.cumsum(counts) - counts
 
     def view_middles(view: int) -> np.ndarray:
-        return middle_pixels(groups.labels[view], groups.counts[view]) + view * size
+        return middle_pixels(groups.labels[view], groups.counts[view]) + view * pixels_per_view
 
     middles = np.concatenate(parallel_map(view_middles, range(len(counts))))
-    return np.where(owners.labels >= 0, middles[first[owners.views] + owners.labels], -1)
+    return np.where(owners.labels >= 0, middles[offsets[owners.views] + owners.labels], -1)
 
 
 def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
@@ -102,9 +102,10 @@ def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
     y, x = np.divmod(np.arange(height * width), width)
     sizes = np.maximum(np.bincount(flat, minlength=count), 1)
     dy, dx = (axis - (np.bincount(flat, axis, count) / sizes)[flat] for axis in (y, x))
-    squares, least = dx * dx + dy * dy, np.full(count, np.inf)
-    np.minimum.at(least, flat, squares)
-    nearest = np.flatnonzero(squares == least[flat])[::-1]  # of equally near pixels the first is written last
+    squares, min_squares = dx * dx + dy * dy, np.full(count, np.inf)
+    np.minimum.at(min_squares, flat, squares)
+    # in descending order, so that of equally near pixels the first one overwrites the others
+    nearest = np.flatnonzero(squares == min_squares[flat])[::-1]
     middles = np.zeros(count, np.int64)
     middles[flat[nearest]] = nearest
     return middles

@@ -17,22 +17,23 @@ from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
 
 BOX_QUANTILES = (1, 99)  # percentiles of the positions along each axis that bound the scene's box
-OUTLIER_BOX = 10.0  # Gaussians outside of a box so many times as large are far from the scene
-NEIGHBORS = 8  # a floater touches none of so many nearest Gaussians
+OUTLIER_BOX = 10.0  # Gaussians are far from the scene if they lie outside of a box this many times as large
+NEIGHBORS = 8  # number of nearest Gaussians; a floater touches none of them
 ROWS = 1 << 14  # Gaussians per task
-TOUCH = 3.0  # two Gaussians touch if their distance is at most so many times the sum of their largest scales
-APART = 3.0  # the nearest Gaussian of a floater is more than so many times the median distance away
-# A Gaussian hangs across the scene if its second or its largest scale is at least such a share of half the diagonal of
-# the scene's box, and WIDER times that of the median Gaussian. Exports, and results without a fit, have none of these
+TOUCH = 3.0  # two Gaussians touch if their distance is at most this many times the sum of their largest scales
+APART = 3.0  # the nearest Gaussian of a floater is farther away than this many times the median distance
+# A Gaussian hangs across the scene if its second or its largest scale exceeds the first or second share in CURTAIN of
+# half the diagonal of the scene's box, and also exceeds WIDER times the median of this scale. Exports, and results
+# without a fit, have no such Gaussians
 CURTAIN, WIDER = (0.1, 0.33), 8.0
-MAX_SAMPLE_GAUSSIANS = 200_000  # Gaussians that a share is estimated from
+MAX_SAMPLE_GAUSSIANS = 200_000  # the share of floaters is estimated from at most about this many Gaussians
 
 ToWorld = Callable[[Gaussians], Gaussians]
 Counts = dict[str, int]
 
 
 def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
-    """Return a mask ``[n]`` of centres ``[n,3]`` outside of a box ten times as large as that of the scene.
+    """Return a mask ``[n]`` of the centres ``[n,3]`` outside of a box ten times as large as the scene's box.
 
     The scene's box reaches from the 1st to the 99th percentile of the ``samples``, or else of the centres, along each
     axis.
@@ -45,9 +46,10 @@ def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.nda
 def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
     """Return a mask ``[n]`` of finite Gaussians that are isolated, far beyond the scene, or hang across it.
 
-    A Gaussian is isolated if none of its eight nearest neighbours is within three times the sum of their largest
-    scales, and the nearest is more than three times as far away as that of the median Gaussian. See
-    :func:`beyond_scene` and :func:`curtains` for the other two. ``rows [m]``: test only these, and return ``[m]``.
+    A Gaussian is isolated under two conditions. None of its eight nearest neighbours is within three times the sum of
+    both largest scales. The distance to its nearest neighbour is more than three times the median of these distances.
+    See :func:`beyond_scene` and :func:`curtains` for the other two kinds. With ``rows [m]``, only these Gaussians are
+    tested, and the mask is ``[m]``.
     """
     rows = np.arange(len(gaussians)) if rows is None else rows
     means, sizes = gaussians.means.astype(np.float64), gaussians.scales.max(1).astype(np.float64)
@@ -61,8 +63,8 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     views = np.full(len(means), -1)  # -1: each point has a view of its own, so all others may be neighbours
     touched, nearest = np.empty(len(rows), bool), np.empty(len(rows))
 
-    def measure(first: int) -> None:
-        span = slice(first, min(first + ROWS, len(rows)))
+    def measure(start: int) -> None:
+        span = slice(start, min(start + ROWS, len(rows)))
         nearest_of_others(points, views, tree, axes, splits, span.start, span.stop, len(means), ids)
         distances = np.sqrt(((points[ids[span]] - points[span, None]) ** 2).sum(2))
         touched[span] = (distances <= TOUCH * (sizes[span, None] + sizes[ids[span]])).any(1)
@@ -75,7 +77,7 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
 
 
 def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
-    """Return a mask ``[m]`` of the Gaussians ``rows [m]`` that hang across the scene: far larger than the median."""
+    """Return a mask ``[m]``: which Gaussians ``rows [m]`` hang across the scene, far larger than the median."""
     low, high = np.percentile(gaussians.means.astype(np.float64), BOX_QUANTILES, axis=0)
     radius = np.sqrt(((high - low) ** 2).sum()) / 2
     scales = np.sort(gaussians.scales, axis=1)[:, 1:]
@@ -92,11 +94,11 @@ def floater_share(gaussians: Gaussians) -> float:
 def clean(
     gaussians: Gaussians, options: CleanOptions, cameras: Cameras | None, photos: np.ndarray | None, to_world: ToWorld
 ) -> tuple[np.ndarray, Counts]:
-    """Choose wanted Gaussians; return their rows, and the number of dropped ones by reason.
+    """Choose the Gaussians to keep; return their rows, and the number of dropped Gaussians by reason.
 
-    The reasons are ``cropped`` and those that ``options`` drop. Gaussians and ``cameras`` are canonical; ``to_world``
-    maps to the frame of the crop. The sky is found in the ``photos [v,h,w,3]``. Without cameras, a Gaussian is unseen
-    if none of several placed cameras shows it.
+    The reasons are ``cropped`` and the names in ``options.drops``. Gaussians and ``cameras`` are canonical;
+    ``to_world`` maps Gaussians to the frame of the crop. The sky is found in the ``photos [v,h,w,3]``. Without cameras,
+    a Gaussian is unseen if none of several placed cameras shows it.
     """
     rows, counts = np.arange(len(gaussians)), Counts()
 
@@ -114,8 +116,8 @@ def clean(
     if "transparent" in options.drops:
         remaining = remove("transparent", remaining.opacities < LEAST_OPACITY)
     if "sky" in options.drops:
-        assert cameras is not None, "sky is dropped where there are photos"
-        assert photos is not None, "sky is dropped where there are photos"
+        assert cameras is not None, "dropping the sky requires photos"
+        assert photos is not None, "dropping the sky requires photos"
         remaining = remove("sky", sky(remaining, cameras, photos))
     if "floaters" in options.drops:
         remove("floaters", floaters(remaining))
@@ -123,7 +125,7 @@ def clean(
 
 
 def describe_counts(counts: Counts, *, placed: bool) -> str:
-    """Say how many Gaussians :func:`clean` dropped for each reason; ``placed``: no camera of the scene is known."""
+    """Say how many Gaussians :func:`clean` dropped for each reason; ``placed``: in placed cameras, not in views."""
     words = {
         "cropped": "outside of the crop",
         "sky": "sky",
@@ -136,6 +138,6 @@ def describe_counts(counts: Counts, *, placed: bool) -> str:
 
 
 def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:
-    """Keep the ``count`` Gaussians with the largest opacity times area (of the two largest axes), in their order."""
+    """Keep the ``count`` Gaussians with the largest products of opacity and the two largest scales, in their order."""
     area = np.sort(gaussians.scales, axis=1)[:, 1:].prod(1)
     return gaussians[np.sort(np.argsort(-gaussians.opacities * area, kind="stable")[:count])]

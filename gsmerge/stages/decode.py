@@ -19,7 +19,7 @@ from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.types import Decoded, FeatureGaussians, Gaussians, PicturedScene, Scene
 
 GROUPS_PER_TASK = 8192
-REFILLS = 3  # rounds in which Gaussians too faint to be seen are replaced by others; a few of these are faint again
+REFILLS = 3  # rounds that replace Gaussians too faint to be seen; a few of the new Gaussians are faint again
 PLANE_WEIGHT = 1 / 16  # weight of squared distances from a group's plane, in the unit of the children's features
 
 
@@ -47,7 +47,7 @@ def decode(
 
 
 def keep_all(scene: Scene, count: int | None) -> Decoded | None:
-    """Return all Gaussians of a scene unchanged if at least that number is asked for; otherwise None."""
+    """Return all Gaussians of a scene unchanged if ``count`` is at least their number; otherwise None."""
     if count is None or count < len(scene.gaussians):
         return None
     return Decoded(scene.gaussians, len(scene.gaussians), exact=True, is_input=True)
@@ -57,14 +57,15 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
 def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOptions, *, grows: bool) -> Decoded:
     """Decode merged views into the Gaussians that a fit starts from.
 
-    Their number is the exact count that is asked for, unless the fit ``grows`` to it; otherwise K per group.
+    If an exact count is requested, this is their number, unless the fit ``grows`` to it. Otherwise there are K for each
+    group.
     """
     count, exact = merged.segmentation.count, merged.segmentation.exact
     if exact and not grows:
         gaussians = _decode_exactly(merged, count, options)
     else:
         gaussians = _decode_count(merged, scene, merged_count(merged, options, grows=grows), options)
-        if exact and len(gaussians) > count:  # K per group are more than the fit may grow to
+        if exact and len(gaussians) > count:  # K per group exceed the number that the fit may grow to
             gaussians = _decode_count(merged, scene, count, options)
     return Decoded(gaussians, count, exact)
 
@@ -98,8 +99,8 @@ def deal_visible(
 ) -> Gaussians:
     """Make ``total`` visible Gaussians; children of other groups replace Gaussians fainter than ``min_opacity``.
 
-    Each group gets one Gaussian. ``order [d]`` are the groups that get the further ones, see :func:`deal_order`.
-    ``make`` makes the Gaussians, including faint ones, given the number for each group ``[g]``. There are fewer than
+    Each group gets one Gaussian. Further Gaussians go to the groups ``order [d]``, see :func:`deal_order`. ``make``
+    takes the number of Gaussians for each group ``[g]`` and makes them, including faint ones. There are fewer than
     ``total`` if the groups have too few members.
     """
     extra = max(0, total - num_groups)
@@ -142,9 +143,9 @@ def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarr
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
     """Return the number of Gaussians to decode merged views into; None: K for each Feature Gaussian.
 
-    It is the exact count that was requested, if no fit grows to it. It is also a number if superpixels are empty: a
-    Gaussian that a near and a far view show belongs to the near view, so superpixels of the far view may be empty, and
-    other groups get their Gaussians instead. Heads that make exactly K of every group cannot do that.
+    If an exact count was requested and no fit grows to it, this is the number. If superpixels are empty, other groups
+    get their Gaussians: a Gaussian in a near and a far view belongs to the near view, so superpixels of the far view
+    may be empty. Heads that make exactly K Gaussians of every group cannot do that.
     """
     segmentation, num_empty = merged.segmentation, len(merged.segmentation.groups) - merged.num_groups
     if segmentation.exact and not grows:
@@ -206,9 +207,9 @@ def halve(
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
     """Give ``extra`` Gaussians to groups in which they lower distortion most; return the children ``[g]`` per group.
 
-    A child that only lowers distortion together with the next one counts with the mean gain of both, which is the
-    convex hull of the group's distortion. So a larger ``extra`` never removes a child. The sum is ``g + extra``, or the
-    largest number that the members give.
+    If a child lowers distortion only together with the next child, both count with their mean gain, which is the slope
+    of the convex hull of the group's distortion. So a larger ``extra`` never removes a child. The sum is ``g + extra``,
+    or the largest number of children that the members allow.
     """
     if extra < 0:
         raise ValueError(f"extra: expected at least 0, got {extra}")
@@ -253,7 +254,7 @@ def hull_gains(errors: np.ndarray) -> np.ndarray:
     """
     num_groups, num_children = errors.shape
     gains = np.full((num_groups, num_children - 1), -np.inf)
-    corner, rows = np.zeros(num_groups, int), np.arange(num_groups)  # last corner of each group's hull so far
+    corner, rows = np.zeros(num_groups, int), np.arange(num_groups)  # `corner`: the last one of each hull so far
     for _ in range(num_children - 1):
         steps = np.arange(num_children)[None] - corner[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -22,14 +22,14 @@ from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene
 if TYPE_CHECKING:
     from gsmerge.networks.weights import RunnableNetworks
 
-# Factors on the optical depth of groups that other views see through: ALONE if no other view has a surface at the same
-# place, DISPUTED if fewer views have a surface there than see through it
+# Factors on the optical depth of a group if more views see through it than have a surface at its position: ALONE if no
+# other view has a surface there, DISPUTED if some do
 ALONE, DISPUTED = 0.15, 0.39
-NEAREST_VIEWS = 64  # nearest views that vote on it; more of them hardly change the vote
+NEAREST_VIEWS = 64  # number of nearest views that are compared; more views hardly change the result
 
 
 def make_corrector(networks: RunnableNetworks | None, members: Members, cameras: Cameras, seed: int) -> Corrector:
-    """Combine networks with the facts about a scene that they read; without networks nothing is corrected."""
+    """Combine networks with the members and cameras of a scene; without networks, return the empty correction."""
     if networks is None:
         return ANALYTIC
     from gsmerge.networks.apply import NetworkContext
@@ -41,8 +41,7 @@ def make_corrector(networks: RunnableNetworks | None, members: Members, cameras:
 def encode(scene: Scene, members: Members, groups: Groups, rule: Rule = "depth") -> FeatureGaussians:
     """Pool every superpixel into one Feature Gaussian, in order of view and label.
 
-    Superpixels without a valid member are left out. ``rule``: see
-    :func:`gsmerge.pooling.pool_members`.
+    Superpixels without a valid member are omitted. ``rule``: see :func:`gsmerge.pooling.pool_members`.
     """
     starts, ids, views = member_rows(scene, members, groups)
     return from_moments(pool_members(members, starts, ids, rule), starts, ids, views)
@@ -63,19 +62,19 @@ def correct(
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """List members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``, without empty superpixels."""
     counts = np.asarray(groups.counts)
-    first, flat = np.cumsum(counts) - counts, groups.labels.reshape(-1)
+    offsets, flat = np.cumsum(counts) - counts, groups.labels.reshape(-1)
     labels = np.empty(len(members.pixels), np.int32)
 
     def label(start: int) -> None:
         rows = slice(start, start + ROWS)
         pixels = members.pixels[rows]
-        labels[rows] = np.where(pixels >= 0, flat[pixels] + first[pixels // scene.pixels_per_view], -1)
+        labels[rows] = np.where(pixels >= 0, flat[pixels] + offsets[pixels // scene.pixels_per_view], -1)
 
     parallel_map(label, range(0, len(labels), ROWS))
     starts, ids = group_members(labels, int(counts.sum()))
     sizes = np.diff(starts)
-    filled, views = sizes > 0, np.repeat(np.arange(len(scene)), groups.counts)
-    return np.concatenate([[0], np.cumsum(sizes[filled])]), ids, views[filled]
+    has_members, views = sizes > 0, np.repeat(np.arange(len(scene)), groups.counts)
+    return np.concatenate([[0], np.cumsum(sizes[has_members])]), ids, views[has_members]
 
 
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:
@@ -95,8 +94,8 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 
 
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
-    """Lower the optical depth of groups that other views see through."""
+    """Lower the optical depth of groups if more views see through them than have a surface at their position."""
     f = features
-    _, same, behind, *_ = cross_view_stats(f.means, f.sh0, f.views, members, cameras, NEAREST_VIEWS).T
-    disputed = np.where(same > 0, DISPUTED, ALONE)
-    return replace(features, gains=features.gains * np.where(behind > same, disputed, 1).astype(np.float32))
+    _, same_share, behind_share, *_ = cross_view_stats(f.means, f.sh0, f.views, members, cameras, NEAREST_VIEWS).T
+    factors = np.where(behind_share > same_share, np.where(same_share > 0, DISPUTED, ALONE), 1)
+    return replace(features, gains=features.gains * factors.astype(np.float32))

@@ -1,7 +1,7 @@
-"""Fitted Gaussians -> filled Gaussians: fill the gaps that cameras between and just beside the views see.
+"""Fitted Gaussians -> filled Gaussians: fill gaps seen from cameras between or just beside the views.
 
 New views uncover places that no photo shows. So the result of a fit is drawn from cameras between the views and just
-beside them. Gaps in these pictures are filled with Gaussians that continue the farther one of the surfaces around, at
+beside them. Gaps in these pictures are filled with Gaussians. They continue the farthest surface beside the gap, at
 depths that no view contradicts.
 """
 
@@ -29,8 +29,8 @@ from gsmerge.types import Cameras, Gaussians
 
 # Chosen on seven training captures
 SHARE = 0.03  # most new Gaussians, as a share of the fitted ones
-LEVEL = 8  # size of a pixel of the drawings, relative to the views': coarse, because the filling is blurred anyway
-BESIDE = -0.1  # position of a camera just outside, as a share of the way to the nearest view
+LEVEL = 8  # side of a drawing's pixel in pixels of the views; it is coarse, because the filling is blurred anyway
+BESIDE = -0.1  # position of a camera just beside the views, as a share of the distance to the nearest view
 MARGIN = 0.05  # margin of the drawings on each side, as a share of their sides
 CLEAR, SOLID = 0.1, 0.05  # transmittance above which a pixel is a gap, and below which it shows a surface
 # A surface is not continued if it is nearer than NEARER times the farthest depth in a window around the pixel, whose
@@ -38,24 +38,25 @@ CLEAR, SOLID = 0.1, 0.05  # transmittance above which a pixel is a gap, and belo
 WINDOW, NEARER = 0.08, 0.85
 SOFT = 2.0  # standard deviation in pixels of the blur by which colours and inverse depths spread into gaps
 MOST_VIEWS = 64  # most views of a scene that is filled, because the time grows with their square
-DEEPER = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # depths that are tried, relative to the surface's
-REACH = 2  # pixels beside a picture in which a Gaussian still reaches into it
-FRONT = 0.98  # share of a surface's depth in front of which a camera would see a Gaussian
+DEPTH_FACTORS = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # candidate depths of a Gaussian, relative to the surface's depth
+REACH = 2  # a Gaussian reaches into a picture from at most this many pixels beside it
+FRONT = 0.98  # a camera would see a Gaussian in front of this share of a surface's depth
 
 
 @stage("fill")
 def fill_between(
     fitted: Gaussians, cameras: Cameras, outside: Outside | None, most: int, *, beyond: bool = False
 ) -> Gaussians:
-    """Make Gaussians that fill the gaps which cameras between and just beside the photos' cameras see.
+    """Make Gaussians that fill gaps seen from cameras between or just beside those of the photos.
 
-    There are at most ``most``, and at most ``SHARE`` times the fitted ones; gaps that half-way cameras see come first.
-    The new Gaussians continue the farther one of the surfaces around. They stand where no camera sees them, so no photo
-    contradicts them, nor does a view from ``outside``. All are in the view of some photo, unless ``beyond``. Scenes of
-    more than ``MOST_VIEWS`` views get none, because photos show nearly everything between them.
+    There are at most ``most`` new Gaussians, and at most ``SHARE`` times the number of ``fitted`` Gaussians. Gaps seen
+    from half-way cameras come first. The new Gaussians continue the farthest surface beside a gap. No photo and no view
+    from ``outside`` contradicts them, because they stand where these views do not see them. Each is in the field of
+    view of some photo, unless ``beyond``. Scenes of more than ``MOST_VIEWS`` views get none, because photos show nearly
+    everything between them.
     """
-    added, most = fitted[:0], min(most, int(SHARE * len(fitted)))
-    if most == 0 or not 1 < len(cameras) <= MOST_VIEWS:
+    added, max_count = fitted[:0], min(most, int(SHARE * len(fitted)))
+    if max_count == 0 or not 1 < len(cameras) <= MOST_VIEWS:
         return added
     cameras = _small_cameras(cameras)
     between, splats = _widen(between_cameras(cameras, BESIDE)), make_splats(fitted)
@@ -68,16 +69,16 @@ def fill_between(
     def continue_surfaces(view: int) -> Gaussians:
         return _continue_surfaces(drawings[view], between[[view]], seen, outside, fitted.shN.shape[1], beyond=beyond)
 
-    for view, more in enumerate(parallel_map(continue_surfaces, range(len(between)))):
-        more = more[~_on_same_pixels(more, added, between[[view]])]
-        added = Gaussians.concat([added, more[: most - len(added)]])
+    for view, new in enumerate(parallel_map(continue_surfaces, range(len(between)))):
+        new = new[~_on_covered_pixels(new, added, between[[view]])]
+        added = Gaussians.concat([added, new[: max_count - len(added)]])
     return added
 
 
-def _on_same_pixels(gaussians: Gaussians, others: Gaussians, camera: Cameras) -> np.ndarray:
-    """Mark ``gaussians`` ``[n]`` whose pixel in a camera is one of the four nearest to one of the ``others``."""
+def _on_covered_pixels(gaussians: Gaussians, covering: Gaussians, camera: Cameras) -> np.ndarray:
+    """Mark ``gaussians [n]`` on pixels of a camera that ``covering`` Gaussians cover; each covers its nearest four."""
     covered, last = np.zeros((camera.height + 2, camera.width + 2), bool), (camera.width + 1, camera.height + 1)
-    (positions,), (depths,) = project(others.means, camera)
+    (positions,), (depths,) = project(covering.means, camera)
     corners = positions[depths > 0, None] + np.array([(0.5, 0.5), (0.5, 1.5), (1.5, 0.5), (1.5, 1.5)])
     x, y = np.clip(np.floor(corners), 0, last).astype(np.int64).reshape(-1, 2).T
     covered[y, x] = True
@@ -91,7 +92,7 @@ class Seen:
     """Surfaces and gaps that c cameras of one size see in a scene."""
 
     cameras: Cameras
-    farthest: np.ndarray  # [c,h,w] mean depth, the farthest within the reach of a new Gaussian
+    farthest: np.ndarray  # [c,h,w] largest mean depth within the pixels that a new Gaussian reaches
     clear: np.ndarray  # [c,h,w] bool, gaps
 
     def without_gaps(self) -> Seen:
@@ -163,32 +164,49 @@ def _continue_surfaces(
     *,
     beyond: bool,
 ) -> Gaussians:
-    """Make Gaussians in the gaps of a ``camera`` that continue the farther one of the surfaces beside each gap.
+    """Make Gaussians in the gaps of a ``camera``, which continue the farthest surface beside each gap.
 
-    A Gaussian stands at the first of the depths ``DEEPER``, relative to that surface, that nothing ``seen``
-    contradicts. There is none if all depths are contradicted.
+    The candidate depths of a Gaussian are ``DEPTH_FACTORS`` times the depth of that surface. The Gaussian stands at the
+    first depth that no view contradicts. If all depths are contradicted, there is no Gaussian. ``seen`` are the
+    surfaces in the photos' cameras and in the cameras between them.
     """
-    depths, transmittance, image = drawing
-    solid, clear = transmittance < SOLID, transmittance > CLEAR
-    around = np.ones((2 * round(WINDOW * camera.width) + 1,) * 2, np.uint8)
-    known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), around))
-    clear &= cv2.dilate(known.astype(np.uint8), around) > 0
-    clear &= beyond | lies_between(known)
-    image = image / np.maximum(1 - transmittance, 1e-6)[..., None]
-    values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
-    sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]
-    y, x = np.nonzero(clear)
-    pixels, viewmat, K = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), camera.viewmats[0], camera.Ks[0]
-    eye, rays = camera.centres[0], matmul(matmul(pixels, invert(K).T), viewmat[:3, :3])  # to depth 1
-    tried = np.array(DEEPER)[:, None] * (sums[:, 4] / sums[:, 0]).astype(np.float64)
-    points = (eye + tried[..., None] * rays).reshape(-1, 3)
+    gaps, surface_depths, colors = _spread_into_gaps(drawing, round(WINDOW * camera.width), beyond=beyond)
+    eye, rays = camera.centres[0], _rays(gaps, camera)
+    depths = np.array(DEPTH_FACTORS)[:, None] * surface_depths.astype(np.float64)
+    points = (eye + depths[..., None] * rays).reshape(-1, 3)
     wrong = np.zeros(len(points), bool) if beyond else ~seen[0].show(points)
     for views in seen:
         wrong[~wrong] = views.contradict(points[~wrong])
     if outside is not None:
         wrong[~wrong] = outside.contradict(points[~wrong], FRONT)
-    hidden = ~wrong.reshape(tried.shape)
-    rows = np.flatnonzero(hidden.any(0))
-    chosen = tried[hidden.argmax(0)[rows], rows]
-    colors = sums[rows, 1:4] / sums[rows, 4:]
-    return make_gaussians(eye, rays[rows], chosen, SIZE / K[0, 0], colors, num_higher)
+    possible = ~wrong.reshape(depths.shape)
+    rows = np.flatnonzero(possible.any(0))
+    first_possible = depths[possible.argmax(0)[rows], rows]
+    return make_gaussians(eye, rays[rows], first_possible, SIZE / camera.Ks[0][0, 0], colors[rows], num_higher)
+
+
+def _spread_into_gaps(
+    drawing: tuple[np.ndarray, np.ndarray, np.ndarray], reach: int, *, beyond: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Spread the depths and colours of the farthest surfaces at most ``reach`` pixels into the gaps of a drawing.
+
+    Returns the pixels of gaps that are filled, ``[h,w]`` bool, and the depth ``[n]`` and the colour ``[n,3]`` of each.
+    """
+    depths, transmittance, image = drawing
+    solid, clear = transmittance < SOLID, transmittance > CLEAR
+    window = np.ones((2 * reach + 1,) * 2, np.uint8)
+    known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), window))
+    clear &= cv2.dilate(known.astype(np.uint8), window) > 0
+    clear &= beyond | lies_between(known)
+    image = image / np.maximum(1 - transmittance, 1e-6)[..., None]
+    values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
+    sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]
+    inverse_depths, colors, weights = sums[:, 0], sums[:, 1:4], sums[:, 4]
+    return clear, weights / inverse_depths, colors / weights[:, None]
+
+
+def _rays(mask: np.ndarray, camera: Cameras) -> np.ndarray:
+    """Return rays ``[n,3]`` in the world, to depth 1, through the pixels of a ``mask [h,w]``."""
+    y, x = np.nonzero(mask)
+    pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
+    return matmul(matmul(pixels, invert(camera.Ks[0]).T), camera.viewmats[0][:3, :3])

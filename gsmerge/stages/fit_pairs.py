@@ -16,17 +16,17 @@ from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians
 
 # PSNR (dB) that a fit may lose in a view that it was not trained on, for each of the powers of masses in
-# :data:`gsmerge.stages.pair_merge.POWERS`. It is larger for an object, which few people view from inside
+# :data:`gsmerge.stages.pair_merge.POWERS`. It is larger for objects, because few people view them from inside
 TOLERANCES = 0.0, 3.0
-NEAR_INPUT = 36.0  # PSNR (dB) against renders of the input; nobody sees what a fit gains beyond it
+NEAR_INPUT = 36.0  # PSNR (dB) against renders of the input; nobody sees further gains of a fit
 
 
 def fit_pairs(starts: Sequence[Decoded], prepared: Prepared, options: FitOptions, seed: int, target: float) -> Fitted:
     """Fit the best of several starts to renders of the input, unless it looks like the input already.
 
     ``starts`` were merged by the powers of masses in :data:`gsmerge.stages.pair_merge.POWERS`, in this order. If the
-    scene has no views of its own, each start is fitted, and the best result is returned. ``target`` is the PSNR (dB)
-    that was asked for.
+    scene has no views of its own, each start is fitted, and the best result is returned. ``target`` is the requested
+    PSNR (dB).
     """
     photos, views = scene_photos(prepared.scene), prepared.reference.score_views
     psnrs = [score_photos(start.gaussians, photos, views, quarter=True).psnr for start in starts]

@@ -12,13 +12,15 @@ from gsmerge.runtime.record import stage
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.types import SH_C0, FeatureGaussians, Matches
 
+UPPER_TRIANGLE = [0, 1, 2, 4, 5, 8]  # entries xx xy xz yy yz zz of a flattened 3 x 3 covariance
+
 
 @stage("match")
 def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     """Cluster Feature Gaussians of different views that show the same piece of surface.
 
-    The result does not depend on the order of the Feature Gaussians: leaders are chosen by weight, and by position if
-    weights are equal. Fully transparent Feature Gaussians form clusters of one.
+    The result does not depend on the order of the Feature Gaussians, because leaders are chosen by weight, and by
+    position if weights are equal. Each fully transparent Feature Gaussian forms a cluster of one.
     """
     count = len(features)
     clusters = np.full(count, -1, np.int64)
@@ -35,16 +37,16 @@ def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
 def _find_clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOptions) -> tuple[np.ndarray, int]:
     """Return the cluster ``[m]`` of each of the ``rows [m]``, and the number of clusters."""
     means, views = features.means[rows].astype(np.float64), features.views[rows]
-    covars = features.covars[rows].astype(np.float64).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    covars = np.ascontiguousarray(features.covars[rows].astype(np.float64).reshape(-1, 9)[:, UPPER_TRIANGLE])
     colors = SH_C0 * features.sh0[rows, 0].astype(np.float64)
     neighbors = nearest_of_other_views(means, views, options.num_neighbors)
     boxes = options.match == "aabb"
     latents = as_array(features.latents)
     has_latents = boxes and bool(latents.any())  # networks without an encoder leave them zero
-    latents = normalize(latents[rows] if has_latents else latents[rows, :0])
+    latents = normalize(latents[rows] if has_latents else np.zeros((len(rows), 0), latents.dtype))
     scores = np.empty(neighbors.shape)
     limits = options.max_color, options.similarity
-    edge_scores(neighbors, means, np.ascontiguousarray(covars), colors, latents, views, *limits, boxes, scores)
+    edge_scores(neighbors, means, covars, colors, latents, views, *limits, boxes, scores)  # fills `scores`
     if boxes:
         return connected_components(neighbors, scores, options.iou)
     order = np.lexsort((*means.T, -features.weights[rows]))

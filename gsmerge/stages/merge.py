@@ -21,7 +21,7 @@ class MergedViews:
     members: Members  # The scene's Gaussians, indexed by `features.members`
     segmentation: Segmentation  # The superpixels, and the number of Gaussians to make
     num_groups: int  # Superpixels with Gaussians, before merging
-    networks: Corrector = ANALYTIC  # What corrects the Gaussians that they are decoded into
+    networks: Corrector = ANALYTIC  # Corrections of the decoded Gaussians
 
 
 @stage("match")
@@ -40,14 +40,14 @@ def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = AN
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split rows by cluster: rows that are alone, the other rows sorted by cluster, and the start of each cluster."""
+    """Return the rows that are alone in their cluster, the other rows by cluster, and the starts of these clusters."""
     clusters = matches.clusters
     alone = np.bincount(clusters, minlength=matches.count)[clusters] == 1
     order = np.flatnonzero(~alone)
     order = order[np.argsort(clusters[order], kind="stable")]
-    first = np.ones(len(order), bool)
-    first[1:] = clusters[order][1:] != clusters[order][:-1]
-    return np.flatnonzero(alone), order, np.flatnonzero(first)
+    begins_cluster = np.ones(len(order), bool)
+    begins_cluster[1:] = clusters[order][1:] != clusters[order][:-1]
+    return np.flatnonzero(alone), order, np.flatnonzero(begins_cluster)
 
 
 def take(features: FeatureGaussians, index: np.ndarray) -> FeatureGaussians:
@@ -61,9 +61,9 @@ def _gather(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, 
     """Return the members of the indexed Feature Gaussians, as starts and rows."""
     begin, sizes = features.starts[index], np.diff(features.starts)[index]
     starts = np.concatenate([np.zeros(1, np.int64), sizes.cumsum()])
-    places = (begin - starts[:-1]).astype(np.int32).repeat(sizes)
-    places += np.arange(starts[-1], dtype=np.int32)
-    return starts, features.members[places]
+    positions = (begin - starts[:-1]).astype(np.int32).repeat(sizes)  # in the members of all Feature Gaussians
+    positions += np.arange(starts[-1], dtype=np.int32)
+    return starts, features.members[positions]
 
 
 def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:

@@ -22,16 +22,18 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians
 
 ROUND_SHARE = 0.25  # least share of the Gaussians that remains after a round
-CELL_SHARE = 0.2  # the same in each cell; longer chains of merges make haze
+CELL_SHARE = 0.2  # least share of a cell's Gaussians that remains after a round; longer chains of merges make haze
 # Chosen on training scenes by the PSNR of views from random cameras (docs/internals/notebook.md#bare-files)
 COLOR_WEIGHT = 0.6  # weight of squared distances of harmonics of degree 0, relative to costs in nats
-# Powers of the masses by which costs are multiplied: the first favours large parts of the pictures, for scenes; the
+# Costs are multiplied by a power of the masses. The first power favours large parts of the pictures, for scenes; the
 # second favours detail, for objects
 POWERS = 1.0, 0.3
 FLATNESS = 0.01  # least scale, relative to the largest, so that the logarithm of the volume stays finite
 MIN_OPACITY = 1e-4  # least opacity of Gaussians that are merged, so that masses stay positive
-WIDER = 0.05  # most growth of scales for each doubling of the merged number: fewer Gaussians would leave more gaps
+WIDER = 0.05  # most growth of scales for each doubling of the merged number; without it gaps would open
 CELLS_PER_TASK = 256
+FULL_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # entries of an upper triangle xx xy xz yy yz zz in a flattened 3 x 3 matrix
+NEXT_AXIS = [1, 2, 0]  # the axis after each axis, so that products with it cover the three pairs of axes
 
 
 @dataclass(eq=False)
@@ -57,8 +59,8 @@ class Cloud:
 def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) -> Gaussians:
     """Merge finite Gaussians in any frame into ``count`` Gaussians, at least one; none is dropped.
 
-    If there are no more than ``count``, they are returned unchanged. ``power``: costs are weighted by the masses to
-    this power.
+    If there are at most ``count`` Gaussians, they are returned unchanged. Costs are weighted by the masses to the
+    ``power``.
     """
     count = max(1, count)
     if len(gaussians) <= count:
@@ -87,18 +89,18 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
     pairs, costs = np.zeros((len(cloud), 2), np.int32), np.full(len(cloud), np.inf, np.float32)
     colors = np.ascontiguousarray(cloud.sh[:, :3])
 
-    def work(first: int) -> None:
-        last = min(first + CELLS_PER_TASK, len(starts) - 1)
+    def merge_cells(begin: int) -> None:
+        end = min(begin + CELLS_PER_TASK, len(starts) - 1)
         agglomerate(
             cloud.means, cloud.covars, cloud.masses, cloud.weights, colors, order, starts, COLOR_WEIGHT, CELL_SHARE,
-            first, last, pairs, costs,
-        )  # fmt: skip
+            begin, end, pairs, costs,
+        )  # fills `pairs` and `costs`  # fmt: skip
 
-    parallel_map(work, range(0, len(starts) - 1, CELLS_PER_TASK))
-    chosen = pairs[_cheapest(costs, len(cloud) - count)]
-    if len(chosen) == 0:  # no cost is a number: keep the Gaussians with the largest masses
+    parallel_map(merge_cells, range(0, len(starts) - 1, CELLS_PER_TASK))
+    cheapest_pairs = pairs[_cheapest(costs, len(cloud) - count)]
+    if len(cheapest_pairs) == 0:  # no cost is a number: keep the Gaussians with the largest masses
         return cloud[np.sort(np.argsort(-cloud.masses, kind="stable")[:count])]
-    return merge_rows(cloud, chosen)
+    return merge_rows(cloud, cheapest_pairs)
 
 
 def merge_rows(cloud: Cloud, pairs: np.ndarray) -> Cloud:
@@ -113,7 +115,7 @@ def _divide(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Divide means ``[n,3]`` into cells of neighbours; return their order ``[n]`` and the cell starts ``[c+1]``."""
     count = len(means)
     starts = np.array([0, count])
-    while (starts[1:] - starts[:-1]).max() > CELL:  # in the same way as the tree halves its runs
+    while (starts[1:] - starts[:-1]).max() > CELL:  # halves runs as the k-d tree does
         starts = np.sort(np.concatenate([starts, (starts[1:] + starts[:-1]) // 2]))
     return make_tree(means)[0], starts
 
@@ -132,14 +134,14 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
 def gaussians_of(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
     """Convert moments to Gaussians; Gaussians that were not merged are copied from ``source``.
 
-    A mass that would need an opacity above one makes scales larger instead, at most by the share ``wider`` for each
-    doubling of the merged number.
+    If a mass would need an opacity above one, scales grow instead, at most by the share ``wider`` for each doubling of
+    the merged number.
     """
-    scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
+    scales, quats = principal_axes(cloud.covars[:, FULL_MATRIX].reshape(-1, 3, 3))
     squares = scales * scales
-    opacities = cloud.masses / np.sqrt((squares * squares[:, [1, 2, 0]]).sum(1))
-    most = 1 + wider * log(cloud.sizes.astype(np.float64)) / float(log(2.0))
-    scales *= np.sqrt(opacities).clip(1, most)[:, None]
+    opacities = cloud.masses / np.sqrt((squares * squares[:, NEXT_AXIS]).sum(1))
+    max_growth = 1 + wider * log(cloud.sizes.astype(np.float64)) / float(log(2.0))
+    scales *= np.sqrt(opacities).clip(1, max_growth)[:, None]
     opacities = np.minimum(opacities, MAX_OPACITY)
     sh = cloud.sh.reshape(len(cloud), -1, 3)
     means, quats, scales = to_float32(cloud.means), to_float32(quats), to_float32(scales)

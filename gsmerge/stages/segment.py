@@ -1,4 +1,4 @@
-"""Scene -> groups: the superpixels of every view, the same number in each or cut from a region tree.
+"""Scene -> groups: the superpixels of every view, either the same number in each, or cut from a region tree.
 
 The tree has few superpixels where little is lost, and many where much is gained. Distortion is measured in image space.
 It is the squared colour error plus the squared error of the depth relative to a plane, so a flat wall costs nothing
@@ -32,8 +32,8 @@ COMPACTNESS = 1e-5
 # larger Gaussians. It is exceeded only if the budget is too small for more regions.
 MAX_EXTENT = 1 / 8
 KNEE_STEP = 1.25  # the slope of the curve is measured over this factor of the count
-KNEE_SLOPE = 1.0  # dB of predicted quality per relative increase of the count: below it, more are not worth it
-KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (noise, views that disagree)
+KNEE_SLOPE = 1.0  # dB of predicted quality per relative increase of the count; below it, more Gaussians gain too little
+KNEE_FLOOR = 3e-4  # squared error per pixel and channel that remains at every count (noise, views that disagree)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class SuperpixelChoices:
 
     options: SegmentOptions  # Method and number
     limits: CountLimits  # Limits of the number of Gaussians
-    start_share: float  # Share of the Gaussians to start with; a fit adds the others
+    start_share: float  # Share of the Gaussians to start with; a fit adds the rest
     shared: SharedTree | None  # The region tree of all counts of a run; None: each count builds its own
 
 
@@ -65,28 +65,28 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
     """Cut every view into superpixels: as the options say, or so that they give exactly ``count`` Gaussians.
 
     For an exact count the region tree is cut, which gives a plain wall few superpixels and a fern many. The tree is
-    also cut if some pixels count more than others. If the shared tree is too coarse, a finer one is built. Adaptive
-    superpixels change the number of Gaussians; if it exceeds the budget, the tree is cut at the largest allowed count
-    instead.
+    also cut if pixels differ in importance. If the shared tree is too coarse, a finer tree is built. Adaptive
+    superpixels change the number of Gaussians. If this number exceeds the budget, the tree is cut at the largest
+    allowed count instead.
     """
-    limits, options, views = choices.limits, choices.options, len(scene)
+    limits, options, num_views = choices.limits, choices.options, len(scene)
     if count is None and scene.importance is not None and not options.adapts:
         count = limits.default
     if count is None:
-        pictures, each = scene.images, max(1, int(limits.per_view * choices.start_share))
+        start_per_view = max(1, int(limits.per_view * choices.start_share))
         if not options.adapts:
-            return Segmentation(segment(pictures, options, each), limits.default, exact=False)
+            return Segmentation(segment(scene.images, options, start_per_view), limits.default, exact=False)
         # the superpixels adapt to the final number; the fit begins with a share of it
-        groups = segment(pictures, options, limits.per_view, adapt=each / limits.per_view)
-        count = round(limits.default * len(groups) / (each * views))
+        groups = segment(scene.images, options, limits.per_view, adapt=start_per_view / limits.per_view)
+        count = round(limits.default * len(groups) / (start_per_view * num_views))
         if count <= limits.max_count:
             return Segmentation(groups, count, exact=False)
         count = limits.max_count
     tree = choices.shared.get(scene, choices) if choices.shared else None
-    first = max(views, int(count * choices.start_share))
-    if tree is None or first > len(tree):
+    start_count = max(num_views, int(count * choices.start_share))
+    if tree is None or start_count > len(tree):
         tree = scene_tree(scene, options, limits, count)
-    return Segmentation(cut_tree(tree, first), count, exact=True)
+    return Segmentation(cut_tree(tree, start_count), count, exact=True)
 
 
 @stage("segment")
@@ -95,12 +95,12 @@ def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimit
 
     The squared colour error of a pixel is multiplied by its importance.
     """
-    pictures, important = scene.images, scene.importance
-    leaves = max(limits.per_view, -(-count // len(scene)))
-    stretched = pictures if important is None else pictures * np.sqrt(important)[..., None]
-    leaves = leaves if important is None else int(leaves * important.max())
-    groups = segment(pictures, options, min(leaves, scene.pixels_per_view))
-    return region_tree(stretched, front_depths(scene), groups, scene.get_pixels().shown)
+    images, leaves = scene.images, max(limits.per_view, -(-count // len(scene)))
+    if scene.importance is not None:  # errors are squared, so colours are multiplied by the square root
+        images = images * np.sqrt(scene.importance)[..., None]
+        leaves = int(leaves * scene.importance.max())
+    groups = segment(scene.images, options, min(leaves, scene.pixels_per_view))
+    return region_tree(images, front_depths(scene), groups, scene.get_pixels().shown)
 
 
 def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
@@ -117,8 +117,8 @@ class RegionTree:
 
     groups: Groups  # The superpixels that it starts from
     parents: tuple[np.ndarray, ...]  # For each view [2·leaves-1] int32: the union that a region is part of, or -1
-    order: np.ndarray  # [m] int64, all merges, cheapest first; those of view v are numbered from `first[v]` on
-    first: np.ndarray  # [v+1] int64, number of merges in the views before
+    order: np.ndarray  # [m] int64, all merges, cheapest first; the merges of view v are numbered from `offsets[v]` on
+    offsets: np.ndarray  # [v+1] int64, number of merges in the views before
     distortions: np.ndarray  # [m+1] float64 mean squared error after the first i merges
     min_regions: int  # Fewest regions before any is larger than `MAX_EXTENT`
 
@@ -164,21 +164,21 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
 
     merged_views = parallel_map(merge_view, range(len(images)))
     parents, view_heights, growths, starts, num_pixels = zip(*merged_views, strict=True)
-    first, heights = np.concatenate([[0], np.cumsum([len(h) for h in view_heights])]), np.concatenate(view_heights)
+    offsets, heights = np.concatenate([[0], np.cumsum([len(h) for h in view_heights])]), np.concatenate(view_heights)
     # Heights never fall from child to parent, and children come first, so a stable sort keeps children before parents
     order = np.argsort(heights, kind="stable")
     added = np.concatenate([[sum(starts)], np.concatenate(growths)[order]])
     distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))
     min_regions = len(groups) - int(np.count_nonzero(heights < OVERSIZE))
-    return RegionTree(groups, parents, order, first, distortions, min_regions)
+    return RegionTree(groups, parents, order, offsets, distortions, min_regions)
 
 
 def _check_pictures(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> None:
     """Raise ValueError if shapes differ, or if a superpixel is empty."""
     shape = list(groups.labels.shape)
-    for name, array, want in (("images", images, [*shape, 3]), ("depths", depths, shape), ("valid", valid, shape)):
-        if list(array.shape) != want:
-            raise ValueError(f"{name}: expected shape {want}, got {list(array.shape)}")
+    for name, array, expected in (("images", images, [*shape, 3]), ("depths", depths, shape), ("valid", valid, shape)):
+        if list(array.shape) != expected:
+            raise ValueError(f"{name}: expected shape {expected}, got {list(array.shape)}")
     for view, count in enumerate(groups.counts):
         sizes = np.bincount(groups.labels[view].reshape(-1), minlength=count)
         if len(sizes) > count or int(sizes.min()) < 1:
@@ -188,8 +188,9 @@ def _check_pictures(images: np.ndarray, depths: np.ndarray, groups: Groups, vali
 def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Return depths in units of their median, float32; 0 for pixels that do not count."""
     usable = valid & np.isfinite(depths)
-    middle = float(np.median(depths[usable & (depths > 0)])) if (usable & (depths > 0)).any() else 1.0
-    clipped = np.clip(depths / middle, 1 / DEPTH_RANGE, DEPTH_RANGE)
+    positive = usable & (depths > 0)
+    median = float(np.median(depths[positive])) if positive.any() else 1.0
+    clipped = np.clip(depths / median, 1 / DEPTH_RANGE, DEPTH_RANGE)
     return np.ascontiguousarray(np.where(usable, clipped, 0), np.float32)
 
 
@@ -197,19 +198,19 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
     """Cut the tree into exactly ``budget`` regions over all views, at least one in each.
 
     A ``budget`` above the number of superpixels gives all superpixels. The regions of a smaller budget are unions of
-    those of a larger budget. Raises ValueError if ``budget`` is below the number of views.
+    regions of a larger budget. Raises ValueError if ``budget`` is below the number of views.
     """
     num_views = len(tree.parents)
     if budget < num_views:
         raise ValueError(f"budget: expected at least {num_views}, one per view, got {budget}")
-    keep = np.zeros(len(tree.order), bool)
-    keep[tree.order[: max(0, len(tree) - budget)]] = True
+    is_merged = np.zeros(len(tree.order), bool)
+    is_merged[tree.order[: max(0, len(tree) - budget)]] = True
 
     def cut_view(view: int) -> tuple[np.ndarray, int]:
-        view_keep = keep[tree.first[view] : tree.first[view + 1]]
+        is_view_merged = is_merged[tree.offsets[view] : tree.offsets[view + 1]]
         leaves = tree.groups.counts[view]
-        leaf_labels = cut_labels(tree.parents[view], view_keep, leaves)
-        return leaf_labels[tree.groups.labels[view]], leaves - int(view_keep.sum())
+        leaf_labels = cut_labels(tree.parents[view], is_view_merged, leaves)
+        return leaf_labels[tree.groups.labels[view]], leaves - int(is_view_merged.sum())
 
     labels, counts = zip(*parallel_map(cut_view, range(num_views)), strict=True)
     return Groups(np.stack(labels), counts)
@@ -218,16 +219,16 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
 def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     """Return the count beyond which more Gaussians add little quality.
 
-    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. The knee is the largest N around which, within a factor of
-    1.25, q still grows by ``KNEE_SLOPE`` dB per relative increase of N; the least N if there is none. ``counts [m]``
-    are all different; ``distortions [m]`` are mean squared errors per pixel and channel.
+    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. Its slope at N is measured between N / 1.25 and N, in dB per
+    relative increase of N. The knee is the largest N with a slope of at least ``KNEE_SLOPE``, or the least N if there
+    is none. ``counts [m]`` are all different; ``distortions [m]`` are mean squared errors per pixel and channel.
     """
     counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
     if len(counts) == 0 or counts.shape != distortions.shape:
         raise ValueError(f"expected as many distortions as counts, got {distortions.shape} for {counts.shape}")
     order = np.argsort(counts)
-    scale, error = log(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
+    log_counts, error = log(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
     quality = -10 * log10(KNEE_FLOOR + np.maximum(error, 0))
-    before = np.interp(scale - log(KNEE_STEP), scale, quality)
+    before = np.interp(log_counts - log(KNEE_STEP), log_counts, quality)
     steep = (quality - before) / log(KNEE_STEP) >= KNEE_SLOPE
     return int(counts[order][np.flatnonzero(steep)[-1] if steep.any() else 0])

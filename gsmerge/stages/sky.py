@@ -2,7 +2,7 @@
 
 In each photo the sky is a smooth region that begins at the upper border and is nowhere warmer than grey. It also pales
 towards the horizon, as air does; otherwise, as under clouds, it has to be several times as far away as the rest.
-Ceilings and white walls share the first three properties, seldom the last two, and never in several views.
+Ceilings and white walls share the first three properties. They seldom have the last two, and never in several views.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ SIDE = 480.0  # length in pixels of the longer side to which gradients are scale
 SMOOTH = 0.02  # largest gradient of a colour per pixel
 # Sky is blue and brighter than DARK, or brighter than WHITE with less chroma than GREY
 DARK, WHITE, GREY = 0.35, 0.75, 0.12
-WARM = 0.03  # red exceeds blue at most by so much, in nine tenths of the region
+WARM = 0.03  # red exceeds blue by at most this much, in nine tenths of the region
 LEAST_AREA, LEAST_TOP = 0.02, 0.4  # least share of the picture, and of its upper border, that is sky
 PALER, PALER_RANGE = -0.12, 0.08  # largest correlation of saturation with the row; least spread of saturation
-FAR = 3.0  # the sky is at least so many times as far away as the rest
+FAR = 3.0  # the sky is more than this many times as far away as the rest
 LEAST_VIEWS, LEAST_SHARE = 2, 0.2  # fewest views that show sky, and least share of all views; fewer may be mistaken
-AGREEMENT = 0.7  # least share of a Gaussian's blending weights that lies in the sky
+AGREEMENT = 0.7  # a Gaussian is sky if at least this share of its blending weights lies in the sky
 LAYERS, LAST_LAYER = 6, 0.02  # most rounds; a round that adds less than this share of the sky found so far is the last
-MAX_SAMPLE_GAUSSIANS = 200_000  # most Gaussians by which depths are compared
+MAX_SAMPLE_GAUSSIANS = 200_000  # most Gaussians whose depths are compared
 
 
 def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
@@ -88,7 +88,7 @@ def sky_region(photo: np.ndarray) -> np.ndarray:
     height, width = photo.shape[:2]
     scale = max(height, width) / SIDE
     sigma = max(1.5 * scale, 0.5)
-    upper = photo[: round(4 * sigma) + 3]  # the rows on which the blurred upper border depends
+    upper = photo[: round(4 * sigma) + 3]  # the blurred upper border depends on these rows alone
     if _like_sky(blur(upper, sigma), scale)[0].mean() < LEAST_TOP:
         return np.zeros((height, width), bool)
     soft = blur(photo, sigma)

@@ -1,16 +1,16 @@
 """Partition each view into superpixels of similar colour and regular shape (paper section 4.1).
 
-The default, ``rdseg``, uses the superpixels where they lower the squared colour error most. It cuts more rectangles
-than asked for, best first, merges them with Ward's rule to the exact number, and then moves border pixels exactly.
-``bass`` is Bayesian adaptive superpixel segmentation from a hexagonal grid. ``bass-st`` is the same from seeds drawn by
-the Shi-Tomasi response, as in the paper. ``bass-adaptive`` is the same with splits and merges. ``slic`` is the common
-baseline. ``grid`` makes plain rectangles; if these are a few pixels large and no fit follows, they are as good as the
-others and cost nothing. No superpixel is empty, each is 4-connected, and the result is the same bit for bit in each
-run.
+The default, ``rdseg``, places superpixels where they lower the squared colour error most. It cuts more rectangles than
+requested, the best cuts first, merges them with Ward's rule to the exact number, and then moves border pixels exactly.
+``bass`` is Bayesian adaptive superpixel segmentation from a hexagonal grid. ``bass-st`` starts from seeds drawn by the
+Shi-Tomasi response instead, as in the paper. ``bass-adaptive`` adds splits and merges to ``bass-st``. ``slic`` is the
+common baseline. ``grid`` makes plain rectangles. If these are a few pixels large and no fit follows, they are as good
+as the other methods and cost nothing. No superpixel is empty, each is 4-connected, and the result is the same bit for
+bit in each run.
 
-The number of superpixels is exactly the one that is asked for, with one exception: if a share of the pixels is asked
-for, ``bass-adaptive`` finds its own number in each view, at most four times more or fewer. If a number is asked for,
-here or by a budget, it goes on with splits or merges to that number, those of the highest Hastings ratio first.
+The number of superpixels is exactly the requested number, with one exception. If a share of the pixels is requested,
+``bass-adaptive`` finds its own number in each view, between a quarter and four times the share. If a number is
+requested, here or by a budget, it then splits or merges to that number, the highest Hastings ratio first.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from gsmerge.types import Groups
 RECTANGLES, EARLY_SWEEPS = 2.0, 0  # rectangles per superpixel that rdseg merges, and sweeps before the merges
 NUM_SWEEPS = 2
 BLOCK = 32  # side in pixels of the squares that are cut into rectangles
-PIXEL_START = 0.45  # above so many rectangles per pixel, the pixels themselves are merged
+PIXEL_START = 0.45  # rectangles per pixel; above this share, the pixels themselves are merged instead of rectangles
 RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
 SLIC_COMPACTNESS = 10  # scikit-image's default
 
@@ -126,10 +126,10 @@ def grid_labels(height: int, width: int, count: int) -> np.ndarray:
     """Return labels ``[h,w]`` int32 of ``count`` rectangles in rows; their numbers per row differ by at most one."""
     min_rows = -(-count // width)  # rows of rectangles that can hold them all
     num_rows = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
-    first = np.arange(num_rows + 1) * count // num_rows  # first label of each row of rectangles
-    row = np.arange(height) * num_rows // height  # row of rectangles of each row of pixels
-    num_columns = np.diff(first)[row]
-    return (first[row][:, None] + np.arange(width) * num_columns[:, None] // width).astype(np.int32)
+    first_labels = np.arange(num_rows + 1) * count // num_rows  # of each row of rectangles
+    row = np.arange(height) * num_rows // height  # row of rectangles that contains each row of pixels
+    num_columns = np.diff(first_labels)[row]
+    return (first_labels[row][:, None] + np.arange(width) * num_columns[:, None] // width).astype(np.int32)
 
 
 def saliency(image: Array) -> Array:
@@ -215,8 +215,8 @@ def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None
 def _slic(pixels: np.ndarray, count: int, compactness: float) -> np.ndarray:
     """Run scikit-image's SLIC, and merge its pieces with Ward's rule to the exact number; return padded labels.
 
-    CIELAB is computed here, from channels that span [0, 1] as in scikit-image, whose own CIELAB depends on the
-    processor.
+    CIELAB is computed here, because scikit-image's own CIELAB depends on the processor. The channels are scaled to
+    [0, 1] first, as in scikit-image.
     """
     from skimage.measure import label
     from skimage.segmentation import slic
@@ -225,13 +225,15 @@ def _slic(pixels: np.ndarray, count: int, compactness: float) -> np.ndarray:
     span = pixels.max() - pixels.min()
     colours = _lab_colours((pixels - pixels.min()) / (span or 1))
     weight = SLIC_COMPACTNESS / (100 * float(np.ptp(colours)) or 1)  # SLIC scales the colours to [0, 1], too
-    asked = count
-    while asked < height * width:
-        pieces = slic(colours, n_segments=asked, compactness=weight, start_label=0, channel_axis=-1, convert2lab=False)
+    num_segments = count
+    while num_segments < height * width:
+        pieces = slic(
+            colours, n_segments=num_segments, compactness=weight, start_label=0, channel_axis=-1, convert2lab=False
+        )
         pieces, num_pieces = label(pieces, background=-1, return_num=True, connectivity=1)
         if num_pieces >= count:
             break
-        asked = int(asked * 1.1) + 1
+        num_segments = int(num_segments * 1.1) + 1
     else:
         return merge_regions(_every_pixel(height, width), pixels, height * width, count, np.float32(compactness**0.5))
     return merge_regions(pad_labels(pieces - 1), pixels, num_pieces, count, np.float32(compactness**0.5))
