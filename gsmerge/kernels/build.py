@@ -32,7 +32,7 @@ class Target:
 
     name: str  # in the library's file name, and in GSMERGE_TARGET
     zig: tuple[str, ...]  # options for the clang of ziglang
-    other: tuple[str, ...]  # options for other compilers
+    gcc: tuple[str, ...]  # options for other compilers, which take those of GCC
 
 
 V3 = Target("v3", ("-mcpu=x86_64_v3",), ("-march=x86-64-v3",))
@@ -54,7 +54,7 @@ class Platform:
 
     @property
     def targets(self) -> tuple[Target, ...]:
-        """The targets, those that need the fewest instruction sets first."""
+        """The targets of the processors, from the fewest instruction sets to the most."""
         return (V3, V4) if self.machine == "x86_64" else (ARM64,)
 
     @property
@@ -66,7 +66,7 @@ class Platform:
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """Further options; stack probes are off, since they would need a C library."""
+        """Further options for the compiler; on Windows, stack probes are off, since they would need a C library."""
         return ("-mno-stack-arg-probe",) if self.system == "win" else ()
 
     def library_name(self, target: Target) -> str:
@@ -75,14 +75,14 @@ class Platform:
 
 
 def find_platform(tag: str | None = None) -> Platform:
-    """Return the platform of a wheel's tag, such as ``manylinux_2_17_aarch64``; by default that of this machine."""
+    """Return the platform of a wheel's tag, such as ``manylinux_2_17_aarch64``; by default this machine's."""
     name = (tag or sysconfig.get_platform()).lower()
     system = next((system for system in ("macosx", "win") if name.startswith(system)), "linux")
     return Platform(system, "arm64" if name.endswith(("arm64", "aarch64")) else "x86_64")
 
 
 def source_files() -> list[Path]:
-    """Return the source files that exist."""
+    """List the C sources and headers in this folder; a wheel may have none."""
     return sorted([*FOLDER.rglob("*.c"), *FOLDER.rglob("*.h")], key=lambda path: path.name)
 
 
@@ -96,12 +96,12 @@ def hash_sources() -> str:
 
 def compiler() -> list[str]:
     """Return the command of the compiler; OSError if there is none."""
-    given = shlex.split(os.environ.get("GSMERGE_CC", ""))
-    if given:
-        program = shutil.which(given[0])
+    words = shlex.split(os.environ.get("GSMERGE_CC", ""))
+    if words:
+        program = shutil.which(words[0])
         if program is None:
-            raise OSError(f"GSMERGE_CC: expected a compiler, found no program {given[0]!r}")
-        return [os.path.abspath(program), *given[1:]]
+            raise OSError(f"GSMERGE_CC: expected a compiler, found no program {words[0]!r}")
+        return [os.path.abspath(program), *words[1:]]
     try:
         import ziglang
     except ImportError:
@@ -115,20 +115,20 @@ def build_target(
     """Build one target's library into a folder; OSError with the compiler's message if that fails."""
     command, path = compiler(), folder / platform.library_name(target)
     is_zig = Path(command[0]).stem == "zig"
-    options = ["-target", platform.triple, *platform.flags, *target.zig] if is_zig else target.other
+    options = ["-target", platform.triple, *platform.flags, *target.zig] if is_zig else target.gcc
     with tempfile.TemporaryDirectory() as cache:
-        whole = Path(cache) / path.name
+        built = Path(cache) / path.name
         caches = {"ZIG_GLOBAL_CACHE_DIR": f"{cache}/global", "ZIG_LOCAL_CACHE_DIR": f"{cache}/local"}
         call = [
             *command, *options, *FLAGS, f'-DSOURCES_HASH="{hash_sources()}"', *extra, *link,
             *(f"-I{folder}" for folder in sorted({path.parent for path in source_files()})),
-            *(str(path) for path in source_files() if path.suffix == ".c"), "-o", whole.name,  # macOS keeps it
+            *(str(path) for path in source_files() if path.suffix == ".c"), "-o", built.name,  # macOS stores this name
         ]  # fmt: skip
         run = subprocess.run(call, cwd=cache, env={**os.environ, **caches}, capture_output=True, text=True, check=False)
         if run.returncode:
             raise OSError(f"{command[0]}: building {path.name} failed\n{run.stderr[-4000:]}")
         folder.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(whole, f"{path}.new")
+        shutil.copyfile(built, f"{path}.new")
         os.replace(f"{path}.new", path)
     return path
 
@@ -141,12 +141,13 @@ def build(
     Args:
         folder: Folder of the libraries.
         extra: Further options for the compiler.
-        platform: Tag of a wheel; by default that of this machine.
+        platform: Tag of a wheel; by default the platform of this machine.
         link: Options that link the objects to a library.
     """
-    where = find_platform(platform)
+    wheel_platform = find_platform(platform)
     with ThreadPoolExecutor() as pool:
-        return list(pool.map(lambda target: build_target(target, folder, where, extra, link), where.targets))
+        targets = wheel_platform.targets
+        return list(pool.map(lambda target: build_target(target, folder, wheel_platform, extra, link), targets))
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ QUAD, BOX, ELLIPSOID, CONE, LEAF, BLOB = range(6)
 def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, depth, ids, points, normals):
     """Write the hit of each pixel: depth along z, id of the shape, point in its frame, and normal in the world.
 
-    Pixels without a hit in front of their present depth do not change.
+    A pixel changes only if the hit is in front of its present depth.
 
     Args:
         eye: ``[3]`` float64 position of the camera.
@@ -36,9 +36,9 @@ def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, 
         step: Pixels from one sample to the next.
         kinds: ``[m]`` int32 kinds of the shapes, 0 to 5.
         sizes: ``[m,4]`` float64 half sizes and ``extra``.
-        rects: ``[m,4]`` int32 samples x0, y0, x1, y1 that can see the shape.
-        depth: ``[h,w]`` float64, filled with the largest depth before.
-        ids: ``[h,w]`` int32, filled with -1 before.
+        rects: ``[m,4]`` int32 rectangles of samples, x0, y0, x1 and y1, in which the shape may appear.
+        depth: ``[h,w]`` float64; the caller fills it with the largest depth.
+        ids: ``[h,w]`` int32; the caller fills it with -1.
         normals: ``[h,w,3]`` float32, towards the camera.
     """
 
@@ -48,7 +48,7 @@ def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, 
     bias=f8(), weights=f8("k"), out=f4("n", out=True),
 )  # fmt: skip
 def add_light(points, normals, axes, centre, radius, maps, bias, weights, out):
-    """Add the light at points: for each light the share that reaches the point, times the cosine and the weight.
+    """Add to ``out`` the light at points: for each light its share that reaches the point, times cosine and weight.
 
     Args:
         normals: ``[n,3]`` float32 of length 1.

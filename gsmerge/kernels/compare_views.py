@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i8, native, u1
 
-COLUMNS = 10  # rows of scratch
+COLUMNS = 10  # values of scratch per pixel
 
 
 @native(
@@ -23,8 +23,8 @@ def compare_views(
 ):  # fmt: skip
     """Compare pixels of one view with the photo of another, for the pairs of views ``first`` to ``last``.
 
-    Pixels are ``points`` in the frame of their camera, with their ``greys``; those of view i are ``starts[i]`` to
-    ``starts[i + 1]``.
+    Pixels are given as ``points`` in the frame of their camera, with their ``greys``. The pixels of view i have the
+    rows ``starts[i]`` to ``starts[i + 1]``.
 
     Args:
         pictures: Grey level, and its derivatives to the right and down; pixels nearer than ``border`` to the edge of a
@@ -32,11 +32,11 @@ def compare_views(
         depths: Depths of the Gaussians at the pixels' centres; NaN without any.
         given: Poses from which ``flows`` are measured.
         scale: Unit of ``flows`` per pixel.
-        scratch: ``[COLUMNS, most pixels of a view]``.
-        curvatures: Written: Gauss-Newton's curvature of half the weighted squared differences by a motion of the
-            second camera; ``slopes`` are their derivatives.
+        scratch: ``[COLUMNS, largest number of pixels of a view]``.
+        curvatures: Written: Gauss-Newton's second derivatives of half the weighted squared differences with respect to
+            a motion of the second camera; ``slopes`` gets the first derivatives.
         costs: Written: mean over the pixels of a robust function of their differences.
-        flows: Written: median distances that the pixels have moved since ``given``.
+        flows: Written: median distances between the pixels' projections with the present poses and with ``given``.
     """
 
 
@@ -52,7 +52,7 @@ def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
 
     ``means`` and ``others`` are the points ``[pixels,3]`` of the pixels of both views. A pixel shows the same surface
     if the other view's point is ``valid`` and the logarithms of the two depths differ by less than ``same``. Returns
-    the positions of these pixels in ``rows``, and the pixels of the other view.
+    the positions of these pixels within ``rows``, and the matching pixels of the other view.
     """
     ids, places = np.empty((2, len(rows)), np.int64)
     count = _find_surfaces(means, rows, others, valid.view(np.uint8), viewmat, K, width, near, same, ids, places)
@@ -66,6 +66,6 @@ def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
 def add_differences(picture, along, start, depths, colors, pixels, sums):
     """Add to ``sums``, for ``pixels`` that a picture shows, the difference of their ``colors`` from it, and 1.
 
-    Points are ``start`` plus ``depths`` times ``along``, in the camera of the picture after its intrinsics. The rows of
-    ``along`` are columns, rows and depths.
+    The projections of the points, homogeneous in pixels of the picture, are ``start`` plus ``depths`` times ``along``.
+    The three rows of ``along`` are the changes of column, row and depth.
     """

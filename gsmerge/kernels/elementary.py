@@ -32,25 +32,29 @@ class Binary(Protocol):
 def _make(name: str, doc: str, arguments: tuple[str, ...] = ("values",), narrow: bool = False) -> Any:
     """Make a function of arrays from the library's ``name_each``, which takes flat float64 arrays.
 
-    ``narrow``: use ``name_floats`` if all arrays are float32.
+    If ``narrow``, the library also has ``name_floats`` for float32 results.
     """
-    wide_each = declare(f"{name}_each", **{key: f8("n") for key in arguments}, out=f8("n", out=True))
-    floats = declare(f"{name}_floats", **{key: f4("n") for key in arguments}, out=f4("n", out=True)) if narrow else None
+    of_doubles = declare(f"{name}_each", **{key: f8("n") for key in arguments}, out=f8("n", out=True))
+    of_floats = None
+    if narrow:
+        of_floats = declare(f"{name}_floats", **{key: f4("n") for key in arguments}, out=f4("n", out=True))
 
     def function(*arrays: ArrayLike) -> Any:
         if all(isinstance(a, float) for a in arrays):  # takes half of the time
             single = np.empty(1)
-            wide_each(*(np.array([a]) for a in arrays), single)
+            of_doubles(*(np.array([a]) for a in arrays), single)
             return single[0]
-        kinds = [a.dtype for a in arrays if isinstance(a, (np.ndarray, np.generic))]
-        kind = np.result_type(*kinds, np.float32) if kinds else np.dtype(np.float64)  # of the result
-        each, inner = (wide_each, np.dtype(np.float64)) if floats is None or kind != np.float32 else (floats, kind)
-        typed = [np.asarray(a, inner) for a in arrays]
+        dtypes = [a.dtype for a in arrays if isinstance(a, (np.ndarray, np.generic))]
+        out_dtype = np.result_type(*dtypes, np.float32) if dtypes else np.dtype(np.float64)
+        compute, dtype = of_doubles, np.dtype(np.float64)
+        if of_floats is not None and out_dtype == np.float32:
+            compute, dtype = of_floats, out_dtype
+        typed = [np.asarray(a, dtype) for a in arrays]
         shape = np.broadcast_shapes(*(a.shape for a in typed))
         flat = [np.ascontiguousarray(a if a.shape == shape else np.broadcast_to(a, shape)).reshape(-1) for a in typed]
-        out = np.empty(shape, inner)
-        each(*flat, out.reshape(-1))
-        return out.astype(kind, copy=False)[()]
+        out = np.empty(shape, dtype)
+        compute(*flat, out.reshape(-1))
+        return out.astype(out_dtype, copy=False)[()]  # [()] makes a scalar of an array without axes
 
     parameters = [inspect.Parameter(key, inspect.Parameter.POSITIONAL_ONLY) for key in arguments]
     function.__name__, function.__qualname__, function.__doc__ = name, name, doc

@@ -11,6 +11,8 @@ from pathlib import Path
 from gsmerge.errors import UsageError
 from gsmerge.kernels.build import FOLDER, Target, find_platform, hash_sources
 
+ELF_HEADER = 64  # bytes
+SECTION_TABLE = "<40xQ10xHH"  # position, bytes per entry and number of entries of an ELF file's section table
 REMEDY = "run python tasks.py native, or pip install again"
 
 
@@ -21,23 +23,23 @@ def load_library() -> ctypes.CDLL:
     ``GSMERGE_NATIVE`` names another folder of libraries. Raises UsageError if no library fits, or if it is missing or
     older than the sources beside it.
     """
-    able, wanted = _able_targets(), os.environ.get("GSMERGE_TARGET")
-    names = [target.name for target in able]
-    if wanted and wanted not in names:
-        raise UsageError(f"GSMERGE_TARGET: expected {' or '.join(names)} on this processor, found {wanted!r}; unset it")
-    return _open(next(target for target in able if target.name == wanted) if wanted else able[-1])
+    targets = {target.name: target for target in _runnable_targets()}
+    name = os.environ.get("GSMERGE_TARGET") or list(targets)[-1]
+    if name not in targets:
+        raise UsageError(f"GSMERGE_TARGET: expected {' or '.join(targets)} on this processor, found {name!r}; unset it")
+    return _open(targets[name])
 
 
-def _able_targets() -> list[Target]:
-    """Return the targets that this processor runs, at least one."""
-    least, *more = find_platform().targets
-    if least.name == "arm64":
-        return [least]
-    library = _open(least)  # its function that identifies the processor uses only instructions of all processors
+def _runnable_targets() -> list[Target]:
+    """Return the targets that this processor runs, at least one, with the most advanced last."""
+    basic, *advanced = find_platform().targets
+    if basic.name == "arm64":
+        return [basic]
+    library = _open(basic)  # its function that identifies the processor uses only instructions of all processors
     level = library.processor_level()
     if level < 3:
         raise UsageError("expected a processor with AVX2 and FMA (x86-64-v3, from 2013 on), found an older one")
-    return [least, *(target for target in more if level >= int(target.name[1:]))]
+    return [basic, *(target for target in advanced if level >= int(target.name[1:]))]  # "v4" needs level 4
 
 
 @lru_cache
@@ -47,12 +49,12 @@ def _open(target: Target) -> ctypes.CDLL:
     try:
         _check_end(path)
         library = ctypes.CDLL(str(path))
-        built = ctypes.c_char_p.in_dll(library, "sources_hash").value or b""
+        sources_hash = ctypes.c_char_p.in_dll(library, "sources_hash").value or b""
     except (OSError, ValueError) as error:  # ValueError if it is not a library of this package
         if path.exists():
             raise UsageError(f"{path}: the native library cannot be loaded ({error}); {REMEDY}") from None
         raise UsageError(f"{path}: the native library is missing; {_find_shadow() or REMEDY}") from None
-    if hash_sources().encode() not in (b"", built):
+    if hash_sources().encode() not in (b"", sources_hash):
         raise UsageError(f"{path}: the native library is older than its sources; {REMEDY}")
     return library
 
@@ -63,8 +65,8 @@ def _find_shadow() -> str | None:
 
     package = FOLDER.parent
     for installed in metadata.distributions(name=package.name):
-        place = Path(str(installed.locate_file(package.name)))
-        if (place / "__init__.py").exists() and place.resolve() != package.resolve():
+        folder = Path(str(installed.locate_file(package.name)))
+        if (folder / "__init__.py").exists() and folder.resolve() != package.resolve():
             remedy = f"start Python in another folder, or run pip install -e {package.parent}"
             return f"the folder {package.parent} hides the package that is installed: {remedy}"
     return None
@@ -73,7 +75,7 @@ def _find_shadow() -> str | None:
 def _check_end(path: Path) -> None:
     """Raise OSError if an ELF file is cut off before its section table, since loading it could crash the process."""
     with path.open("rb") as file:
-        head = file.read(64).ljust(64, b"\0")
-    table, size, count = struct.unpack_from("<40xQ10xHH", head)
-    if head.startswith(b"\x7fELF") and not 0 < table <= path.stat().st_size - size * count:
+        head = file.read(ELF_HEADER).ljust(ELF_HEADER, b"\0")
+    table, entry_bytes, num_entries = struct.unpack_from(SECTION_TABLE, head)
+    if head.startswith(b"\x7fELF") and not 0 < table <= path.stat().st_size - entry_bytes * num_entries:
         raise OSError("it is cut off")

@@ -23,7 +23,7 @@ _multiply_matrices = declare(
 )
 
 
-# Replaces b by the solutions, overwriting a, and returns 0; 1 where a matrix is singular.
+# Replaces b by the solutions and overwrites a. Returns 0, or 1 if a matrix is singular.
 _solve_equations = declare("solve_equations", i4(), a=f8("n", "d", "d", out=True), b=f8("n", "d", "k", out=True))
 
 
@@ -33,30 +33,29 @@ _diagonalise = declare("diagonalise", a=f8("n", "d", "d", out=True), v=f8("n", "
 
 def _wide(*arrays: ArrayLike) -> tuple[list[Array], np.dtype[Any]]:
     """Return arrays in float64, and the type of the result."""
-    own = [np.asarray(one) for one in arrays]
-    kind = NARROW if all(one.dtype == NARROW for one in own) else WIDE
-    return [one if one.dtype == WIDE else one.astype(WIDE) for one in own], kind
+    inputs = [np.asarray(array) for array in arrays]
+    dtype = NARROW if all(array.dtype == NARROW for array in inputs) else WIDE
+    return [array if array.dtype == WIDE else array.astype(WIDE) for array in inputs], dtype
 
 
 def matmul(a: ArrayLike, b: ArrayLike) -> Array:
     """Multiply matrices ``[...,i,j]`` and ``[...,j,k]``, or vectors ``[j]``, as ``a @ b`` does."""
-    (left, right), kind = _wide(a, b)
-    rows, columns = left.ndim == 1, right.ndim == 1
-    left, right = left[None] if rows else left, right[:, None] if columns else right
+    (left, right), dtype = _wide(a, b)
+    left_is_vector, right_is_vector = left.ndim == 1, right.ndim == 1
+    left, right = left[None] if left_is_vector else left, right[:, None] if right_is_vector else right
+    lead = left.shape[:-2]
     if right.ndim == 2:  # one matrix for all, so all rows of the left are treated as one matrix
-        lead = left.shape[:-2]
         first, second = left.reshape(1, math.prod(left.shape[:-1]), left.shape[-1]), right[None]
     else:
-        lead = left.shape[:-2]
         if lead != right.shape[:-2]:
             lead = np.broadcast_shapes(lead, right.shape[:-2])
-            left, right = (np.broadcast_to(one, lead + one.shape[-2:]) for one in (left, right))
-        first, second = (one.reshape(math.prod(lead), *one.shape[-2:]) for one in (left, right))
+            left, right = (np.broadcast_to(array, lead + array.shape[-2:]) for array in (left, right))
+        first, second = (array.reshape(math.prod(lead), *array.shape[-2:]) for array in (left, right))
     out = np.empty((*first.shape[:2], second.shape[2]))
     _multiply_matrices(np.ascontiguousarray(first), np.ascontiguousarray(second), out)
     out = out.reshape(*lead, left.shape[-2], right.shape[-1])
-    out = out[..., 0, :] if rows else out
-    return (out[..., 0] if columns else out).astype(kind, copy=False)
+    out = out[..., 0, :] if left_is_vector else out
+    return (out[..., 0] if right_is_vector else out).astype(dtype, copy=False)
 
 
 def solve(a: ArrayLike, b: ArrayLike) -> Array:
@@ -64,7 +63,7 @@ def solve(a: ArrayLike, b: ArrayLike) -> Array:
 
     Raises numpy.linalg.LinAlgError where a matrix is singular.
     """
-    (left, right), kind = _wide(a, b)
+    (left, right), dtype = _wide(a, b)
     if right.ndim == 1:
         return solve(a, np.asarray(b)[:, None])[..., 0]
     lead, size = np.broadcast_shapes(left.shape[:-2], right.shape[:-2]), left.shape[-1]
@@ -72,7 +71,7 @@ def solve(a: ArrayLike, b: ArrayLike) -> Array:
     solution = np.broadcast_to(right, (*lead, *right.shape[-2:])).reshape(math.prod(lead), *right.shape[-2:]).copy()
     if _solve_equations(work, solution):
         raise np.linalg.LinAlgError("Singular matrix")
-    return solution.reshape(*lead, *right.shape[-2:]).astype(kind, copy=False)
+    return solution.reshape(*lead, *right.shape[-2:]).astype(dtype, copy=False)
 
 
 def invert(matrices: ArrayLike) -> Array:
@@ -82,8 +81,8 @@ def invert(matrices: ArrayLike) -> Array:
 
 
 def eigh(matrices: ArrayLike) -> tuple[Array, Array]:
-    """Return eigenvalues ``[...,d]``, ascending, and in columns eigenvectors ``[...,d,d]`` of symmetric matrices."""
-    (wide,), kind = _wide(matrices)
+    """Return the ascending eigenvalues ``[...,d]`` of symmetric matrices, and eigenvectors as columns ``[...,d,d]``."""
+    (wide,), dtype = _wide(matrices)
     size = wide.shape[-1]
     work = wide.reshape(math.prod(wide.shape[:-2]), size, size).copy()
     vectors = np.empty_like(work)
@@ -92,7 +91,7 @@ def eigh(matrices: ArrayLike) -> tuple[Array, Array]:
     order = np.argsort(values, axis=1, kind="stable")
     values = np.take_along_axis(values, order, 1)
     vectors = np.take_along_axis(vectors, order[:, None], 2)
-    return values.reshape(wide.shape[:-1]).astype(kind), vectors.reshape(wide.shape).astype(kind)
+    return values.reshape(wide.shape[:-1]).astype(dtype), vectors.reshape(wide.shape).astype(dtype)
 
 
 def transform(matrices: ArrayLike, vectors: ArrayLike) -> Array:
@@ -107,9 +106,9 @@ def solve_symmetric(a: ArrayLike, b: ArrayLike, rcond: float = 1e-12) -> Array:
     """
     values, vectors = eigh(a)
     used = values > rcond * values.max(initial=0)
-    parts = matmul(vectors.T, b)
-    scaled = np.where(used, 1 / np.where(used, values, 1), 0)
-    return matmul(vectors, parts * (scaled if parts.ndim == 1 else scaled[:, None]))
+    coordinates = matmul(vectors.T, b)  # in the basis of the eigenvectors
+    inverses = np.where(used, 1 / np.where(used, values, 1), 0)
+    return matmul(vectors, coordinates * (inverses if coordinates.ndim == 1 else inverses[:, None]))
 
 
 def determinant(matrices: ArrayLike) -> Array:
@@ -119,18 +118,18 @@ def determinant(matrices: ArrayLike) -> Array:
 
 
 def closest_rotation(matrix: ArrayLike) -> Array:
-    """Return the rotation R ``[3,3]`` nearest to a matrix by least squares, with the largest trace of ``R^T matrix``.
+    """Return the rotation R ``[3,3]`` nearest to a matrix by least squares; it has the largest trace of ``R^T matrix``.
 
-    It is computed from an eigenvector, a quaternion (Horn 1987), so it is never a reflection.
+    R is made from a quaternion, which is an eigenvector (Horn 1987), so it is never a reflection.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, np.float64)
-    quaternions = np.array(
+    quaternion_form = np.array(
         [
             [a + e + i, h - f, c - g, d - b], [h - f, a - e - i, b + d, c + g],
             [c - g, b + d, e - a - i, f + h], [d - b, c + g, f + h, i - a - e],
         ]
     )  # fmt: skip
-    w, x, y, z = eigh(quaternions)[1][:, -1]
+    w, x, y, z = eigh(quaternion_form)[1][:, -1]
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

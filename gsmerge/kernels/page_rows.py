@@ -19,10 +19,10 @@ def pack_looks(rows, opacities, sh0, scales, quats, shN, sh_scale, color_scale, 
         sh_scale: Factor from ``sh0`` to colours.
         color_scale: Scale of colours in a ``.spz``.
         steps: ``[3]`` int32 steps of opacities, colours and log scales.
-        levels: Factor of a rotation, which is stored as its axis times the tangent of a quarter of its angle, from -1
-            to 1.
-        out: Columns of opacity, red minus green, green, blue minus green, log scales, rotation, and as many harmonics
-            as fit.
+        levels: Factor of rotations. A rotation is stored as its axis times the tangent of a quarter of its angle, from
+            -1 to 1, times this factor.
+        out: Columns of opacity, red minus green, green, blue minus green, log scales and rotation. The remaining
+            columns are harmonics.
     """
 
 
@@ -32,7 +32,7 @@ def pack_looks(rows, opacities, sh0, scales, quats, shN, sh_scale, color_scale, 
     out=u4(4, "m", out=True),
 )  # fmt: skip
 def pack_pixels(rows, ids, means, viewmats, Ks, width, height, pixel_parts, depth_parts, out):
-    """Pack the positions of Gaussians of pixels, up to the first row that is not in front of its camera.
+    """Pack positions of Gaussians relative to their pixels, up to the first row that is not in front of its camera.
 
     Returns the number of packed rows.
 

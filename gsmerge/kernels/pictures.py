@@ -31,13 +31,13 @@ _sample_picture = declare(
 def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
     """Convolve a picture ``[h,w]`` or ``[h,w,c]`` with two filters of odd lengths, mirrored at its borders; float32.
 
-    ``across`` is the filter along the rows and ``down`` that along the columns. Mirroring does not repeat the border
+    ``across`` filters along the rows, and ``down`` filters along the columns. Mirroring does not repeat the border
     pixels.
     """
     source: Picture = np.ascontiguousarray(picture, np.float32)
     layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
     height, width, channels = layers.shape
-    taps = [np.ascontiguousarray(one, np.float32) for one in (across, down)]
+    taps = [np.ascontiguousarray(values, np.float32) for values in (across, down)]
     padded = np.empty((width + len(taps[0]) - 1) * channels, np.float32)
     rows, out = np.empty((height + len(taps[1]) - 1, width, channels), np.float32), np.empty_like(layers)
     _filter_picture(layers, *taps, padded, rows, out)
@@ -47,17 +47,17 @@ def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
 def blur(picture: Picture, sigma: float, size: int | None = None) -> Picture:
     """Blur a picture ``[h,w]`` or ``[h,w,c]`` by a Gaussian of ``sigma`` pixels; float32.
 
-    ``size`` is the odd number of pixels of the filter, by default all within four ``sigma``.
+    ``size`` is the odd number of pixels of the filter, by default all pixels within four ``sigma``.
     """
     size = round(8 * sigma + 1) | 1 if size is None else size
-    places = np.arange(size) - size // 2
-    weights = exp(places**2 * (-0.5 / sigma**2))
+    offsets = np.arange(size) - size // 2
+    weights = exp(offsets**2 * (-0.5 / sigma**2))
     taps = weights / weights.sum()
     return convolve(picture, taps, taps)
 
 
 def sobel(picture: Picture) -> tuple[Picture, Picture]:
-    """Compute Sobel's derivatives of a picture, to the right and down: float32, eight times those per pixel."""
+    """Compute Sobel's derivatives of a picture to the right and down: float32, eight times the change per pixel."""
     return convolve(picture, SLOPE, SMOOTH), convolve(picture, SMOOTH, SLOPE)
 
 
@@ -68,10 +68,10 @@ def sample_bilinear(picture: Picture, x: np.ndarray, y: np.ndarray) -> Picture:
     """
     source: Picture = np.ascontiguousarray(picture, np.float32)
     layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
-    places = [np.ascontiguousarray(one, np.float32) for one in (x, y)]
-    out = np.empty((places[0].size, layers.shape[2]), np.float32)
-    _sample_picture(layers, *(one.reshape(-1) for one in places), out)
-    return out.reshape(*places[0].shape, *source.shape[2:])
+    x, y = np.ascontiguousarray(x, np.float32), np.ascontiguousarray(y, np.float32)
+    out = np.empty((x.size, layers.shape[2]), np.float32)
+    _sample_picture(layers, x.reshape(-1), y.reshape(-1), out)
+    return out.reshape(*x.shape, *source.shape[2:])
 
 
 def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False) -> Picture:
@@ -81,26 +81,26 @@ def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False
     """
     out: Picture = np.asarray(picture, np.float32)
     for axis, size in ((0, height), (1, width)):
-        places, weights = _cubic_taps(out.shape[axis], size)
-        ids = places % out.shape[axis] if periodic else places.clip(0, out.shape[axis] - 1)
+        columns, weights = _cubic_taps(out.shape[axis], size)
+        ids = columns % out.shape[axis] if periodic else columns.clip(0, out.shape[axis] - 1)
         shape = [-1 if i == axis else 1 for i in range(out.ndim)]
-        terms = [out.take(some, axis) * share.reshape(shape) for some, share in zip(ids, weights, strict=True)]
+        terms = [out.take(tap, axis) * weight.reshape(shape) for tap, weight in zip(ids, weights, strict=True)]
         out = terms[0] + terms[1] + terms[2] + terms[3]
     return out
 
 
 def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
-    """Return the four of ``old`` pixels that each new pixel is interpolated from, and their weights, both ``[4,new]``.
+    """Return the indices ``[4,new]`` of the four old pixels around each new pixel, and their weights ``[4,new]``.
 
-    Pixels may lie outside.
+    A line of ``old`` pixels is enlarged to ``new`` pixels. Indices at its ends may lie outside, below 0 or above.
     """
-    places = (np.arange(new) + 0.5) * (old / new) - 0.5
-    first = np.floor(places).astype(np.int64)
-    away = np.abs(places - first - np.arange(-1, 3)[:, None])
+    centres = (np.arange(new) + 0.5) * (old / new) - 0.5  # of the new pixels, in old pixels
+    floors, taps = np.floor(centres).astype(np.int64), np.arange(-1, 3)[:, None]
+    distances = np.abs(centres - floors - taps)
     a = CUBIC
-    near = ((a + 2) * away - (a + 3)) * away * away + 1
-    far = ((a * away - 5 * a) * away + 8 * a) * away - 4 * a
-    return first + np.arange(-1, 3)[:, None], np.where(away <= 1, near, far).astype(np.float32)
+    inner = ((a + 2) * distances - (a + 3)) * distances * distances + 1
+    outer = ((a * distances - 5 * a) * distances + 8 * a) * distances - 4 * a
+    return floors + taps, np.where(distances <= 1, inner, outer).astype(np.float32)
 
 
 def turn_picture(picture: Picture, orientation: int) -> Picture:
@@ -124,18 +124,19 @@ def turn_back(picture: Picture, orientation: int) -> Picture:
 
 
 def count_bars(image: np.ndarray, spread: float) -> tuple[int, int, int, int]:
-    """Count the lines of the bar of one colour at each border of a picture ``[h,w,c]``: above, below, left, right.
+    """Count the lines of one colour at each border of a picture ``[h,w,c]``: above, below, left and right.
 
-    All values of a bar lie within ``spread``. A bar that reaches the middle of the picture has a count of 0.
+    Such lines form a bar, whose values all lie within ``spread``. A bar that reaches the middle of the picture has a
+    count of 0.
     """
     counts = []
     for lines in (image, image[::-1], image.swapaxes(0, 1), image.swapaxes(0, 1)[::-1]):
-        low, high, count, most = np.inf, -np.inf, 0, len(lines) // 2
-        for line in lines[:most]:
+        low, high, count, half = np.inf, -np.inf, 0, len(lines) // 2
+        for line in lines[:half]:
             low, high = min(low, float(line.min())), max(high, float(line.max()))
             if high - low > spread:
                 break
             count += 1
-        counts.append(count if count < most else 0)
+        counts.append(count if count < half else 0)
     above, below, left, right = counts
     return above, below, left, right

@@ -23,8 +23,8 @@ def pixel_errors(points, views, viewmats, Ks, pixels, errors):
 def nearest_centres(points, viewmats, Ks, ids, squares, seen, width, height):
     """Write the pixel ``(view·H + y)·W + x`` of all views whose centre is nearest to the projection of each point.
 
-    Also writes the squared distance, pixels, and the number of views that show the point. For a number of 0 the pixel
-    is -1 and the squared distance is inf.
+    Also writes the squared distance, in pixels, and the number of views that show the point. If no view shows it, the
+    pixel is -1 and the squared distance is inf.
     """
 
 
@@ -36,8 +36,9 @@ def nearest_centres(points, viewmats, Ks, ids, squares, seen, width, height):
 def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, width, height, mixed):
     """Write the pixel of each point, -1 for none, so that as many points as possible are in the order of the pixels.
 
-    The order is view by view and line by line. If ``mixed``, it is line by line, and the views of a pixel follow each
-    other. Returns the number of points with a pixel. Arrays after ``ids`` are scratch; ``before`` has n·v values.
+    Pixels are ordered by view, then by line. If ``mixed``, they are ordered by line and column, and the views of a
+    pixel follow each other. Returns the number of points with a pixel. Arrays after ``ids`` are scratch; ``before`` has
+    n·v values.
     """
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial, wraps
 from typing import Any
@@ -42,7 +42,7 @@ class Argument:
         least: Smallest value, None for any.
         below: Exclusive upper bound of the values, None for any.
         most: Largest value, None for any.
-        ascending: No value may be below the one before it.
+        ascending: Each value is at least the value before it.
         out: The array is written.
         optional: None is allowed and becomes a null pointer; names in its shape must appear in other arguments.
     """
@@ -95,15 +95,15 @@ u1, i1, i2, u4, i4, u8, i8, f4, f8 = (
     partial(_argument, code) for code in ("u1", "i1", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 )
 
-STATUS = i4()  # result of a function that checks indices: 0, or another number for an index outside its array
-COUNT = i8()  # result of a function that counts and checks indices: a count, or a negative number for an index outside
+STATUS = i4()  # result of a function that checks indices: 0, or another number if an index is outside its array
+COUNT = i8()  # result of a function that counts and checks indices: a count, or a negative number for a wrong index
 
 
 PROTOTYPES: dict[str, str] = {}  # of all functions declared so far, in C: tests compare them with the sources
 
 
 def native(returns: Argument | None = None, /, **arguments: Argument) -> Callable[[Callable[..., Any]], Any]:
-    """Replace a function by the one of the same name in the native library.
+    """Replace a function by the function of the same name in the native library.
 
     The arguments are checked at every call. A ValueError names the argument that has a wrong type, shape or range.
 
@@ -122,19 +122,23 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
 
 
 def declare(name: str, returns: Argument | None = None, /, **arguments: Argument) -> Callable[..., Any]:
-    """Return a function of the native library as :func:`native` does, but without documentation."""
+    """Return a function of the native library, with the checks of :func:`native` but without documentation."""
     signature = inspect.Signature([inspect.Parameter(key, _POSITIONAL) for key in arguments])
     entries: dict[ctypes.CDLL, Any] = {}  # the function in each loaded library, since tests load several
-    kinds, names = list(arguments.items()), size_names(arguments)
-    ruled = [(place, key, kind) for place, (key, kind) in enumerate(kinds) if kind.has_rules]
+    names = size_names(arguments)
+    ruled = [(i, key, argument) for i, (key, argument) in enumerate(arguments.items()) if argument.has_rules]
+
+    def convert(values: Sequence[Any], sizes: dict[str, int]) -> list[Any]:
+        pairs = zip(arguments.items(), values, strict=True)
+        return [_convert(name, key, argument, value, sizes) for (key, argument), value in pairs]
 
     def call(*values: Any, **named: Any) -> Any:
         if named or len(values) != len(arguments):
             values = signature.bind(*values, **named).args
         sizes: dict[str, int] = {}
-        passed = [_pass(name, key, kind, value, sizes) for (key, kind), value in zip(kinds, values, strict=True)]
-        for place, key, kind in ruled:
-            _check_values(name, key, kind, values[place], sizes)
+        passed = convert(values, sizes)
+        for i, key, argument in ruled:
+            _check_values(name, key, argument, values[i], sizes)
         library = load_library()
         if library not in entries:
             entries[library] = _entry(library, name, returns, arguments)
@@ -146,7 +150,7 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
     def prepare(*values: Any) -> Callable[[], None]:
         """Check arguments once, and return a function that calls with them; their memory must stay allocated."""
         sizes: dict[str, int] = {}
-        passed = [_pass(name, key, kind, value, sizes) for (key, kind), value in zip(kinds, values, strict=True)]
+        passed = convert(values, sizes)
         passed += [sizes.get(key, 0) for key in names]
         entry = _entry(load_library(), name, returns, arguments)
 
@@ -166,7 +170,7 @@ class Table:
 
     def __init__(self, name: str, numbers: tuple[str, ...], **arrays: Argument) -> None:
         self.name, self.arrays = name, arrays
-        self.places = {key: i for i, key in enumerate((*arrays, *size_names(arrays), *numbers))}
+        self.fields = {key: i for i, key in enumerate((*arrays, *size_names(arrays), *numbers))}
 
     def fill(self, arrays: dict[str, np.ndarray[Any, Any]]) -> FilledTable:
         """Check all arrays and write their addresses and sizes; the numbers are zero."""
@@ -178,7 +182,7 @@ class FilledTable:
 
     def __init__(self, table: Table, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
         self.table, self.arrays, self._sizes = table, dict[str, np.ndarray[Any, Any]](), dict[str, int]()
-        self.values = np.zeros(len(table.places), np.int64)
+        self.values = np.zeros(len(table.fields), np.int64)
         for key in table.arrays:
             self.point(key, arrays[key])
         for key, size in self._sizes.items():
@@ -186,78 +190,78 @@ class FilledTable:
 
     def point(self, key: str, array: np.ndarray[Any, Any]) -> None:
         """Set an address to another array of the same sizes; ValueError if the array does not fit."""
-        self[key] = _pass(self.table.name, key, self.table.arrays[key], array, self._sizes)
+        self[key] = _convert(self.table.name, key, self.table.arrays[key], array, self._sizes)
         self.arrays[key] = array
 
     def __getitem__(self, key: str) -> int:
-        return int(self.values[self.table.places[key]])
+        return int(self.values[self.table.fields[key]])
 
     def __setitem__(self, key: str, value: int) -> None:
-        self.values[self.table.places[key]] = value
+        self.values[self.table.fields[key]] = value
 
 
 def size_names(arguments: dict[str, Argument]) -> list[str]:
     """Return the names of sizes that are not arguments, in order of appearance."""
-    sizes = (size for kind in arguments.values() for size in kind.shape)
+    sizes = (size for argument in arguments.values() for size in argument.shape)
     return list(dict.fromkeys(size for size in sizes if isinstance(size, str) and size not in arguments))
 
 
 def _prototype(name: str, returns: Argument | None, arguments: dict[str, Argument]) -> str:
     """Return the declaration in C that a function must have."""
-    parts = [f"{kind.c}{'' if kind.shape else ' '}{key}" for key, kind in arguments.items()]
-    parts += [f"int64_t {size}" for size in size_names(arguments)]
-    return f"{returns.c if returns else 'void'} {name}({', '.join(parts)})"
+    parameters = [f"{argument.c}{'' if argument.shape else ' '}{key}" for key, argument in arguments.items()]
+    parameters += [f"int64_t {size}" for size in size_names(arguments)]
+    return f"{returns.c if returns else 'void'} {name}({', '.join(parameters)})"
 
 
 def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments: dict[str, Argument]) -> Any:
     function = getattr(library, name)
-    kinds = [ctypes.c_void_p if kind.shape else _CODES[kind.code][1] for kind in arguments.values()]
-    function.argtypes = [*kinds, *[ctypes.c_int64] * len(size_names(arguments))]
+    types = [ctypes.c_void_p if argument.shape else _CODES[argument.code][1] for argument in arguments.values()]
+    function.argtypes = [*types, *[ctypes.c_int64] * len(size_names(arguments))]
     function.restype = _CODES[returns.code][1] if returns else None
     return function
 
 
-def _pass(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]) -> Any:
+def _convert(name: str, key: str, argument: Argument, value: Any, sizes: dict[str, int]) -> Any:
     """Check one argument and return its value for ctypes; values of named sizes are added to ``sizes``."""
-    if not kind.shape:
-        if kind.code[0] != "f":
+    if not argument.shape:
+        if argument.code[0] != "f":
             value = int(value)
-            low, high = kind.span
+            low, high = argument.span
             if not low <= value <= high:
                 raise ValueError(f"{name}: {key}: expected an integer from {low} to {high}, found {value}")
             if sizes.setdefault(key, value) != value:
                 raise ValueError(f"{name}: {key}: expected {sizes[key]}, as arrays have it, got {value}")
         return value
-    if value is None and kind.optional:
+    if value is None and argument.optional:
         return None
-    dtype, shape = kind.dtype, kind.shape
+    dtype, shape = argument.dtype, argument.shape
     if type(value) is not np.ndarray or (value.dtype is not dtype and value.dtype != dtype) or value.ndim != len(shape):
-        raise ValueError(f"{name}: {key}: expected {kind}, got {_describe(value)}")
+        raise ValueError(f"{name}: {key}: expected {argument}, got {_describe(value)}")
     for size, length in zip(shape, value.shape, strict=True):
         if (size if isinstance(size, int) else sizes.setdefault(size, length)) != length:
             known = f" with {size} = {sizes[size]}" if isinstance(size, str) else ""
-            raise ValueError(f"{name}: {key}: expected {kind}{known}, got {_describe(value)}")
+            raise ValueError(f"{name}: {key}: expected {argument}{known}, got {_describe(value)}")
     flags = value.flags
     writeable = flags.writeable
-    if not flags.c_contiguous or not flags.aligned or (kind.out and not writeable):
-        raise ValueError(f"{name}: {key}: expected an aligned{' writable' * kind.out} array in C order")
+    if not flags.c_contiguous or not flags.aligned or (argument.out and not writeable):
+        raise ValueError(f"{name}: {key}: expected an aligned{' writable' * argument.out} array in C order")
     return _address(value, writeable)
 
 
 def _address(array: np.ndarray[Any, Any], writeable: bool) -> int:
-    """Return the address of an array's values; through the buffer, if possible, it takes a fifth of the time."""
+    """Return the address of an array's values, through its buffer if possible, which takes a fifth of the time."""
     if writeable and array.size:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
     return int(array.__array_interface__["data"][0])
 
 
-def _check_values(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]) -> None:
+def _check_values(name: str, key: str, argument: Argument, value: Any, sizes: dict[str, int]) -> None:
     """Check the values of an argument whose type and shape are valid."""
-    if value is None or (kind.shape and not value.size):
+    if value is None or (argument.shape and not value.size):
         return
-    low, high = (value.min(), value.max()) if kind.shape else (value, value)
+    low, high = (value.min(), value.max()) if argument.shape else (value, value)
     least, below, most = (
-        sizes[rule] if isinstance(rule, str) else rule for rule in (kind.least, kind.below, kind.most)
+        sizes[rule] if isinstance(rule, str) else rule for rule in (argument.least, argument.below, argument.most)
     )
     if least is not None and not low >= least:
         raise ValueError(f"{name}: {key}: expected values from {least} on, found {low}")
@@ -265,7 +269,7 @@ def _check_values(name: str, key: str, kind: Argument, value: Any, sizes: dict[s
         raise ValueError(f"{name}: {key}: expected values below {below}, found {high}")
     if most is not None and not high <= most:
         raise ValueError(f"{name}: {key}: expected values up to {most}, found {high}")
-    if kind.ascending and (value[1:] < value[:-1]).any():
+    if argument.ascending and (value[1:] < value[:-1]).any():
         raise ValueError(f"{name}: {key}: expected values in rising order")
 
 

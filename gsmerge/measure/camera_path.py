@@ -1,4 +1,4 @@
-"""Cameras of a scene -> cameras along a path for videos, or one outside camera; all in float64."""
+"""Make cameras along a path for videos, or one outside camera, from the cameras of a scene; all in float64."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from gsmerge.types import Cameras
 
 PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline|turntable)(?:,back:(?P<back>[^,]*))?")
 MAX_TURN, MAX_BACK = 90.0, 10.0  # degrees to each side of an orbit; shares of the depth
-CURVE_PIECES = 64  # straight pieces between two cameras by which the length of a curve is measured
+CURVE_PIECES = 64  # straight pieces between two cameras; the length of a curve is measured along them
 ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
-# Least and largest extent of an orbit to the sides, and up and down, as shares of the distance of its centre. The least
-# still looks right with a single photo; the largest turns the view by 14 degrees to each side.
+# Least and largest extent of an orbit to the sides, and up and down, as shares of the distance to its centre. With the
+# least a single photo still looks right. The largest turns the view by 14 degrees to each side.
 HORIZONTAL, VERTICAL = (0.06, 0.25), (0.03, 0.125)
-LEVEL = 0.01  # squared sine of the turn of cameras; above it their horizons count more for "up" than their mean up
-CLOSE = 0.1  # least radius of a turntable, as a share of the depth
-SAME = 1e-9  # largest distance of cameras that count as one, as a share of a path's length
+LEVEL = 0.01  # squared sine of the cameras' turn; above it, their horizons decide "up" more than their mean up does
+MIN_RADIUS = 0.1  # least radius of a turntable, as a share of the depth
+MIN_LEVEL = 0.1  # least length of the level part of a unit direction that can serve as the level direction
+SAME = 1e-9  # cameras count as one up to this distance, as a share of a path's length
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class CameraPath:
 
     Args:
         kind: "orbit", "spline" or "turntable".
-        turn: Degrees by which an orbit turns to each side; None: as far as the cameras of the scene.
+        turn: Degrees that an orbit turns to each side; None: by the scene's cameras, see :func:`orbit`.
         back: Distance behind the path, as a share of the viewing depth.
     """
 
@@ -52,7 +53,7 @@ def parse_path(text: str) -> CameraPath | None:
     """Parse a path, such as ``orbit``, ``orbit:45`` or ``spline,back:0.5``; None for a file name.
 
     Raises:
-        ValueError: If the text begins with the kind of a path and is not one, or if a number is out of range.
+        ValueError: If the text begins with the kind of a path but is no path, or if a number is out of range.
     """
     kind = re.split("[:,]", text, maxsplit=1)[0]
     if kind not in ("orbit", "spline", "turntable"):
@@ -85,7 +86,7 @@ def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) ->
     Args:
         path: Kind of the path, and its distance from the cameras.
         cameras: c >= 1 cameras of the scene; a spline passes them in this order.
-        depth: Distance of what the cameras show, see :func:`viewing_depth`.
+        depth: Distance of the surfaces that the cameras show, see :func:`viewing_depth`.
         count: Number of frames.
 
     Raises:
@@ -109,8 +110,8 @@ def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
 def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]:
     """Place a camera outside the capture: turn the middle camera about the points ``[n,3]`` and step back.
 
-    Returns one of the cameras of :mod:`gsmerge.measure.fog`, and its distance, in world units, from the point about
-    which it was turned.
+    Returns one of the cameras of :mod:`gsmerge.measure.fog`, and its distance, in world units, from the pivot of its
+    turn.
     """
     back, turn = CAMERAS["turned"][-1]
     middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)
@@ -135,9 +136,9 @@ def median_camera(cameras: Cameras) -> int:
 def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None) -> Cameras:
     """Turn the middle camera about the point ``depth`` in front of it, to the sides and up and down.
 
-    Frames are evenly spaced and form a loop. The vertical of the picture is that of the middle camera. ``turn``:
-    degrees to each side; up and down it is half of it. None: the median offset of the cameras from the middle one,
-    clipped to the shares ``HORIZONTAL`` and ``VERTICAL`` of the depth.
+    Frames are evenly spaced and form a loop. The picture keeps the vertical of the middle camera. ``turn`` is in
+    degrees to each side; up and down the orbit turns by half of it. None: the median offset of the cameras from the
+    middle camera, clipped to the shares ``HORIZONTAL`` and ``VERTICAL`` of the depth.
     """
     middle = median_camera(cameras)
     viewmat = cameras.viewmats[middle].astype(np.float64)
@@ -157,13 +158,13 @@ def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None)
 def turntable(cameras: Cameras, depth: float, count: int) -> Cameras:
     """Turn once about the centre of the scene, which stays in the middle of the picture, with a level horizon.
 
-    Height and distance are the medians of those of the cameras. The first frame is on the side of the middle camera.
+    Height and distance are the medians over the cameras. The first frame is on the side of the middle camera.
     Frames are evenly spaced and form a loop.
     """
     middle, up, towards = _axis(cameras, depth)
     offsets = camera_centres(cameras.viewmats) - middle
     heights = (offsets * up).sum(1)
-    radius = max(float(np.median(_lengths(offsets - heights[:, None] * up))), CLOSE * depth)
+    radius = max(float(np.median(_lengths(offsets - heights[:, None] * up))), MIN_RADIUS * depth)
     angles = 2 * np.pi * np.arange(count)[:, None] / count
     eyes = radius * (cos(angles) * towards + sin(angles) * np.cross(up, towards)) + np.median(heights) * up
     forward = normalize(-eyes)
@@ -173,7 +174,7 @@ def turntable(cameras: Cameras, depth: float, count: int) -> Cameras:
 
 
 def turned_degrees(cameras: Cameras, depth: float) -> float:
-    """Measure the arc of a :func:`turntable`, in degrees, within which all cameras are."""
+    """Measure the smallest arc of a :func:`turntable`, in degrees, that contains all cameras."""
     middle, up, towards = _axis(cameras, depth)
     offsets = camera_centres(cameras.viewmats) - middle
     angles = np.sort(arctan2((offsets * np.cross(up, towards)).sum(1), (offsets * towards).sum(1)))
@@ -190,14 +191,14 @@ def _axis(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray, np.nd
     """
     axes = cameras.viewmats[:, :3, :3].astype(np.float64)
     middle = lower_median(camera_centres(cameras.viewmats) + depth * axes[:, 2])
-    own = axes[median_camera(cameras)]
+    right, down, forward = axes[median_camera(cameras)]
     rights = axes[:, 0]
     # Add a little of the middle camera's up, since the directions of all may cancel each other
-    mean = -axes[:, 1].mean(0) - SAME * own[1]
-    up = normalize(solve(matmul(rights.T, rights) / len(axes) + LEVEL * np.eye(3), mean))
-    back = (own[2] * up).sum() * up - own[2]
+    mean_up = -axes[:, 1].mean(0) - SAME * down
+    up = normalize(solve(matmul(rights.T, rights) / len(axes) + LEVEL * np.eye(3), mean_up))
+    back = (forward * up).sum() * up - forward
     # The middle camera may look straight down
-    return middle, up, normalize(back if _lengths(back) > CLOSE else np.cross(own[0], up))
+    return middle, up, normalize(back if _lengths(back) > MIN_LEVEL else np.cross(right, up))
 
 
 def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
@@ -219,15 +220,15 @@ def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
     rotations = quat_to_rotmat(poses[:, 3:]).swapaxes(1, 2)
     pieces, shares = _pieces(knots, times)
     shares = shares[:, None, None]
-    between = (1 - shares) * Ks[pieces] + shares * Ks[pieces + 1]
-    return replace(cameras, viewmats=_viewmats(rotations, origin + poses[:, :3]), Ks=between)
+    path_Ks = (1 - shares) * Ks[pieces] + shares * Ks[pieces + 1]
+    return replace(cameras, viewmats=_viewmats(rotations, origin + poses[:, :3]), Ks=path_Ks)
 
 
 def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
     """Return poses as rows ``[c,7]`` whose distances measure pose differences, and a mask ``[c]`` of distinct poses.
 
-    A row has the camera's position, and its quaternion times twice the depth. The sign of a quaternion follows the row
-    before. A small rotation changes a row by the angle times the depth.
+    A row has the camera's position, and its quaternion times twice the depth. Each quaternion has the sign nearer to
+    the row before. A small rotation changes a row by the angle times the depth.
     """
     quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].astype(np.float64).swapaxes(1, 2))
     opposite = (quats[1:] * quats[:-1]).sum(1) < 0
@@ -245,10 +246,11 @@ def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float)
     tangents = np.concatenate([slopes[:1], inner, slopes[-1:]])
     pieces, shares = _pieces(knots, times)
     s = shares[:, None]
-    out = (1 + 2 * s) * (1 - s) ** 2 * rows[pieces] + s * s * (3 - 2 * s) * rows[pieces + 1]
-    out += s * (1 - s) * steps[pieces] * ((1 - s) * tangents[pieces] - s * tangents[pieces + 1])
-    out[:, 3:] = 2 * depth * normalize(out[:, 3:])
-    return out
+    # Cubic Hermite interpolation
+    poses = (1 + 2 * s) * (1 - s) ** 2 * rows[pieces] + s * s * (3 - 2 * s) * rows[pieces + 1]
+    poses += s * (1 - s) * steps[pieces] * ((1 - s) * tangents[pieces] - s * tangents[pieces + 1])
+    poses[:, 3:] = 2 * depth * normalize(poses[:, 3:])
+    return poses
 
 
 def _pieces(knots: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -260,8 +262,8 @@ def _pieces(knots: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _at_equal_steps(points: np.ndarray, times: np.ndarray, shares: np.ndarray) -> np.ndarray:
     """Return the times at which the given shares of the length of a curve ``points [m,d]`` are reached."""
-    passed = np.concatenate([np.zeros(1), _lengths(np.diff(points, axis=0)).cumsum()])
-    return np.interp(shares * passed[-1], passed, times)
+    distances = np.concatenate([np.zeros(1), _lengths(np.diff(points, axis=0)).cumsum()])  # along the curve
+    return np.interp(shares * distances[-1], distances, times)
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:

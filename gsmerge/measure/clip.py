@@ -20,12 +20,12 @@ from PIL import Image
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.kernels.elementary import sin
-from gsmerge.measure.preview import FACE, Picture, shorten_text
+from gsmerge.measure.preview import BLUE_FIRST, FACE, Picture, shorten_text
 from gsmerge.settings.pictures import GIF
 from gsmerge.types import StrPath
 
-# Code and name of the encoders for each ending; the first that OpenCV has is used. Browsers play all but MPEG-4. VP8
-# takes a third of the time of VP9 and 1.6 times the space.
+# Code and name of the encoders for each ending; the first encoder that OpenCV has is used. Browsers play all but
+# MPEG-4. VP8 takes a third of the time of VP9 and 1.6 times the space.
 ENCODERS = {".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")), ".webm": (("VP80", "VP8"), ("VP90", "VP9"))}
 # Name, encoder, container and options of the program ffmpeg by the number of channels. Nearly every program plays
 # H.264; browsers and editors read the alpha of VP9
@@ -44,9 +44,11 @@ GIF_SAMPLE = 1 << 20  # pixels from which the palette of a GIF is made
 OPENCV = "opencv-contrib-python-headless"
 FOLDER = "name a folder instead, for one picture a frame"
 SWIPE_SECONDS = 6  # time in which a line moves to both sides and back
-SWIPE_SHARE = 0.9  # of the distance to the next line or the border, how far a line moves
-BLUE_FIRST = [2, 1, 0, 3]  # order of channels for OpenCV and ffmpeg
+SWIPE_SHARE = 0.9  # share of the distance to the next line or the border that a line moves
 LINES_PER_WIDTH = 480  # width of a frame divided by the width of a line
+LINE = 32  # height of a line of text at scale 1, pixels
+MIN_SHRINK = 0.6  # least factor on the size of captions that are too wide
+SHADE, TEXT_LEVEL = 0.35, 245  # brightness of the picture behind a caption, and level of its text
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,7 @@ class Caption:
         height, width = self.text.shape[:2]
         box = picture[self.top : self.top + height, self.left : self.left + width]
         text = self.text[: box.shape[0], : box.shape[1]]  # a tiny frame cuts it off
-        box[:] = (0.35 * box * (1 - text) + 245 * text).round()
+        box[:] = (SHADE * box * (1 - text) + TEXT_LEVEL * text).round()
 
 
 def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int) -> list[Caption]:
@@ -71,21 +73,22 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
     ``texts``: name, count and size of each scene; count and size share a line if there is room.
     """
     scale, thickness = max(0.45, height / 900), max(1, round(height / 600))
-    line = round(32 * scale)
-    margin, most = line // 2, width // len(texts) - 2 * line
+    line_height = round(LINE * scale)
+    margin, max_width = line_height // 2, width // len(texts) - 2 * line_height
 
     def text_width(text: str) -> int:
         return int(cv2.getTextSize(text, FACE, scale, thickness)[0][0])
 
     rows: list[tuple[str, ...]] = [(name, f"{count}, {size}") for name, count, size in texts]
-    rows = rows if max(text_width(row[1]) for row in rows) <= most else list(texts)
-    scale *= min(1.0, max(0.6, 0.95 * most / max(text_width(row[1]) for row in rows)))
+    rows = rows if max(text_width(row[1]) for row in rows) <= max_width else list(texts)
+    scale *= min(1.0, max(MIN_SHRINK, 0.95 * max_width / max(text_width(row[1]) for row in rows)))
     captions = []
     for i, row in enumerate(rows):
-        lines = [shorten_text(text, most, scale, thickness) for text in row]
-        box = np.zeros((line * len(lines) + margin, max(map(text_width, lines)) + 2 * margin), np.uint8)
+        lines = [shorten_text(text, max_width, scale, thickness) for text in row]
+        box = np.zeros((line_height * len(lines) + margin, max(map(text_width, lines)) + 2 * margin), np.uint8)
         for number, text in enumerate(lines, 1):
-            cv2.putText(box, text, (margin, number * line - margin // 4), FACE, scale, 255, thickness, cv2.LINE_AA)
+            start = margin, number * line_height - margin // 4
+            cv2.putText(box, text, start, FACE, scale, 255, thickness, cv2.LINE_AA)
         left = margin + (width - box.shape[1] - 2 * margin) * i // max(len(rows) - 1, 1)
         captions.append(Caption(max(left, 0), max(height - margin - len(box), 0), box[..., None] / np.float32(255)))
     return captions
@@ -98,21 +101,24 @@ def swipe_places(count: int, frames: int, fps: float, width: int) -> list[list[i
     """
     rounds = max(1, round(frames / fps / SWIPE_SECONDS))
     shifts = SWIPE_SHARE * sin(2 * np.pi * rounds * np.arange(frames) / frames)
-    places = (np.arange(count + 1) + shifts[:, None]) * width / count
-    places[:, 0], places[:, -1] = 0, width
-    return [list(map(int, row)) for row in places.round()]
+    borders = (np.arange(count + 1) + shifts[:, None]) * width / count
+    borders[:, 0], borders[:, -1] = 0, width
+    return [list(map(int, row)) for row in borders.round()]
 
 
-def draw_swipe(pictures: Sequence[Picture], places: Sequence[int], captions: Sequence[Caption]) -> Picture:
-    """Join columns of pictures from the same camera to one frame, each with its caption, and draw lines between."""
+def draw_swipe(pictures: Sequence[Picture], borders: Sequence[int], captions: Sequence[Caption]) -> Picture:
+    """Join columns of pictures from the same camera to one frame, each with its caption; draw lines at the ``borders``.
+
+    ``borders`` are one frame's row of :func:`swipe_places`.
+    """
     frame = np.empty_like(pictures[0])
     half = max(1, frame.shape[1] // (2 * LINES_PER_WIDTH))
-    for picture, caption, left, right in zip(pictures, captions, places[:-1], places[1:], strict=True):
+    for picture, caption, left, right in zip(pictures, captions, borders[:-1], borders[1:], strict=True):
         caption.draw(picture)
         frame[:, left:right] = picture[:, left:right]
-    for place in places[1:-1]:
-        frame[:, max(place - 2 * half, 0) : place + 2 * half] //= 2
-        frame[:, max(place - half, 0) : place + half] = 255
+    for border in borders[1:-1]:
+        frame[:, max(border - 2 * half, 0) : border + 2 * half] //= 2  # a shadow on both sides of the white line
+        frame[:, max(border - half, 0) : border + half] = 255
     return frame
 
 
@@ -150,7 +156,7 @@ def find_ffmpeg(encoder: str) -> str | None:
 
 
 def stored_size(path: StrPath, width: int, height: int) -> tuple[int, int]:
-    """Return the size of frames in a clip. Sides of videos are even, since they store colours for pairs of pixels."""
+    """Return width and height of the frames in a clip; sides of videos are even, since two pixels share a colour."""
     if Path(path).suffix.lower() == GIF:
         return width, height
     return width + width % 2, height + height % 2
@@ -161,9 +167,9 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
 
     A ``.mp4`` has the encoding H.264 if :func:`find_ffmpeg` finds a program for it, otherwise the first encoding that
     OpenCV has. A ``.webm`` of pictures with alpha ``[h,w,4]`` needs that program. All frames of a GIF share a palette,
-    and are in memory together.
+    and are in memory together. A video takes the memory of a few frames.
 
-    Of a video, one frame is in memory at a time. Its frames have the :func:`stored_size`: an odd side gets one more row
+    The frames of a video have the :func:`stored_size`: an odd side gets one more row
     or column, a copy of the last one. SceneError if there is no encoder for the ending of the name, or if the file
     cannot be written completely.
     """
@@ -172,9 +178,9 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
         if path.suffix.lower() == GIF:
             _write_gif(temporary, list(map(_to_channels, frames)), fps)
             return "GIF"
-        even = (_to_even(_to_channels(frame)) for frame in frames)
-        first = next(even)
-        writer, encoding = _open_writer(path, temporary, first, fps)
+        even_frames = (_to_even(_to_channels(frame)) for frame in frames)
+        first_frame = next(even_frames)
+        writer, encoding = _open_writer(path, temporary, first_frame.shape, fps)
         written: list[Future[None]] = []
 
         def encode(frame: Picture) -> None:
@@ -182,7 +188,7 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
 
         try:
             with ThreadPoolExecutor(1) as encoder:  # encode on one thread, while the next frame is drawn
-                for frame in chain([first], even):
+                for frame in chain([first_frame], even_frames):
                     if written:
                         written[-1].result()
                     written.append(encoder.submit(encode, frame))
@@ -200,8 +206,8 @@ def _write_gif(path: Path, frames: Sequence[Picture], fps: float) -> None:
     palette = Image.fromarray(sample[None]).quantize(256, Image.Quantize.FASTOCTREE)
     # No dithering, which flickers, costs 1.6 dB and takes a quarter more bytes
     paletted = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
-    first, *others = paletted
-    first.save(path, "GIF", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
+    first_frame, *later_frames = paletted
+    first_frame.save(path, "GIF", save_all=True, append_images=later_frames, duration=round(1000 / fps), loop=0)
 
 
 def _to_channels(picture: Picture) -> Picture:
@@ -215,12 +221,14 @@ def _to_even(picture: Picture) -> Picture:
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
-def _open_writer(path: Path, temporary: Path, first: Picture, fps: float) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
-    """Open a file with the first available encoder; also return the name of its encoding."""
-    height, width, channels = first.shape
+def _open_writer(
+    path: Path, temporary: Path, shape: tuple[int, ...], fps: float
+) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
+    """Open a file for frames of a ``shape`` with the first available encoder; also return the encoding's name."""
+    height, width, channels = shape
     name, encoder, container, _ = BY_FFMPEG[channels]
     if path.suffix.lower() == f".{container}" and (program := find_ffmpeg(encoder)):
-        return FfmpegWriter(program, temporary, first.shape, fps), name
+        return FfmpegWriter(program, temporary, shape, fps), name
     if channels > 3:
         problem = f"pictures with alpha need the program ffmpeg with {encoder} on the PATH, which was not found"
         raise SceneError(path, problem, FOLDER)

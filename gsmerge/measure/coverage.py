@@ -11,17 +11,18 @@ from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.types import Gaussians, Scene
 
-HUGE_SCALE_SHARE = 0.1  # of the box's diagonal; larger scales show no detail
+HUGE_SCALE_SHARE = 0.1  # scales above this share of the box's diagonal are huge; they show no detail
 
 
 def extents(gaussians: Gaussians) -> dict[str, Any]:
     """Measure positions and sizes of finite Gaussians, in world units; on a sample if there are many.
 
     Returns:
-        ``box_low`` and ``box_high``: percentiles 1 and 99 of the positions per axis; ``diagonal`` of that box;
-        ``share_outliers``: beyond ten times the box about its centre; ``share_floaters``: isolated, or beyond that;
-        ``scale_median`` of each Gaussian's largest scale; ``scale_max``: the largest scale of all; ``share_huge``:
-        scales above a tenth of the diagonal. All are 0 if there are no Gaussians.
+        ``box_low`` and ``box_high``: percentiles 1 and 99 of the positions per axis. ``diagonal``: length of the box's
+        diagonal. ``share_outliers``: share of positions outside the box enlarged ten times. ``share_floaters``: share
+        of isolated Gaussians and outliers. ``scale_median``: median of each Gaussian's largest scale. ``scale_max``:
+        largest scale of all. ``share_huge``: share of Gaussians whose largest scale is above a tenth of the diagonal.
+        All are 0 if there are no Gaussians.
     """
     names = ("diagonal", "share_outliers", "share_floaters", "scale_median", "scale_max", "share_huge")
     if len(gaussians) == 0:
@@ -41,17 +42,18 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
 def coverage(scene: Scene) -> list[dict[str, Any]]:
     """Measure how much of each view the Gaussians cover. Layers count as views.
 
-    Returns for each view its ``name``, ``share_of_pixels``: the share of pixels with a visible Gaussian of their own
-    (None if views have no own Gaussians), and ``share_of_gaussians``: the share whose centre is inside the picture.
+    Returns three values for each view: its ``name``; ``share_of_pixels``, the share of pixels with a visible Gaussian
+    of their own, None if views have no Gaussians of their own; and ``share_of_gaussians``, the share of Gaussians whose
+    centre is inside the picture.
     """
     if len(scene) == 0:
         return []
     shares = shares_inside(scene, MAX_SAMPLE_GAUSSIANS)
     pixels: list[float | None] = [None] * len(scene)
     if scene.has_own_pixels:
-        own, covered = scene.get_pixels(), scene.covered
-        visible = own.shown if covered is None else covered
-        visible = visible & (scene.gaussians.opacities >= LEAST_OPACITY)[own.fronts]
+        grid, covered = scene.get_pixels(), scene.covered
+        visible = grid.shown if covered is None else covered
+        visible = visible & (scene.gaussians.opacities >= LEAST_OPACITY)[grid.fronts]
         pixels = [float(view.mean()) for view in visible]
     keys = ("name", "share_of_pixels", "share_of_gaussians")
     return [dict(zip(keys, view, strict=True)) for view in zip(scene.names, pixels, shares, strict=True)]

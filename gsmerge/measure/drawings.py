@@ -52,7 +52,7 @@ PANEL_VIEWS = 4  # rows of a panel
 SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # least duration of a path
 VIEW_FRAMES = 4  # least number of frames for each view of a spline
 FPS, GIF_FPS = 30.0, 12.5  # frames per second
-GIF_SIDE = 640  # largest side of a GIF, pixels, unless a size is given
+GIF_SIDE = 640  # largest side of a GIF without the option size, pixels
 PLACED_SIZE = 1280, 720  # width and height of pictures from placed cameras, pixels
 OPAQUE = 0.5  # least alpha of a pixel that has a depth
 HALF_TURN = 180  # degrees; if the cameras span less, a turntable also shows a side that no photo shows
@@ -71,10 +71,10 @@ class DrawOptions:
     output: Path  # A picture, a video, or a folder for pictures
     opacity: OpacityChoice = "auto"
     hints: ReadHints = AUTO
-    views: int | str | None = None  # Largest number of views, or the name of a single one; None: all, in a panel four
+    views: int | str | None = None  # Largest number of views, or the name of one view; None: all, in a panel four
     path: str | None = None  # See :func:`gsmerge.measure.camera_path.parse_path`, or a file of cameras
     frames: int | None = None  # Along the path; None: by SECONDS, for a spline at least VIEW_FRAMES for each view
-    size: tuple[int, int] | None = None  # Width and height of a picture; None: those of the cameras
+    size: tuple[int, int] | None = None  # Width and height of a picture; None: the size of the cameras
     overlay: str | None = None  # "support": colour Gaussians by the number of views that show them
     background: float | Literal["none"] = 0.0  # Grey level; "none": pictures have alpha
     channel: Channel = "color"  # Content of the pictures
@@ -101,7 +101,7 @@ class DrawOptions:
         return GIF_FPS if self.output.suffix.lower() == GIF else FPS
 
     def resize(self, cameras: Cameras) -> Cameras:
-        """Give cameras the size of the pictures, which they fill."""
+        """Resize and crop the images of cameras to the size of the pictures."""
         if self.size is not None:
             return fill_cameras(cameras, *self.size)
         return shrink_cameras(cameras, GIF_SIDE) if self.output.suffix.lower() == GIF else cameras
@@ -113,7 +113,7 @@ class Drawing:
 
     paths: list[Path]  # Of the pictures, or of the video
     facts: dict[str, Any]  # For the report
-    draw: Callable[[int], Iterator[Picture]]  # Takes the number of threads, which is that of views in memory too
+    draw: Callable[[int], Iterator[Picture]]  # Takes the number of threads; as many views are in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,8 +139,8 @@ class DrawnScenes:
     ) -> Iterator[tuple[Picture, ...]]:
         """Yield the 8-bit pictures of all scenes for each camera, with one view per thread in memory.
 
-        ``places`` are the borders between scenes in each picture, one more than there are scenes. Of each scene at
-        least the columns between its borders are drawn.
+        ``places`` has a row of borders for each picture, see :func:`gsmerge.measure.clip.swipe_places`; scene i lies
+        between the borders i and i + 1. Columns outside a scene's borders may show the background only.
         """
         if options.background == NONE or options.channel != "color":
             ((_, gaussians),) = self.scenes
@@ -182,7 +182,7 @@ def farthest_depth(gaussians: Gaussians, cameras: Cameras) -> float:
 
 
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
-    """Find the files of the scene that gives the cameras' frame: the source of a compacted scene, or itself."""
+    """Find the scene into whose frame the cameras are moved: the source of a compacted scene, else itself."""
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
     if match is None or not (source := files.ply.with_name(f"{match[1]}.ply")).is_file():
         return files
@@ -199,15 +199,15 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     pictured = {group.load.views.of_scene[view] for view in group.load.scene.photo_views}
 
     def draw(_: int) -> Iterator[Picture]:
-        parts = [(f"{path.name}{options.legend}", gaussians) for path, gaussians in group.scenes]
+        named = [(f"{path.name}{options.legend}", gaussians) for path, gaussians in group.scenes]
         shown = [photos[used[i]] if used[i] in pictured else None for i in ids] if pictured else None
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         plain = options.overlay is None
-        rows = view_pictures(parts, cameras[ids], shown, ids, scored=plain, background=options.grey)
-        # Of placed views, the second half is inside the scene
-        around = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
-        outside = outside_pictures(parts, around, photos=shown is not None, background=options.grey)
+        rows = view_pictures(named, cameras[ids], shown, ids, scored=plain, background=options.grey)
+        # Without cameras of the scene, views are placed: the first half around it, the second half inside it
+        outer_cameras = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
+        outside = outside_pictures(named, outer_cameras, photos=shown is not None, background=options.grey)
         yield contact_sheet([*rows, outside])
 
     facts = {"scenes": group.counts(), "views": ids, "photos": len(pictured) > 0, "notes": group.notes}
@@ -215,7 +215,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
 
 
 def prepare_pictures(options: DrawOptions) -> Drawing:
-    """Prepare a picture for each camera, with several scenes side by side; without a folder, for a single camera."""
+    """Prepare a picture for each camera, or for one camera if the output is no folder; scenes are side by side."""
     group = _read(options, photos=False)
     is_folder = options.output.suffix.lower() not in PICTURES
     ids = options.choose(group.load.views.names) if is_folder or options.views else [0]
@@ -239,7 +239,7 @@ def _depth_unit(group: DrawnScenes, cameras: Cameras, options: DrawOptions) -> d
 
 
 def prepare_clip(options: DrawOptions) -> Drawing:
-    """Prepare a clip of the scenes along a path, with moving lines between them; in a folder, its frames."""
+    """Prepare a clip of the scenes along a path, with moving lines between them; a folder gets its frames."""
     group, cameras, near, ids = _path_cameras(options)
     cameras = options.resize(cameras)
     paths = [path.absolute() for path, _ in group.scenes]
@@ -255,8 +255,8 @@ def prepare_clip(options: DrawOptions) -> Drawing:
             return
         captions = make_captions(texts, cameras.width, cameras.height)
         places = swipe_places(len(texts), len(cameras), options.fps, cameras.width)
-        for drawn, row in zip(group.draw(cameras, options, threads, near, places), places, strict=True):
-            yield draw_swipe(drawn, row, captions)
+        for drawn, borders in zip(group.draw(cameras, options, threads, near, places), places, strict=True):
+            yield draw_swipe(drawn, borders, captions)
 
     facts = {"views": ids, "notes": group.notes, "scenes": group.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
@@ -284,28 +284,29 @@ def _check_frames(output: Path, width: int, height: int, count: int) -> None:
 
 
 def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
-    """Read scenes and make the cameras of a path; return both, the near plane, and the ids of the path's views."""
+    """Read the scenes, and make the cameras of a path; also return the near plane and the ids of its views."""
     assert options.path is not None
     path = parse_path(options.path)
-    file, is_separate = None if path else Path(options.path), True
-    if file is not None and _lacks_cameras(options.framing):
-        options, is_separate = replace(options, framing=replace(options.framing, cameras=file)), False
+    file = None if path else Path(options.path)
+    is_only_source = file is not None and _lacks_cameras(options.framing)  # the path is also the scene's camera file
+    if is_only_source:
+        options = replace(options, framing=replace(options.framing, cameras=file))
     group = _read(options, photos=False)
-    placed = group.load.views.cameras
-    cameras = placed if file is None or not is_separate else _place_file(file, group.load)
+    scene_cameras = group.load.views.cameras
+    cameras = scene_cameras if file is None or is_only_source else _place_file(file, group.load)
     assert not isinstance(options.views, str)
     ids = pick_views(len(cameras), options.views or len(cameras))
     cameras = cameras[ids]
-    depth = viewing_depth(cameras if file is None else placed, group.scenes[0][1].means)
+    depth = viewing_depth(cameras if file is None else scene_cameras, group.scenes[0][1].means)
     if path is not None:
         if path.kind == "turntable" and (turn := turned_degrees(cameras, depth)) < HALF_TURN:
             group.notes.append(
                 f"the photos span {turn:.0f} degrees about the scene's centre, and a turntable also shows sides without"
                 " photos; --path orbit stays near the photos"
             )
-        least = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
+        min_frames = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
         try:
-            count = options.frames or max(round(SECONDS[path.kind] * options.fps), least)
+            count = options.frames or max(round(SECONDS[path.kind] * options.fps), min_frames)
             cameras = sample_path(path, cameras, depth, count)
         except ValueError as error:
             raise UsageError(str(error)) from error
@@ -313,7 +314,7 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
 
 
 def _place_file(file: Path, load: Loaded) -> Cameras:
-    """Read the cameras of a path into the frame of a scene; cameras without a size get that of the scene's views."""
+    """Read the cameras of a path into the frame of a scene; cameras without a size get the scene's size."""
     cameras = load.views.cameras
     stored = read_cameras(file) if load.cameras is None else read_into_frame(load, file)[0]
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
@@ -330,25 +331,25 @@ def _lacks_cameras(files: SceneFiles) -> bool:
 def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     """Read the scenes, and move the cameras into the frame of ``options.framing``."""
     files, framing, paths = options.files, options.framing, options.paths
-    first = read_gaussian_file(files, opacity=options.opacity, hints=options.hints)
+    first_ply = read_gaussian_file(files, opacity=options.opacity, hints=options.hints)
     plys = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
     same_file = framing.ply == files.ply
-    rows = first if same_file else read_gaussian_file(framing, opacity="auto", hints=AUTO)
-    own = move_cameras_to_scene(rows, framing, hints=options.hints, photos=photos)
-    load = _with_views(own, inside=photos)
-    if options.overlay is not None and load is not own:
+    framing_ply = first_ply if same_file else read_gaussian_file(framing, opacity="auto", hints=AUTO)
+    framing_load = move_cameras_to_scene(framing_ply, framing, hints=options.hints, photos=photos)
+    load = _with_views(framing_load, inside=photos)
+    if options.overlay is not None and load is not framing_load:
         load = replace(load, notes=(*load.notes, "overlay: it counts these placed views, not those of photos"))
-    scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
-    notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
-    with_paths = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
+    scenes = [load.scene.file_gaussians if same_file else first_ply.gaussians, *(ply.gaussians for ply in plys)]
+    notes = [[*([] if same_file else file_notes(first_ply.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
+    notes_with_paths = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
     if options.overlay is not None and len(load.scene):
         scenes = [tint(gaussians, count_views_in_world(gaussians, load.scene.cameras)) for gaussians in scenes]
-    sizes = [file.info.file_bytes for file in (first, *plys)]
-    return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, with_paths if plys else list(notes[0]), load)
+    sizes = [file.info.file_bytes for file in (first_ply, *plys)]
+    return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, notes_with_paths if plys else list(notes[0]), load)
 
 
 def _with_views(load: Loaded, *, inside: bool) -> Loaded:
-    """Place views around a scene that has none, and also ``inside`` it if asked."""
+    """Place views around a scene without views; if ``inside``, also place views inside it."""
     if len(load.scene):
         return load
     with record_run() as record:
@@ -364,21 +365,22 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
 def find_view(view: str, names: Sequence[str]) -> int:
     """Find a view by its name, with or without folders and ending; UsageError if there is none, or several."""
     stems = picture_stems(names)
-    places = [place for place, name in enumerate(names) if view in (name, Path(name).name, stems[place])]
-    if len(places) != 1:
-        problem = f"{len(places)} views of this name" if places else "no view of this name"
+    ids = [i for i, name in enumerate(names) if view in (name, Path(name).name, stems[i])]
+    if len(ids) != 1:
+        problem = f"{len(ids)} views of this name" if ids else "no view of this name"
         raise UsageError(f"--views {view}: expected a number or a name of a view such as {stems[0]}, found {problem}")
-    return places[0]
+    return ids[0]
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:
     """Choose unique file names for views: names of images, or else paths joined by ``_``, or else numbers."""
     paths = []
     for name in names:
-        parts = [part for part in re.split(r"[\\/]+", name) if part not in ("", ".", "..")] or ["view"]
-        stem, dot, suffix = parts[-1].rpartition(".")
+        words = [word for word in re.split(r"[\\/]+", name) if word not in ("", ".", "..")]
+        *folders, file_name = words or ["view"]
+        stem, dot, suffix = file_name.rpartition(".")
         is_image = stem and f"{dot}{suffix}".lower() in IMAGE_SUFFIXES
-        paths.append([*parts[:-1], stem if is_image else parts[-1]])
+        paths.append([*folders, stem if is_image else file_name])
     numbers = [[f"view_{i:03d}"] for i in range(len(names))]
     for candidates in ([path[-1:] for path in paths], paths, numbers):
         stems = ["_".join(path) for path in candidates]
@@ -388,16 +390,16 @@ def picture_stems(names: Sequence[str]) -> list[str]:
 
 
 def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> dict[str, Any]:
-    """Draw the pictures and write them, and make folders as needed; return facts that only drawing reveals."""
+    """Draw and write the pictures, and make folders as needed; return facts that are known only after drawing."""
     total, fps = drawing.facts.get("frames", len(drawing.paths)), drawing.facts.get("fps")
 
-    def count(pictures: Iterator[Picture]) -> Iterator[Picture]:
+    def report_each(pictures: Iterator[Picture]) -> Iterator[Picture]:
         for done, picture in enumerate(pictures, 1):
             yield picture
             progress("render", done, total)
 
     with use_threads() as at_once:
-        pictures = count(drawing.draw(at_once))
+        pictures = report_each(drawing.draw(at_once))
         if fps is not None:
             return {"encoding": write_clip(drawing.paths[0], pictures, fps, overwrite=overwrite)}
         with atomic_outputs(overwrite=overwrite) as add:

@@ -1,4 +1,4 @@
-"""Gaussians, cameras and photos -> a map for each view of the likely error of a new view from there.
+"""Draw a map for each camera of the likely error of a new view there, from Gaussians, cameras and photos.
 
 A result was fitted to the photos of its own views, so its error on these says little. Instead, the surface of each
 pixel, as the result has it, is projected into the nearest photos of other views, and their colours are compared with
@@ -25,15 +25,15 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 SIDE = 320  # largest longer side of a map, pixels
-# Number of nearest other photos that are compared, and of those that count for a pixel: the nearest that see its
-# surface. The rank correlation with held-out errors of four captures is 0.53 to 0.63 with two, and 0.44 to 0.58 with
-# four, since some photos show what stands in front
+# Number of nearest other photos that are compared. Of the photos that see a pixel's surface, the nearest COUNTED count.
+# The rank correlation with held-out errors of four captures is 0.53 to 0.63 with two, and 0.44 to 0.58 with four, since
+# some photos show an object in front of the surface
 NEIGHBORS, COUNTED = 8, 2
-MIN_PHOTOS = 2  # so that each photo has another one
+MIN_PHOTOS = 2  # each photo needs another photo to compare with
 OPAQUE = 0.5  # least opacity of a pixel that shows a surface
-BEHIND = 1.05  # a surface is hidden from another view if it is so many times as deep as what that view shows
+BEHIND = 1.05  # a surface is hidden in another view if its depth there exceeds the drawn depth by this factor
 SIGMA = 2.0  # standard deviation, pixels, of the blur of errors; the error of a single pixel is random
-MAX_ERROR = 0.2  # error, as a share of a channel's range, that has the last colour
+MAX_ERROR = 0.2  # error with the last colour, as a share of a channel's range
 STOPS = ((0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164))  # colours of errors, sRGB
 UNKNOWN = (0, 130, 140)  # colour of pixels that no other photo shows
 
@@ -44,7 +44,7 @@ class ErrorReference:
 
     gaussians: Gaussians
     views: Views  # canonical cameras, photos of at most SIDE pixels
-    masks: np.ndarray | None  # [v,h,w] bool, pixels of the photos that count; None: all
+    masks: np.ndarray | None  # [v,h,w] bool, pixels inside the photos' masks; None: all
     drawn: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # picture and depth by view
 
     def draw(self, view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +55,7 @@ class ErrorReference:
 
 
 def make_reference(gaussians: Gaussians, views: Views, masks: np.ndarray | None = None) -> ErrorReference:
-    """Take canonical ``views`` with photos as the reference of a canonical scene's errors, inside ``masks [v,h,w]``."""
+    """Shrink canonical ``views`` with photos, and ``masks [v,h,w]``, to a reference for the errors of a scene."""
     small = shrink_views(views, SIDE)
     size = small.cameras.width, small.cameras.height
     resized = None if masks is None else np.stack([resize_mask(mask, *size) for mask in masks])
@@ -65,42 +65,54 @@ def make_reference(gaussians: Gaussians, views: Views, masks: np.ndarray | None 
 def expected_errors(reference: ErrorReference, camera: Cameras, own: int | None = None) -> np.ndarray:
     """Estimate the likely error of a canonical camera's picture by the photos of other views.
 
-    Returns ``[h,w]`` float32 of at most ``SIDE`` pixels a side: mean absolute differences of the channels, in [0, 1],
-    from the nearest photos that show the surface of a pixel; NaN if no photo shows it. ``own``: the view of the camera,
-    whose photo does not count.
+    Returns ``[h,w]`` float32, at most ``SIDE`` pixels per side: the mean absolute difference of the channels, in
+    [0, 1], between a pixel and the nearest photos that show its surface; NaN if no photo shows it. ``own`` is the view
+    of the camera, whose photo does not count.
     """
     camera = shrink_cameras(camera, SIDE)
     image, depth = draw_camera(reference.gaussians, camera) if own is None else reference.draw(own)
     ids = np.flatnonzero(depth > 0)
     points, colors = lift_pixels(depth, depth > 0, camera), image.reshape(-1, 3).take(ids, 0)
     sums, counts = np.zeros((2, len(ids)), np.float32)
-    open_rows, small = np.arange(len(ids)), reference.views.cameras
-    for other in _nearest(small, camera, own):
-        (pixels,), (z,) = project(points.take(open_rows, 0), small[[other]])
-        seen = np.flatnonzero((z > 0) & is_inside(pixels, small))
-        pixels, rows = pixels.take(seen, 0), open_rows.take(seen)
-        column, row = pixels.astype(np.int64).T
-        places = row * small.width + column
-        shown = z.take(seen) < BEHIND * reference.draw(other)[1].reshape(-1).take(places)
-        if reference.masks is not None:
-            shown &= reference.masks[other].reshape(-1).take(places)
-        pixels, rows = pixels.compress(shown, 0), rows.compress(shown)
-        differences = np.abs(sample_bilinear(reference.views.images[other], *(pixels.T - 0.5)) - colors.take(rows, 0))
+    open_rows = np.arange(len(ids))  # surface points that need more photos
+    for view in _nearest(reference.views.cameras, camera, own):
+        rows, photo_colors = _see_points(reference, view, points, open_rows)
+        differences = np.abs(photo_colors - colors.take(rows, 0))
         sums[rows] += (differences[:, 0] + differences[:, 1] + differences[:, 2]) / np.float32(3)
         counts[rows] += 1
         open_rows = open_rows.compress(counts.take(open_rows) < COUNTED)
-    errors = np.zeros((depth.size, 2), np.float32)
-    errors[ids, 0], errors[ids, 1] = sums / np.maximum(counts, 1), counts > 0
-    errors = errors.reshape(*depth.shape, 2)
-    known = errors[..., 1] > 0
-    total, weight = np.moveaxis(blur(errors, SIGMA), 2, 0)
-    return np.where(known, total / np.maximum(weight, np.float32(1e-6)), np.float32(np.nan))
+    means, known = np.zeros((2, depth.size), np.float32)
+    means[ids], known[ids] = sums / np.maximum(counts, 1), counts > 0
+    layers = np.stack([means, known], 1).reshape(*depth.shape, 2)
+    total, weight = np.moveaxis(blur(layers, SIGMA), 2, 0)
+    smooth = total / np.maximum(weight, np.float32(1e-6))
+    return np.where(layers[..., 1] > 0, smooth, np.float32(np.nan))
+
+
+def _see_points(
+    reference: ErrorReference, view: int, points: np.ndarray, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Select the ``rows [m]`` of ``points [n,3]`` that a view's photo shows; also return its colours there, ``[k,3]``.
+
+    A photo shows a point that is inside the picture and the mask, and that no drawn surface hides.
+    """
+    cameras = reference.views.cameras
+    (pixels,), (depths,) = project(points.take(rows, 0), cameras[[view]])
+    inside = np.flatnonzero((depths > 0) & is_inside(pixels, cameras))
+    pixels, rows = pixels.take(inside, 0), rows.take(inside)
+    column, row = pixels.astype(np.int64).T
+    pixel_ids = row * cameras.width + column
+    shown = depths.take(inside) < BEHIND * reference.draw(view)[1].reshape(-1).take(pixel_ids)
+    if reference.masks is not None:
+        shown &= reference.masks[view].reshape(-1).take(pixel_ids)
+    pixels, rows = pixels.compress(shown, 0), rows.compress(shown)
+    return rows, sample_bilinear(reference.views.images[view], *(pixels.T - 0.5))
 
 
 def draw_errors(errors: np.ndarray) -> Picture:
     """Colour errors ``[h,w]`` from black over red to yellow (0.2 or more), and teal where the error is not known."""
-    places = np.nan_to_num(errors).clip(0, MAX_ERROR) * ((len(STOPS) - 1) / MAX_ERROR)
-    colors = [np.interp(places, range(len(STOPS)), channel) for channel in np.array(STOPS).T]
+    positions = np.nan_to_num(errors).clip(0, MAX_ERROR) * ((len(STOPS) - 1) / MAX_ERROR)  # among the colour stops
+    colors = [np.interp(positions, range(len(STOPS)), channel) for channel in np.array(STOPS).T]
     return np.where(np.isnan(errors)[..., None], UNKNOWN, np.stack(colors, 2)).round().astype(np.uint8)
 
 
@@ -139,9 +151,9 @@ def draw_sheets(
 ) -> Iterator[tuple[str, int, Picture]]:
     """Draw the photo, the picture and the map of each result and view, side by side.
 
-    Yields (result, number of the view among all views, sheet); the input views come first. ``cameras``: those of the
-    input views, by name of each result whose cameras differ from the scene's. Without ``context`` only held-out views
-    are drawn. The scene must have photos, see :func:`require_photos`.
+    Yields (result, number of the view among all views, sheet); the input views come first. ``cameras`` has the cameras
+    of the input views, by name of each result whose cameras differ from the scene's. Without ``context`` only held-out
+    views are drawn. The scene must have photos, see :func:`require_photos`.
     """
     assert scene.images is not None
     frame = scene_frame(scene)
@@ -155,12 +167,19 @@ def draw_sheets(
         for number, (source, view, own) in enumerate(views):
             if own is not None and not (context and (scene.masks is None or scene.masks[view].any())):
                 continue
-            camera = source.cameras[[view]]
-            drawn, _ = draw_camera(reference.gaussians, camera) if own is None else reference.draw(own)
-            errors = expected_errors(reference, camera, own)
-            pictures = to_picture(source.images[view]), to_picture(drawn), draw_errors(errors)
-            known = errors[~np.isnan(errors)]
-            mean = f"error {known.mean():.3f}, " if len(known) else ""
-            legend = f"{mean}yellow {MAX_ERROR}; teal, {100 * (1 - len(known) / errors.size):.0f} %, unknown"
-            texts = f"view {number}: {source.names[view]}{'' if own is not None else ', held out'}", name, legend
-            yield name, number, contact_sheet([list(zip(texts, pictures, strict=True))])
+            title = f"view {number}: {source.names[view]}{'' if own is not None else ', held out'}"
+            yield name, number, _draw_sheet(reference, source, view, own, (title, name))
+
+
+def _draw_sheet(
+    reference: ErrorReference, source: Views, view: int, own: int | None, texts: tuple[str, str]
+) -> Picture:
+    """Draw photo, picture and map of a view of ``source``; ``texts`` are the labels of the first two."""
+    camera = source.cameras[[view]]
+    drawn, _ = draw_camera(reference.gaussians, camera) if own is None else reference.draw(own)
+    errors = expected_errors(reference, camera, own)
+    pictures = to_picture(source.images[view]), to_picture(drawn), draw_errors(errors)
+    known = errors[~np.isnan(errors)]
+    mean = f"error {known.mean():.3f}, " if len(known) else ""
+    legend = f"{mean}yellow {MAX_ERROR}; teal, {100 * (1 - len(known) / errors.size):.0f} %, unknown"
+    return contact_sheet([list(zip((*texts, legend), pictures, strict=True))])

@@ -34,7 +34,7 @@ MENDED = (
     "the photos of the input views differ from their Gaussians, or from each other, in tone, exposure or by objects"
     " that cover them; compact mends this, but the scores here use the photos as they are"
 )
-MIN_SEEN_SHARE = 0.1  # of the held-out pixels that input views have seen; less suggests another frame of coordinates
+MIN_SEEN_SHARE = 0.1  # if input views have seen less of the held-out pixels, the frames of coordinates may differ
 INPUT = "input"  # name of the scene itself among the results
 
 OnImage = Callable[[str, str, int, np.ndarray], None]  # result, split, number of the view, image
@@ -94,7 +94,7 @@ class ResultScores:
         return _mean([full for full, _ in pairs]), _mean([masked for _, masked in pairs])
 
     def mean_covered(self, split: str) -> tuple[float | None, Quality]:
-        """Average, over the views of a split, the share of pixels that the input covers and the scores over these."""
+        """Average, over a split's views, the share of pixels that the input covers, and the scores over them."""
         views = [score for score in self.scores if score.split == split]
         shares = [score.covered_share for score in views if score.covered_share is not None]
         return float(np.mean(shares)) if shares else None, _mean([score.covered for score in views])
@@ -150,10 +150,10 @@ class _Split:
 
     views: Views
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
-    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: those that its renders show
-    reference: str  # words for the pictures: photos, or what stands in for them
+    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: where its renders are opaque
+    reference: str  # words for the pictures: photos, or their replacement
     scored: Sequence[int]  # ids of the views whose pictures are scored
-    drawn: Gaussians | None = None  # the input, if its renders stand in for photos
+    drawn: Gaussians | None = None  # the input, if its renders replace photos
 
     def move_to(self, cameras: Cameras | None) -> _Split:
         """Move the views to the cameras of a result (None: keep them); renders of the input are not moved."""
@@ -223,9 +223,10 @@ def evaluate(
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
-    given = scene if scene.images is None else replace(scene, images=as_pictures(scene.images))
-    scene, mended = scored_pictures(given)
-    inputs, after = scene.file_gaussians, {name: own_gaussians(value).numpy() for name, value in results.items()}
+    original = scene if scene.images is None else replace(scene, images=as_pictures(scene.images))
+    scene, mended = scored_pictures(original)
+    inputs = scene.file_gaussians
+    outputs = {name: own_gaussians(result).numpy() for name, result in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_pictures(targets.images))
         targets = shrink_views(targets, options.photo_side)
@@ -233,25 +234,27 @@ def evaluate(
     with use_threads(options.threads):
         renderer = _Renderer(near_plane(scene), options)
         progress("what the input views see", 0, 0)
-        reference = PHOTOS if scene is given else ROW_COLORS
+        reference = PHOTOS if scene is original else ROW_COLORS
         splits = _splits(scene, reference, inputs, targets, renderer)
-        named = {INPUT: inputs, **after} if options.own else after
-        has_fog = options.fog and bool(after)
-        fog = measure_fog(inputs, after, scene.cameras, renderer.near, progress) if has_fog else {}
-        num_pictures, numbers = len(named) * sum(len(split.views) for split in splits.values()), count(1)
+        scored = {INPUT: inputs, **outputs} if options.own else outputs
+        has_fog = options.fog and bool(outputs)
+        fog = measure_fog(inputs, outputs, scene.cameras, renderer.near, progress) if has_fog else {}
+        num_pictures, numbers = len(scored) * sum(len(split.views) for split in splits.values()), count(1)
 
-        def keep(name: str, kind: str, view: int, image: np.ndarray) -> None:
+        def report_image(name: str, kind: str, view: int, image: np.ndarray) -> None:
             on_image(name, kind, view, image)
             progress(f"evaluate: {name}", next(numbers), num_pictures)
 
         renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, so that this is not part of a result's time
-        parts = [
-            _score_split(kind, split, named, cameras if kind == "context" else {}, renderer, keep)
+        split_scores = [
+            _score_split(kind, split, scored, cameras if kind == "context" else {}, renderer, report_image)
             for kind, split in splits.items()
         ]
     scores = [
-        ResultScores(name, len(gaussians), len(gaussians) / max(len(inputs), 1), *_join(name, parts), fog.get(name, {}))
-        for name, gaussians in named.items()
+        ResultScores(
+            name, len(gaussians), len(gaussians) / max(len(inputs), 1), *_join(name, split_scores), fog.get(name, {})
+        )
+        for name, gaussians in scored.items()
     ]
     counts = {name: len(split.scored) for name, split in splits.items()}
     notes = (*lpips_notes, *_notes(splits, scores, mended=mended))
@@ -269,8 +272,8 @@ def _without_missing(options: EvaluateOptions) -> tuple[EvaluateOptions, tuple[s
 
 def _name_reference(splits: Mapping[str, _Split]) -> str:
     """Name the pictures that results are compared with: photos, or their replacement in the input views."""
-    first, *others = dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits)
-    return f"{first}, and {others[0]} in its own views" if others else first
+    names = list(dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits))
+    return f"{names[0]}, and {names[1]} in its own views" if len(names) > 1 else names[0]
 
 
 def near_plane(scene: Scene) -> float:
@@ -302,7 +305,7 @@ def _splits(
     """
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
-    sources = scene.cameras if scene.has_own_pixels else cameras  # the points are from the pixels of these
+    sources = scene.cameras if scene.has_own_pixels else cameras  # the points come from the pixels of these cameras
     points = context_points(scene, renderer.near, sources)
 
     def split(views: Views, reference: str, masks: np.ndarray | None = None) -> _Split:
@@ -312,9 +315,9 @@ def _splits(
             scored = [view for view in scored if masks[view].any()] or scored
         return _Split(views, visible, None, reference, scored)
 
-    target = {} if targets is None else {"target": split(targets, PHOTOS)}
+    held_out = {} if targets is None else {"target": split(targets, PHOTOS)}
     if targets is not None and not renderer.options.context:
-        return target
+        return held_out
     if scene.images is not None:
         views = shrink_views(Views(scene.cameras, scene.images, scene.names), side)
         context = split(views, reference, scene.masks)
@@ -324,13 +327,13 @@ def _splits(
     if scene.covered is not None:
         covered = np.stack([resize_mask(mask, cameras.width, cameras.height) for mask in scene.covered])
         context = replace(context, covered=covered)
-    return {"context": context, **target}
+    return {"context": context, **held_out}
 
 
 def _score_split(
     kind: str,
     split: _Split,
-    named: Mapping[str, Gaussians],
+    results: Mapping[str, Gaussians],
     cameras: Mapping[str, Cameras],
     renderer: _Renderer,
     on_image: OnImage,
@@ -338,55 +341,82 @@ def _score_split(
     """Draw and score all results, one view after the other; return seconds and score of each view by result."""
     options, names = renderer.options, split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))
-    moved = {name: split.move_to(cameras.get(name)) for name in named}
-    scores: dict[str, list[tuple[float, ViewScore]]] = {name: [] for name in named}
+    moved = {name: split.move_to(cameras.get(name)) for name in results}
+    scores: dict[str, list[tuple[float, ViewScore]]] = {name: [] for name in results}
     for view in range(len(names)):
         covered = None if split.covered is None else split.covered[view]
-        for name, gaussians in named.items():
+        nets = options.lpips if view in lpips_views else ()
+        for name, gaussians in results.items():
             start = time.perf_counter()
             image, opaque = renderer.draw(gaussians, moved[name].views.cameras, view)
             seconds = time.perf_counter() - start
             on_image(name, kind, view, image)
             if name == INPUT and covered is None:
                 covered = opaque
-            nets = options.lpips if view in lpips_views else ()
-            full, masked = Quality(), Quality()
+            score = ViewScore(kind, names[view], float(split.visible[view].mean()), Quality(), Quality())
             if view in split.scored:
-                full, masked = _both(image, split.views.images[view], split.visible[view], nets)
-            score = ViewScore(kind, names[view], float(split.visible[view].mean()), full, masked)
-            full, masked = (replace(quality, lpips_vgg=None, lpips_alex=None) for quality in (full, masked))
-            zooms = {
-                zoom: (full, masked)
-                if zoom == 1 or view not in split.scored
-                else _score_zoom(gaussians, moved[name], view, zoom, renderer)
-                for zoom in (() if options.zoom == (1,) else options.zoom)
-            }
-            if covered is not None and view in split.scored:
-                share, quality = _covered(image, split.views.images[view], covered)
-                score = replace(score, covered_share=share, covered=quality or full)
+                score = _score_view(score, image, split, view, covered, nets)
+            zooms = _score_zooms(score, gaussians, moved[name], view, renderer)
             scores[name].append((seconds, replace(score, zooms=zooms)))
     return scores
 
 
+def _score_view(
+    score: ViewScore,
+    image: np.ndarray,
+    split: _Split,
+    view: int,
+    covered: NDArray[np.bool_] | None,
+    nets: Sequence[str],
+) -> ViewScore:
+    """Add to a score the quality of a render over all pixels, over the seen pixels, and over the ``covered`` pixels."""
+    photo = split.views.images[view]
+    full, masked = _both(image, photo, split.visible[view], nets)
+    score = replace(score, full=full, masked=masked)
+    if covered is None:
+        return score
+    share, quality = _covered(image, photo, covered)
+    return replace(score, covered_share=share, covered=quality or _without_lpips(full))
+
+
+def _score_zooms(
+    score: ViewScore, gaussians: Gaussians, split: _Split, view: int, renderer: _Renderer
+) -> dict[float, Pair]:
+    """Score a view at the requested sizes, if others than the photo's are requested; size 1 repeats ``score``."""
+    options = renderer.options
+    own = _without_lpips(score.full), _without_lpips(score.masked)
+    return {
+        zoom: own if zoom == 1 or view not in split.scored else _score_zoom(gaussians, split, view, zoom, renderer)
+        for zoom in (() if options.zoom == (1,) else options.zoom)
+    }
+
+
+def _without_lpips(quality: Quality) -> Quality:
+    return replace(quality, lpips_vgg=None, lpips_alex=None)
+
+
 def _join(
-    name: str, parts: Sequence[Mapping[str, Sequence[tuple[float, ViewScore]]]]
+    name: str, split_scores: Sequence[Mapping[str, Sequence[tuple[float, ViewScore]]]]
 ) -> tuple[float, tuple[ViewScore, ...]]:
     """Return the median seconds and the scores of a result over the views of all splits."""
-    rows = [row for part in parts for row in part[name]]
+    rows = [row for scores in split_scores for row in scores[name]]
     return float(np.median([seconds for seconds, _ in rows])), tuple(score for _, score in rows)
 
 
 def _covered(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) -> tuple[float, Quality | None]:
-    """Measure the share of pixels in a mask, and PSNR and SSIM over them; None if nearly all pixels are in it."""
+    """Measure the share of pixels in a mask, and PSNR and SSIM over them; None, for all, if nearly all are in it."""
     share = float(mask.mean())
     return share, None if share >= WHOLE else _quality(image, photo, mask, ()) if share > 0 else Quality()
 
 
 def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, renderer: _Renderer) -> Pair:
     """Score a render at another size against the photo, or the render of the input, at that size."""
-    (cameras, drawn), photo = (zoom_cameras(split.views.cameras, zoom), split.drawn), split.views.images[view]
+    cameras = zoom_cameras(split.views.cameras, zoom)
     size = cameras.width, cameras.height
-    photo = resize_photo(photo, *size) if drawn is None else renderer.image(drawn, cameras, view)
+    if split.drawn is None:
+        photo = resize_photo(split.views.images[view], *size)
+    else:
+        photo = renderer.image(split.drawn, cameras, view)
     image, seen = renderer.image(gaussians, cameras, view), resize_mask(split.visible[view], *size)
     return _both(image, photo, seen, ())
 
@@ -413,5 +443,9 @@ def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | Non
 
 def _mean(scores: Sequence[Quality]) -> Quality:
     """Average each measure over the scores that have it."""
-    columns = {f.name: [v for score in scores if (v := getattr(score, f.name)) is not None] for f in fields(Quality)}
-    return Quality(**{name: float(np.mean(values)) if values else None for name, values in columns.items()})
+    means: dict[str, float | None] = {}
+    for measure in fields(Quality):
+        values = [getattr(score, measure.name) for score in scores]
+        measured = [value for value in values if value is not None]
+        means[measure.name] = float(np.mean(measured)) if measured else None
+    return Quality(**means)

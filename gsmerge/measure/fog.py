@@ -1,9 +1,9 @@
 """Measure fog, veils, holes and spikes: errors of a compact scene that only show from outside the views.
 
-Photos score a scene from their own viewpoints only. A person who views the scene first steps back and turns. Then
-Gaussians that hang in gaps between the views show as haze, Gaussians of wrong depth as veils before surfaces, gaps in
-surfaces as holes, and long thin Gaussians, which made the texture of one view, as strokes. The measure needs no photos,
-only the input and the cameras of its views; docs/guide/evaluate.md defines it for readers.
+Photos score a scene from their own viewpoints only, but a person who views the scene first steps back and turns. Then
+Gaussians in gaps between the views show as haze, and Gaussians of wrong depth as veils before surfaces. Gaps in
+surfaces show as holes. Long thin Gaussians, which made the texture of one view, show as strokes. The measure
+needs no photos, only the input and the cameras of its views; docs/guide/evaluate.md defines it for readers.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ ALL = "all"  # kind of all these cameras together
 SIDE = 480  # largest longer side of the pictures, pixels
 EMPTY, SOLID, OPEN = 0.05, 0.9, 0.5  # opacities: the input is empty below, solid above; a result has a hole below
 MARGIN = 17  # side, in pixels, of the square that erodes empty regions
-FAR_SHARE = 0.1  # fog is far if it is farther from all that the input shows than this share of the width
+FAR_SHARE = 0.1  # fog is far if it is farther than this share of the width from every pixel that the input shows
 VEIL = 0.7  # a result has a veil where its depth is below this share of the input's depth
-VEILED = 0.08  # a result gets a note if its worst veil is larger
+VEILED = 0.08  # a result whose worst veil is larger gets a note
 # Spikes are Gaussians at least RATIOS times as long as their second axis, and longer (3 sigma) than the share LONG of
 # the width. They are visible where a channel changes by more than CHANGED without them
 RATIOS, LONG, CHANGED = (5.0, 3.0), 0.05, 0.05
@@ -41,15 +41,17 @@ NEAREST = 0.25  # near plane of the depths of both scenes, as a share of the vie
 
 @dataclass(frozen=True)
 class Fog:
-    """Fog, veils, holes and spikes of a result from outside, compared with its input; None if there is no such pixel.
+    """Fog, veils, holes and spikes of a result from outside, compared with its input.
+
+    A figure is None if no pixel can be measured.
 
     Args:
         fog_near: Mean opacity, in [0, 1], where the input is empty.
-        fog_far: Mean opacity farther than a tenth of the width from all that the input shows.
+        fog_far: Mean opacity farther than a tenth of the width from every pixel that the input shows.
         holes: Share of the pixels with a solid input in which the result is not solid.
         veil: Share of the pixels with a solid input in which the depth of the result is less than 0.7 of the input's;
             mean over the cameras.
-        veil_worst: The largest such share of a single camera.
+        veil_worst: The largest veil of a single camera.
         spikes: Share of the pixels that change visibly without Gaussians at least five times as long as their second
             axis and longer than 5 % of the width.
         strokes: The same share for Gaussians at least three times as long.
@@ -70,7 +72,7 @@ class OutsidePicture:
 
     opacities: np.ndarray  # [h,w]
     beyond: np.ndarray  # [h,w] opacities without Gaussians nearer than NEAREST
-    depths: np.ndarray  # [h,w] mean camera z of these
+    depths: np.ndarray  # [h,w] mean camera z, without Gaussians nearer than NEAREST
 
 
 def measure_fog(
@@ -85,18 +87,19 @@ def measure_fog(
     Returns a :class:`Fog` by name of the result and kind of camera (those of :data:`CAMERAS`, and "all"). Its figures
     are means over the pixels of all pictures of the kind. ``near``: near plane of the pictures, in world units.
     """
-    first, splats = make_splats(reference), {name: make_splats(result) for name, result in results.items()}
-    pictures: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}
+    reference_splats = make_splats(reference)
+    splats = {name: make_splats(result) for name, result in results.items()}
+    pictures: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}  # kind of camera, and counts
     outside = list(outside_cameras(reference, cameras))
     for number, (kind, camera, depth) in enumerate(outside):
         progress("views from outside", number, len(outside))
-        expected = draw_outside(first, camera, near, NEAREST * depth)
+        expected = draw_outside(reference_splats, camera, near, NEAREST * depth)
         for name in results:
             counts = count_pixels(expected, draw_outside(splats[name], camera, near, NEAREST * depth))
             pictures[name].append((kind, np.concatenate([counts, count_spikes(results[name], camera, near)])))
     return {
         name: {
-            kind: mean_fog(np.stack([counts for other, counts in rows if kind in (other, ALL)]))
+            kind: mean_fog(np.stack([counts for picture_kind, counts in rows if kind in (picture_kind, ALL)]))
             for kind in (*CAMERAS, ALL)
         }
         for name, rows in pictures.items()
@@ -115,13 +118,13 @@ def describe_fog(name: str, fog: Fog) -> str | None:
 
 
 def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras, float]]:
-    """Yield kind, camera, and median depth of the view from which it steps back, for each outside picture."""
+    """Yield for each outside picture its kind, its camera, and the median depth of the view where the camera starts."""
     cameras = shrink_cameras(cameras, SIDE)
     for view in pick_views(len(cameras), VIEWS):
         camera = cameras[[view]]
         depth = middle_depth(gaussians.means, camera)
-        for kind, places in CAMERAS.items():
-            for back, turn in places:
+        for kind, moves in CAMERAS.items():
+            for back, turn in moves:
                 viewmat = step_outside(camera.viewmats[0], depth, back, turn)
                 yield kind, replace(camera, viewmats=viewmat[None]), depth
 
@@ -137,7 +140,7 @@ def draw_outside(splats: Splats, camera: Cameras, near: float, nearest: float) -
 
 
 def count_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
-    """Return sum and number of pixels ``[4,2]`` of near fog, far fog, holes and veil in a picture of a result."""
+    """Return sums over pixels, and numbers of measured pixels, ``[4,2]``: near fog, far fog, holes and veil."""
     empty, solid = (expected.opacities < EMPTY).astype(np.uint8), expected.opacities > SOLID
     sides = MARGIN, max(MARGIN, 2 * round(FAR_SHARE * empty.shape[1]) + 1)
     masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
@@ -149,7 +152,7 @@ def count_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray
 
 
 def count_spikes(gaussians: Gaussians, camera: Cameras, near: float) -> np.ndarray:
-    """Return the numbers of pixels that change without spikes, and of all pixels, for each of ``RATIOS``: ``[2,2]``."""
+    """Return, for each of ``RATIOS``, how many pixels change without spikes, and how many there are: ``[2,2]``."""
     _, second, longest = np.sort(gaussians.scales, 1).T
     depths = camera_depths(gaussians.means.astype(np.float64), camera.viewmats[0])
     long = 3 * longest * camera.Ks[0, 0, 0] > LONG * camera.width * np.maximum(depths, near)

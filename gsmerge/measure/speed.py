@@ -38,21 +38,22 @@ def measure_costs(
     seconds per view. All scenes but the first also have ``merge_seconds``, and in ``speeds`` the ``speedup`` against
     the first scene and ``break_even_frames``.
     """
-    few = cameras[pick_views(len(cameras), NUM_VIEWS)]
+    sampled = cameras[pick_views(len(cameras), NUM_VIEWS)]
     costs: dict[str, dict[str, Any]] = {
-        name: {"overdraw": round(overdraw(gaussians, few, near), 3), "speeds": []} for name, gaussians in scenes.items()
+        name: {"overdraw": round(overdraw(gaussians, sampled, near), 3), "speeds": []}
+        for name, gaussians in scenes.items()
     }
     with use_threads(threads) as used:
         for zoom in zooms:
-            views = zoom_cameras(few, zoom)
+            views = zoom_cameras(sampled, zoom)
             head = {"width": views.width, "height": views.height, "threads": used}
             for name, seconds in time_in_turns(scenes, views, near).items():
                 costs[name]["speeds"].append({**head, "seconds": round(seconds, 6)})
-    first, *others = scenes
-    for name in others:
+    baseline, *results = scenes
+    for name in results:
         costs[name]["merge_seconds"] = merge = (merge_seconds or {}).get(name)
-        for base, speed in zip(costs[first]["speeds"], costs[name]["speeds"], strict=True):
-            before, after = base["seconds"], speed["seconds"]
+        for base_speed, speed in zip(costs[baseline]["speeds"], costs[name]["speeds"], strict=True):
+            before, after = base_speed["seconds"], speed["seconds"]
             speed["speedup"] = before / after
             # Frames after which merging has saved its own time (paper, supplement: timing)
             speed["break_even_frames"] = None if merge is None or after >= before else merge / (before - after)
@@ -66,7 +67,7 @@ def time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) 
     plane, in the units of the scenes.
     """
     shortest = {name: np.full(len(views), np.inf) for name in scenes}
-    for gaussians in scenes.values():  # fills caches
+    for gaussians in scenes.values():  # the first render fills caches
         time_render(gaussians, views[[0]], near)
     for round_number in range(REPEATS):
         for name, gaussians in scenes.items():

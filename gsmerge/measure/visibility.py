@@ -17,17 +17,17 @@ from gsmerge.types import Cameras, Gaussians, Scene
 Points = NDArray[np.float64]  # [n,3]
 _OPAQUE = 0.5  # least alpha of a pixel whose rendered depth is that of a surface
 _NEAR = 0.01  # near plane, as a share of the median depth of a view
-_BEHIND = 1.05  # a surface hides centres beyond so many times its depth
-MAX_SAMPLE_GAUSSIANS = 200_000  # on which a share is measured
+_BEHIND = 1.05  # a surface hides a centre whose depth exceeds the surface's by this factor
+MAX_SAMPLE_GAUSSIANS = 200_000  # largest sample on which a share is measured
 _CHUNK = 1 << 16  # points processed at a time; all of them, in every thread, would take too much memory
-_DILATION = 3  # side, in pixels of the input views, of the square that a sample marks
+_DILATION = 3  # side of the square that a point marks, pixels of the input views
 
 
 def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
     """Return the surface points ``[n,3]``, in world units, that the pixels of the input views show.
 
     If views have Gaussians of their own, the points are their centres. Otherwise they are depths rendered beyond
-    ``near`` (world units) in the ``cameras``; None: those of the scene.
+    ``near`` (world units) in the ``cameras``; None: the scene's cameras.
     """
     if scene.has_own_pixels:
         return scene.file_gaussians.means.astype(np.float64)
@@ -63,8 +63,8 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
         seen = hit > 0
         side = _side(Ks[view], sources)
         own = len(points) * view // len(cameras)  # in most scenes the view's own points begin here; start with them
-        for first in (*range(own, len(points), _CHUNK), *range(0, own, _CHUNK)):
-            chunk = points[first : first + _CHUNK]
+        for start in (*range(own, len(points), _CHUNK), *range(0, own, _CHUNK)):
+            chunk = points[start : start + _CHUNK]
             image = matmul(matmul(chunk, viewmats[view, :3, :3].T) + viewmats[view, :3, 3], Ks[view].T)
             image = image.compress(image[:, 2] > near, 0)
             pixels = image[:, :2] / image[:, 2:]
@@ -79,7 +79,7 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
 
 
 def _side(K: np.ndarray, sources: Cameras | None) -> int:
-    """Choose the side, an odd number of pixels, of the square that a sample marks with the intrinsics ``K [3,3]``."""
+    """Choose the side (odd, pixels) of the square that a point marks in a view with intrinsics ``K [3,3]``."""
     if sources is None:
         return _DILATION
     focals = [np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64))]  # pixels
@@ -95,16 +95,16 @@ def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
         near = _NEAR * float(np.median(depths[inside])) if inside.any() else 1.0
         drawn = render(gaussians, cameras[[view]], near=near, with_depths=True)
         assert drawn.depths is not None
-        chosen = np.flatnonzero(inside)
-        x, y = pixels[chosen].astype(np.int64).T
+        candidates = np.flatnonzero(inside)
+        x, y = pixels[candidates].astype(np.int64).T
         surface = np.where(drawn.alphas[0, y, x, 0] > _OPAQUE, drawn.depths[0, y, x, 0], np.inf)
-        rows.append(chosen[depths[chosen] <= _BEHIND * surface])
+        rows.append(candidates[depths[candidates] <= _BEHIND * surface])
     return rows
 
 
 def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
     """Yield for each view a mask ``[n]`` of the points ``[n,3]`` inside its picture."""
     at_once = 1 + _CHUNK // max(1, len(points))
-    for first in range(0, len(cameras), at_once):
-        pixels, depths = project(points, cameras[first : first + at_once])
+    for start in range(0, len(cameras), at_once):
+        pixels, depths = project(points, cameras[start : start + at_once])
         yield from (depths > 0) & is_inside(pixels, cameras)

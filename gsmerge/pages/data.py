@@ -38,12 +38,12 @@ from gsmerge.stages.superpixels import segment
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 LPIPS = "alex"  # network of LPIPS, if its weights are installed; it takes 0.05 s per picture, "vgg" 0.8 s
-MAX_VIEWS = 32  # of more views, some at equal intervals are shown; each takes up to 300 kB
-WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
+MAX_VIEWS = 32  # of more views, only so many at equal intervals are shown; each takes up to 300 kB
+WEBP_QUALITY = 90  # stills of this quality score within 1 dB of lossless stills
 OUTLINE_SIDE = 1280  # largest longer side of a picture of superpixels' outlines, pixels
-OUTLINE_LEVELS = 5  # levels per channel of an outline's colour; with transparency all colours fit into a byte
+OUTLINE_LEVELS = 5  # levels per channel of an outline's colour; all colours and transparency then fit into a byte
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
-OUTLINE_SHIFT = 0.35  # an outline is lighter than its superpixel by this share, or darker if the superpixel is light
+OUTLINE_SHIFT = 0.35  # outlines move by this share from the superpixel's colour to white, or to black if it is light
 
 
 @dataclass(frozen=True)
@@ -53,15 +53,15 @@ class Side:
     name: str
     num_gaussians: int
     file_bytes: int
-    mean: Quality  # over the held-out views, or over the input views if no view is held out
+    mean: Quality  # mean over the held-out views, or over the input views if no view is held out
     splats: bytes | None  # the Gaussians in the page's frame, see :func:`pack_splats`; None: too many for a page
-    sh_degree: int  # of the harmonics in the page
-    file_sh_degree: int  # of the harmonics in the file
+    sh_degree: int  # degree of the harmonics in the page
+    file_sh_degree: int  # degree of the harmonics in the file
     covered_share: float | None  # share of the pixels of these views that the input covers
-    covered: Quality  # over the covered pixels
+    covered: Quality  # mean over the covered pixels
     seconds: float  # time to draw a view on this machine, with all threads
     dropped: Mapping[str, int]  # number of Gaussians that ``--drop`` would remove, by its words
-    seen: Mapping[str, int]  # number of Gaussians that "none" or "one" of the input views shows; empty if not known
+    seen: Mapping[str, int]  # number of Gaussians shown by "none" or by "one" of the input views; empty: not known
     support: bytes | None  # number of views that show each packed Gaussian, see :func:`pack_support`; None: not known
     new_gain: tuple[float, float] | None = None  # bounds of the expected gain of new views, dB; None: not known
 
@@ -79,11 +79,11 @@ class PageView:
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
     outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None for held-out views
-    outside: bool = False  # true: a camera without a photo and without scores
+    outside: bool = False  # True for the outside view, which has neither a photo nor scores
     drops: tuple[bytes | None, ...] = ()  # PNG, one for each side: Gaussians that ``--drop`` would remove, coloured
     seen: tuple[bytes | None, ...] = ()  # PNG, one for each side: Gaussians that none or one of the input views shows
     maps: tuple[bytes | None, ...] = ()  # WebP, one for each side: see :mod:`gsmerge.measure.error_maps`
-    faded: tuple[bytes | None, ...] = ()  # stills of the outside view in which Gaussians that no view shows are faint
+    faded: tuple[bytes | None, ...] = ()  # outside view only: stills with faint Gaussians where no view shows them
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,13 @@ class ViewData:
 
     title: str  # name of the scene
     sides: tuple[Side, ...]  # the scene itself, then its results
-    views: tuple[PageView, ...]  # by the scores of the first result, or else of the scene, the worst view first
+    views: tuple[PageView, ...]  # the worst first, by the scores of the first result, or of the scene without results
     outside: PageView  # the view from outside the capture
-    num_views: int  # number of measured views, which may be larger than that of `views`
-    reference: str  # words for the pictures that scores compare with
+    num_views: int  # number of measured views; `views` may have fewer
+    reference: str  # words for the pictures against which scores are measured
     notes: tuple[str, ...]  # warnings and limits, one sentence each
     num_superpixels: tuple[int, int] | None = None  # least and largest number in a photo; None without outlines
-    lacks_pixels: bool = False  # true: the scene itself does not cover all pixels of the input views
+    lacks_pixels: bool = False  # if True, the scene itself does not cover all pixels of the input views
     agreement: Agreement | None = None  # share of the depth that other views confirm; None: not known
 
     @property
@@ -110,7 +110,7 @@ class ViewData:
     def start(self) -> int:
         """Index of the view with which the page opens: the view with the median score, or the first without scores.
 
-        Held-out views are preferred, as in the figures at the top, and views with LPIPS.
+        Held-out views are preferred, as in the figures at the top; among them, views with LPIPS.
         """
         views = list(enumerate(self.views))
         held_out = [(i, view) for i, view in views if view.held_out] or views
@@ -164,10 +164,10 @@ def collect(
 def still_keeper(stills: Stills) -> OnImage:
     """Make a function for ``on_image`` of :func:`gsmerge.evaluate` that adds the drawings to ``stills``."""
 
-    def keep(result: str, split: str, view: int, image: np.ndarray) -> None:
+    def add_still(result: str, split: str, view: int, image: np.ndarray) -> None:
         stills[result, split, view] = encode_still(to_picture(image))
 
-    return keep
+    return add_still
 
 
 def page_data(
@@ -184,56 +184,69 @@ def page_data(
 ) -> ViewData:
     """Make the content of a page from an evaluation and its stills; see :func:`collect`."""
     pictures = photo_array(evaluation.pictures)
-    splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
-    splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
     canonical = {name: frame.enter(gaussians) for name, gaussians in named.items()}
-    own_cameras = frame.enter_cameras(scene.cameras.numpy())
+    scene_cameras = frame.enter_cameras(scene.cameras.numpy())
     inspected = [name for name in named if name != INPUT or not results]
     photos = pictures if len(pictures) else None
     marks = {name: Marks() for name in named} | {
-        name: find_marks(canonical[name], own_cameras, photos, own=name == INPUT and scene.has_own_pixels)
+        name: find_marks(canonical[name], scene_cameras, photos, own=name == INPUT and scene.has_own_pixels)
         for name in inspected
     }
-    split, near = "context" if held_out is None else "target", near_plane(scene) / frame.unit
+    split = "context" if held_out is None else "target"
     sides = [
-        _side(result, size, split, canonical[result.name], marks[result.name], scene, own_cameras, light=light)
+        _side(result, size, split, canonical[result.name], marks[result.name], scene, scene_cameras, light=light)
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
-    means = canonical[evaluation.results[:2][-1].name].means
-    views = _page_views(splits, evaluation, stills, frame, means)
+    means = canonical[evaluation.results[:2][-1].name].means  # of the first result, or of the scene without results
+    views = _page_views(_split_views(scene, pictures, held_out), evaluation, stills, frame, means)
     shown, num_superpixels = with_outlines(_shown(views), pictures)
-    moved = {name: frame.enter_cameras(own.numpy()) for name, own in (cameras or {}).items()}
+    moved = {name: frame.enter_cameras(result_cameras.numpy()) for name, result_cameras in (cameras or {}).items()}
     references = {
-        name: make_reference(canonical[name], Views(moved.get(name, own_cameras), pictures, scene.names), scene.masks)
+        name: make_reference(canonical[name], Views(moved.get(name, scene_cameras), pictures, scene.names), scene.masks)
         for name in (inspected if len(pictures) > 1 else ())
     }
-    splats = {name: make_splats(canonical[name]) for name in inspected}
     shown = tuple(replace(view, maps=tuple(_map(references.get(name), view) for name in named)) for view in shown)
-    *drawn, outside = (
+    splats, near = {name: make_splats(canonical[name]) for name in inspected}, near_plane(scene) / frame.unit
+    *marked, outside = (
         _with_marks(view, splats, marks, near) for view in (*shown, _outside_view(scene, named, frame, len(views)))
     )
-    faint = (marks[name].fade(gaussians) for name, gaussians in canonical.items())
-    faded = (None if g is None else render(g, outside.camera, near=near).images[0] for g in faint)
-    outside = replace(outside, faded=tuple(None if one is None else encode_still(to_picture(one)) for one in faded))
-    measured = evaluation.notes if results else ()  # they concern results
-    notes = (*measured, *_limits(sides, len(shown), len(views)))
-    share, _ = evaluation.results[0].mean_covered("context")
-    lacks_pixels = share is not None and share < WHOLE
+    faded = tuple(_fade(canonical[name], marks[name], outside.camera, near) for name in named)
+    measured_notes = evaluation.notes if results else ()  # they concern results
+    notes = (*measured_notes, *_limits(sides, len(shown), len(views)))
+    covered_share, _ = evaluation.results[0].mean_covered("context")
+    lacks_pixels = covered_share is not None and covered_share < WHOLE
+    agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
     return ViewData(
-        title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
-        lacks_pixels, confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=own_cameras)),
+        title, tuple(sides), tuple(marked), replace(outside, faded=faded), len(views), evaluation.reference, notes,
+        num_superpixels, lacks_pixels, agreement,
     )  # fmt: skip
+
+
+def _split_views(
+    scene: Scene, pictures: np.ndarray, held_out: Views | None
+) -> dict[str, tuple[Cameras, np.ndarray, Sequence[str]]]:
+    """Return cameras in the world, photos and names of the views by split."""
+    splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
+    if held_out is not None:
+        splits["target"] = (held_out.cameras.numpy(), held_out.images, held_out.names)
+    return splits
+
+
+def _fade(gaussians: Gaussians, marks: Marks, camera: Cameras, near: float) -> bytes | None:
+    """Draw canonical Gaussians, faint where no view shows them; None if views show all."""
+    faint = marks.fade(gaussians)
+    return None if faint is None else encode_still(to_picture(render(faint, camera, near=near).images[0]))
 
 
 def _with_marks(view: PageView, splats: Mapping[str, Splats], marks: Mapping[str, Marks], near: float) -> PageView:
     """Add to a view the pictures of the marked Gaussians of each side."""
-    drawn = [
-        draw_marks(splats[name], marked, view.camera, near) if name in splats else (None, None)
-        for name, marked in marks.items()
+    pictures = [
+        draw_marks(splats[name], side_marks, view.camera, near) if name in splats else (None, None)
+        for name, side_marks in marks.items()
     ]
-    drops, seen = zip(*drawn, strict=True)
+    drops, seen = zip(*pictures, strict=True)
     return replace(view, drops=drops, seen=seen)
 
 
@@ -244,15 +257,15 @@ def _page_views(
     frame: Frame,
     means: np.ndarray,
 ) -> list[PageView]:
-    """List the measured views of ``splits`` (cameras in the world, photos, names); ``means [n,3]`` are canonical."""
+    """List the measured views of the splits, see :func:`_split_views`; ``means [n,3]`` are canonical."""
     views: list[PageView] = []
-    for split, (places, photos, names) in splits.items():
+    for split, (cameras, photos, names) in splits.items():
         if split not in evaluation.num_views:  # only held-out views were measured
             continue
         encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
         encoded = encoded or [None] * len(names)
         for i, name in enumerate(short_names(names)):
-            camera = frame.enter_cameras(places[[i]])
+            camera = frame.enter_cameras(cameras[[i]])
             views.append(PageView(
                 name=name,
                 place=len(views),
@@ -285,13 +298,13 @@ def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, pl
 
 def with_outlines(views: Sequence[PageView], photos: np.ndarray) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
     """Add outlines of superpixels to the input views with photos; also return their least and largest number."""
-    places = [i for i, view in enumerate(views) if view.photo and not view.held_out]
-    if not places:
+    ids = [i for i, view in enumerate(views) if view.photo and not view.held_out]
+    if not ids:
         return tuple(views), None
-    pictures = photos[[views[i].place for i in places]]
+    pictures = photos[[views[i].place for i in ids]]
     groups = segment(pictures, SegmentOptions())
     outlined = list(views)
-    for i, picture, labels in zip(places, pictures, groups.labels, strict=True):
+    for i, picture, labels in zip(ids, pictures, groups.labels, strict=True):
         outlined[i] = replace(views[i], outlines=encode_outlines(picture, labels))
     return tuple(outlined), (min(groups.counts), max(groups.counts))
 
@@ -310,16 +323,16 @@ def encode_still(picture: Picture) -> bytes:
 def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     """Encode the borders of superpixels ``[h,w]`` as an enlarged, transparent PNG.
 
-    Each border has the mean colour of its superpixel in ``photo [h,w,3]``, slightly lighter or, for light colours,
-    darker.
+    A border has the mean colour of its superpixel in ``photo [h,w,3]``, made lighter, or darker if it is light.
     """
     means = mean_colors(photo, labels)
     light = means.mean(1, keepdims=True) > 0.5
     shifted = means + OUTLINE_SHIFT * (np.where(light, 0.0, 1.0) - means)
     levels = np.round((OUTLINE_LEVELS - 1) * shifted) * (255 // (OUTLINE_LEVELS - 1))
-    colors, places = np.unique(levels.astype(np.uint8), axis=0, return_inverse=True)
-    drawn = draw_borders(labels, 1 + places.reshape(-1).astype(np.uint8), max(1, OUTLINE_SIDE // max(labels.shape)))
-    return encode_indexed(drawn, np.pad(colors, ((1, 0), (0, 0))))
+    colors, color_ids = np.unique(levels.astype(np.uint8), axis=0, return_inverse=True)
+    factor = max(1, OUTLINE_SIDE // max(labels.shape))
+    drawn = draw_borders(labels, 1 + color_ids.reshape(-1).astype(np.uint8), factor)
+    return encode_indexed(drawn, np.pad(colors, ((1, 0), (0, 0))))  # index 0 is transparent
 
 
 def _map(reference: ErrorReference | None, view: PageView) -> bytes | None:

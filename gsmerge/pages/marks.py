@@ -17,23 +17,23 @@ from gsmerge.types import Cameras, Gaussians
 Color = tuple[int, int, int]  # sRGB
 DROPS: Mapping[str, Color] = {"floaters": (255, 45, 150), "sky": (20, 170, 255)}
 SEEN: Mapping[str, Color] = {"none": TINTS[0], "one": TINTS[1]}  # by the number of views that show a Gaussian
-MAX_SUPPORT = 2  # numbers of views from here on are not distinguished
-FAINT = 0.1  # factor on the opacity of Gaussians that no view shows, where these fade
+MAX_SUPPORT = 2  # larger numbers of views are stored as this number
+FAINT = 0.1  # factor on the opacity of faded Gaussians, which no view shows
 MAX_MARKED = 300_000  # Gaussians; finding the floaters among more takes seconds
-VISIBLE = 0.15  # least share of a pixel's light that is drawn
-STEPS, MAX_ALPHA = 8, 190  # number of shares that have different opacities, and the opacity of the whole light
+VISIBLE = 0.15  # marked Gaussians are drawn in pixels in which they have at least this share of the light
+STEPS, MAX_ALPHA = 8, 190  # number of different opacities of marks, and the largest one, for a share of 1
 
 
 @dataclass(frozen=True, eq=False)
 class Marks:
     """Marks of the n Gaussians of one side of a page."""
 
-    drops: Mapping[str, np.ndarray] = field(default_factory=dict)  # [n] bool, removed by ``--drop``, by its words
+    drops: Mapping[str, np.ndarray] = field(default_factory=dict)  # by word of ``--drop``: [n] bool, it would remove
     support: np.ndarray | None = None  # [n] uint8, number of views that show each, at most 2; None: not known
 
     @property
     def seen(self) -> dict[str, np.ndarray]:
-        """Masks ``[n]`` of the Gaussians that no view and that one view shows, without empty masks."""
+        """Masks ``[n]`` of the Gaussians that "none" or "one" of the views shows, without empty masks."""
         if self.support is None:
             return {}
         masks = {word: self.support == number for number, word in enumerate(SEEN)}
@@ -63,7 +63,7 @@ def find_marks(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None
 
 
 def draw_marks(splats: Splats, marks: Marks, camera: Cameras, near: float) -> tuple[bytes | None, bytes | None]:
-    """Draw the marked ones of canonical ``splats`` in one view: those of ``drops``, and those of ``seen``."""
+    """Draw marked Gaussians of canonical ``splats`` in one view: PNGs of ``marks.drops`` and of ``marks.seen``."""
     if not (marks.drops or marks.seen):
         return None, None
     viewmat, K = camera.viewmats[0], camera.Ks[0]
@@ -82,7 +82,8 @@ def draw_masks(tiled: TiledView, masks: Mapping[str, np.ndarray], colors: Mappin
     if not flags[tiled.ids].any():
         return None
     first, second, _ = np.moveaxis(composite(tiled, flags)[0], 2, 0)
-    most = np.maximum(first, second)
-    ids = np.where(most >= VISIBLE, STEPS * (second > first) + np.ceil(STEPS * most.clip(0, 1)), 0).astype(np.uint8)
+    share = np.maximum(first, second)
+    # 0: transparent; 1 to STEPS: opacities of the first colour; then opacities of the second colour
+    ids = np.where(share >= VISIBLE, STEPS * (second > first) + np.ceil(STEPS * share.clip(0, 1)), 0).astype(np.uint8)
     tints = [(*color, MAX_ALPHA * step // STEPS) for color in colors.values() for step in range(1, STEPS + 1)]
     return encode_indexed(ids, np.array([(0, 0, 0, 0), *tints], np.uint8)) if ids.any() else None

@@ -12,13 +12,13 @@ from torch.autograd.function import once_differentiable
 
 from gsmerge.kernels.raster.project import add_rows
 from gsmerge.raster.composite import Rendering, draw_views, prepare_views, view_colors
-from gsmerge.raster.gradient import ColorGradients, color_gradients, gradients_of, pose_gradient
+from gsmerge.raster.gradient import ColorGradients, Gradients, color_gradients, gradients_of, pose_gradient
 from gsmerge.raster.tiled_view import Array, TiledView, tile_view
 from gsmerge.types import Cameras, Gaussians
 
 
 class _Render(torch.autograd.Function):
-    """Images and alphas (and depths, without gradient) from the tensors of Gaussians and view matrices."""
+    """Render images, alphas and optional depths (without gradient) from tensors of Gaussians and view matrices."""
 
     @staticmethod
     def forward(
@@ -26,16 +26,16 @@ class _Render(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         cameras = replace(cameras, viewmats=tensors[-1])
         splats, viewmats, Ks = prepare_views(Gaussians(*tensors[:-1]), cameras)
-        tiled: dict[int, TiledView] = {}
+        tiled_views: dict[int, TiledView] = {}
 
         def tile_one(view: int) -> TiledView:
-            tiled[view] = tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
-            return tiled[view]
+            tiled_views[view] = tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
+            return tiled_views[view]
 
         drawn = draw_views(tile_one, (len(cameras), cameras.height, cameras.width), background, with_depths)
-        ctx.views = tiled
+        ctx.views = tiled_views
         images, alphas = torch.from_numpy(drawn.images), torch.from_numpy(drawn.alphas)
-        # saved through autograd, so that it notices if one of them is overwritten before the backward pass
+        # Save tensors through autograd, which notices if one of them is overwritten before the backward pass
         ctx.save_for_backward(*tensors, images, alphas)
         if drawn.depths is None:
             return images, alphas
@@ -47,35 +47,42 @@ class _Render(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_images: Tensor, grad_alphas: Tensor, *_: Tensor) -> tuple[Any, ...]:
         *tensors, images, alphas = ctx.saved_tensors
-        lefts = 1 - alphas[..., 0]
+        transmittances = 1 - alphas[..., 0]
         totals = [np.zeros(tensor.shape, np.float32) for tensor in tensors[:-1]]
-        poses = np.zeros(tensors[-1].shape)
+        viewmat_grads = np.zeros(tensors[-1].shape)
+        with_viewmat = ctx.needs_input_grad[-1]
         color_grads: ColorGradients | None = None
         for view, tiled in sorted(ctx.views.items()):
-            image, left, grad_image, grad_alpha = (
+            image, transmittance, grad_image, grad_alpha = (
                 np.ascontiguousarray(tensor.numpy())
-                for tensor in (images[view], lefts[view], grad_images[view], grad_alphas[view, ..., 0])
+                for tensor in (images[view], transmittances[view], grad_images[view], grad_alphas[view, ..., 0])
             )
-            colors, with_pose = view_colors(tiled), ctx.needs_input_grad[-1]
-            shape = gradients_of(tiled, colors, image, left, grad_image, -grad_alpha, with_pose)
-            color_grads = color_gradients(tiled, shape.colors, colors, used=color_grads)
-            rows = [
-                shape.means + color_grads.means,
-                shape.quats,
-                shape.scales,
-                shape.opacities,
-                color_grads.sh0,
-                color_grads.shN,
-            ]
-            for total, row in zip(totals, rows, strict=True):
-                add_rows(tiled.ids, row.reshape(len(row), total[:1].size), total.reshape(len(total), total[:1].size))
-            if with_pose:
-                poses[view] = pose_gradient(tiled, shape, color_grads)
+            colors = view_colors(tiled)
+            grads = gradients_of(tiled, colors, image, transmittance, grad_image, -grad_alpha, with_viewmat)
+            color_grads = color_gradients(tiled, grads.colors, colors, used=color_grads)
+            _add_view(totals, grads, color_grads)
+            if with_viewmat:
+                viewmat_grads[view] = pose_gradient(tiled, grads, color_grads)
         gradients = [
             torch.from_numpy(total).to(tensor.dtype) if needed else None
-            for total, tensor, needed in zip([*totals, poses], tensors, ctx.needs_input_grad[4:], strict=True)
+            for total, tensor, needed in zip([*totals, viewmat_grads], tensors, ctx.needs_input_grad[4:], strict=True)
         ]
         return None, None, None, None, *gradients
+
+
+def _add_view(totals: list[Array], grads: Gradients, color_grads: ColorGradients) -> None:
+    """Add the gradients of one view to ``totals``, the gradients of all Gaussians in the order of their fields."""
+    columns = [
+        grads.means + color_grads.means,
+        grads.quats,
+        grads.scales,
+        grads.opacities,
+        color_grads.sh0,
+        color_grads.shN,
+    ]
+    for total, column in zip(totals, columns, strict=True):
+        width = total[:1].size
+        add_rows(grads.ids, column.reshape(len(column), width), total.reshape(len(total), width))
 
 
 def render_tensors(

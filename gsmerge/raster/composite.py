@@ -17,8 +17,8 @@ from gsmerge.raster.tiled_view import Array, Splats, TiledView, make_splats, pie
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras, Gaussians
 
-TINY = 1e-6  # least opacity that blended depths are divided by
-SHOWN = 4  # number of views that a notebook shows of a rendering
+MIN_OPACITY = 1e-6  # blended depths are divided by the opacity of their pixel, or by this if it is smaller
+NOTEBOOK_VIEWS = 4  # number of a rendering's views that a notebook shows
 
 
 def background_color(background: ArrayLike) -> Array:
@@ -45,11 +45,11 @@ def blend(tiled: TiledView, colors: Array, background: Array) -> tuple[Array, Ar
     image = np.empty((tiled.height, tiled.width, 3), np.float32)
     transmittance = np.empty((tiled.height, tiled.width), np.float32)
 
-    def tiles(span: tuple[int, int]) -> None:
+    def blend_tiles(span: tuple[int, int]) -> None:
         kernels.blend(*tiled.lists, colors, *span, tiled.top, background, image, transmittance)
 
     with use_threads() as threads:
-        parallel_map(tiles, tile_ranges(tiled, threads))
+        parallel_map(blend_tiles, tile_ranges(tiled, threads))
     return image, transmittance
 
 
@@ -63,16 +63,16 @@ def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Arr
 
     Depths of Gaussians are clipped at ``farthest``.
     """
-    blended, left = blend(tiled, depth_colors(tiled, farthest), np.zeros(3, np.float32))
-    return blended[..., 0] / np.maximum(1 - left, np.float32(TINY)), left
+    blended, transmittance = blend(tiled, depth_colors(tiled, farthest), np.zeros(3, np.float32))
+    return blended[..., 0] / np.maximum(1 - transmittance, np.float32(MIN_OPACITY)), transmittance
 
 
 def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
     """Blend the Gaussians of a view front to back into an image.
 
-    ``colors [n,3]`` of all Gaussians may have any sign. By default they are the spherical harmonics as seen from this
-    view, clipped at 0. ``background`` has 1 or 3 numbers. Returns the image ``[h,w,3]`` and the remaining transmittance
-    ``[h,w]``, float32. Raises ValueError for other shapes.
+    ``colors [n,3]`` of all Gaussians may be negative. By default the spherical harmonics are evaluated for this view,
+    and their colours are clipped at 0. ``background`` has 1 or 3 numbers. Returns the image ``[h,w,3]`` and the
+    remaining transmittance ``[h,w]``, float32. Raises ValueError for other shapes.
     """
     if colors is None:
         return blend(tiled, view_colors(tiled), background_color(background))
@@ -82,24 +82,24 @@ def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLi
 
 
 def splat_adjoint(tiled: TiledView, image: Array) -> Array:
-    """Sum blending weight times ``image [h,w,c]`` over the pixels, for each Gaussian: ``[n,c]`` float32.
+    """Sum, for each Gaussian, its blending weights times ``image [h,w,c]`` over the pixels; return ``[n,c]`` float32.
 
     This map is the transpose of :func:`composite` (without background), which maps colours linearly to images. Four
-    channels cost little more than one. Raises ValueError if the image has another size than the view.
+    channels cost little more than one. Raises ValueError unless the image has the size of the view.
     """
     if image.ndim != 3 or image.shape[:2] != (tiled.height, tiled.width):
         raise ValueError(f"image: expected shape {[tiled.height, tiled.width, 'c']}, got {list(image.shape)}")
     sums = np.zeros((len(tiled.splats), image.shape[2]), np.float32)
     slots = np.empty((len(tiled.flatten_ids), kernels.CHANNELS), np.float32)
 
-    def tiles(span: tuple[int, int]) -> None:
-        kernels.weighted_sums(*tiled.lists, *span, part, slots)
+    def sum_tiles(span: tuple[int, int]) -> None:
+        kernels.weighted_sums(*tiled.lists, *span, channels, slots)
 
     with use_threads() as threads:
-        for first in range(0, image.shape[2], kernels.CHANNELS):
-            part = np.ascontiguousarray(image[..., first : first + kernels.CHANNELS], np.float32)
-            parallel_map(tiles, tile_ranges(tiled, threads))
-            kernels.add_slots(tiled.flatten_ids, slots, tiled.ids, first, sums)
+        for channel in range(0, image.shape[2], kernels.CHANNELS):
+            channels = np.ascontiguousarray(image[..., channel : channel + kernels.CHANNELS], np.float32)
+            parallel_map(sum_tiles, tile_ranges(tiled, threads))
+            kernels.add_slots(tiled.flatten_ids, slots, tiled.ids, channel, sums)
     return sums
 
 
@@ -151,7 +151,7 @@ class Rendering:
         """Encode the first views, side by side, as the picture that a notebook shows."""
         if len(self.images) == 0:
             return None
-        row = np.concatenate(list(as_array(self.images[:SHOWN])), 1)[..., ::-1]
+        row = np.concatenate(list(as_array(self.images[:NOTEBOOK_VIEWS])), 1)[..., ::-1]
         return cv2.imencode(".png", (row.clip(0, 1) * 255).round().astype(np.uint8))[1].tobytes()
 
 
@@ -170,18 +170,18 @@ def draw_views(
     shape: tuple[int, int, int],
     background: AnyArray,
     with_depths: bool,
-    first: int = 0,
+    first_view: int = 0,
 ) -> Rendering:
-    """Tile and draw all views, numbered from ``first``; ``shape`` is (views, height, width)."""
+    """Tile and draw all views, numbered from ``first_view``; ``shape`` is (views, height, width)."""
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
     depths = np.empty((*shape, 1), np.float32) if with_depths else None
 
-    def one(view: int) -> None:
-        tiled = tile_one(first + view)
+    def draw_view(view: int) -> None:
+        tiled = tile_one(first_view + view)
         images[view], transmittance = blend(tiled, view_colors(tiled), background)
         alphas[view, ..., 0] = 1 - transmittance
         if depths is not None:
             depths[view, ..., 0] = blend_depths(tiled)[0]
 
-    parallel_map(one, range(shape[0]))  # if there is a single view, its pieces use the pool
+    parallel_map(draw_view, range(shape[0]))  # if there is a single view, its pieces use the pool
     return Rendering(images, alphas, depths)

@@ -17,7 +17,7 @@ from gsmerge.kernels.raster.project import BLOCK, POSE, SUMS, project_backward
 from gsmerge.raster.tiled_view import Array, TiledView, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
-# Least number of intersections or Gaussians for another thread; less than in the forward pass, which is faster per item
+# Least number of intersections or Gaussians per thread. It is higher in the forward pass, which is faster per item
 MIN_PER_THREAD = 1 << 12
 
 
@@ -26,7 +26,7 @@ class Gradients:
     """Gradients of a loss with respect to the Gaussians of a view."""
 
     ids: Array  # [m] int32, ascending: the Gaussians of the rows; all other Gaussians have a gradient of zero
-    means: Array  # [m,3] float32, through geometry only; see color_gradients for the part through the viewing direction
+    means: Array  # [m,3] float32, through geometry only; color_gradients adds the part through the viewing direction
     quats: Array  # [m,4] float32, with respect to the quaternions as stored, which may have any length
     scales: Array  # [m,3] float32, with respect to linear scales
     opacities: Array  # [m] float32
@@ -34,7 +34,7 @@ class Gradients:
     viewmat: Array | None  # [4,4] float64, last row 0; None if not requested
 
     def __getitem__(self, rows: Array) -> Gradients:
-        """Return the gradients of the Gaussians ``rows`` (mask or indices), with that of the whole view matrix."""
+        """Select the gradients of the Gaussians ``rows`` (mask or indices); the gradient of the view matrix stays."""
         names = ("ids", "means", "quats", "scales", "opacities", "colors")
         return replace(self, **{name: np.ascontiguousarray(getattr(self, name)[rows]) for name in names})
 
@@ -70,8 +70,9 @@ def gradients_of(
 
     All arrays are float32 and contiguous. ``image [h,w,3]``, with its background, and ``transmittance [h,w]`` are the
     results of ``composite``. ``colors [m,3]`` are the colours of the view's Gaussians. ``grad_image [h,w,3]`` and
-    ``grad_left [h,w]`` (None: zero) are the gradients of the loss with respect to image and transmittance. Where alpha
-    is clamped at 0.99 its gradient is zero. Thresholds that decide whether a Gaussian is drawn have no gradient.
+    ``grad_left [h,w]`` (None: zero) are the gradients of the loss with respect to image and transmittance. The
+    gradient of alpha is zero where alpha is clamped at 0.99. Thresholds that decide whether a Gaussian is drawn have no
+    gradient.
     """
     m, splats = len(tiled.ids), tiled.splats
     slots = np.empty((len(tiled.flatten_ids), SUMS), np.float32)
@@ -81,7 +82,7 @@ def gradients_of(
     num_blocks = -(-m // BLOCK)
     poses = np.empty((num_blocks, POSE), np.float32) if with_viewmat else None
 
-    def tiles(span: tuple[int, int]) -> None:
+    def blend_tiles(span: tuple[int, int]) -> None:
         blend_backward(*tiled.lists, colors, *span, image, transmittance, grad_image, grad_left, slots)
 
     def project(span: tuple[int, int]) -> None:
@@ -93,21 +94,16 @@ def gradients_of(
         color_sums[slice(*span)] = sums[slice(*span), :3]
 
     with use_threads() as threads:
-        parallel_map(tiles, tile_ranges(tiled, threads, MIN_PER_THREAD))
+        parallel_map(blend_tiles, tile_ranges(tiled, threads, MIN_PER_THREAD))
         parallel_map(project, _blocks(m, threads))
-    viewmat = None
-    if poses is not None:
-        pose = poses.sum(0, dtype=np.float64)
-        viewmat = np.zeros((4, 4))
-        viewmat[:3, 3] = pose[9:]
-        viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], splats.origin)
+    viewmat = None if poses is None else viewmat_gradient(poses, splats.origin)
     return Gradients(tiled.ids, means, quats, scales, opacities, color_sums, viewmat)
 
 
 def viewmat_gradient(poses: Array, origin: Array) -> Array:
     """Sum the gradients ``[blocks,POSE]`` of :func:`project_backward` to the gradient ``[4,4]`` float64 of the viewmat.
 
-    ``origin [3]`` is that of the splats.
+    ``origin [3]`` is the origin of the splats.
     """
     pose, viewmat = poses.sum(0, dtype=np.float64), np.zeros((4, 4))
     viewmat[:3, 3] = pose[9:]
@@ -121,9 +117,9 @@ def color_gradients(
     """Return the gradients of a loss through the spherical harmonics of the Gaussians of a view.
 
     ``grad_colors [m,3]`` are :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours; no gradient passes
-    where they are clipped at 0. ``used`` is a result that is no longer needed. Its memory is reused if it has as many
-    coefficients and enough rows, since new memory costs a quarter of the time or more. The gradient of the eye is minus
-    the sum of the gradients of the means.
+    where they are clipped at 0. ``used`` is a result that is no longer needed. Its memory is reused if it has the same
+    number of coefficients and enough rows, since new memory costs a quarter of the time or more. The gradient
+    of the eye is minus the sum of the gradients of the means.
     """
     m, splats = len(tiled.ids), tiled.splats
     rest = splats.shN.shape[1:]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from threading import Lock
 from typing import Any
 
@@ -26,8 +27,8 @@ from gsmerge.raster.tiled_view import FAR_PLANE, TiledView, make_splats, tile_vi
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
-ONE_AT_A_TIME = 4_000_000  # above so many Gaussians views are tiled one at a time, since a tiled view is as large
-BAND_PIXELS = 1 << 22  # pixels of an image that are in memory as floating-point numbers; larger images take bands
+ONE_AT_A_TIME = 4_000_000  # Gaussians; larger scenes tile one view at a time, since a tiled view takes as much memory
+BAND_PIXELS = 1 << 22  # largest number of pixels drawn at once; larger images are drawn in bands to save memory
 MIN_ALPHA = 0.5  # least opacity of a pixel that counts when superpixels are merged
 
 
@@ -76,7 +77,7 @@ def render(
         >>> gsmerge.render(scene.gaussians, scene.cameras, background=1.0).images.shape
         (5, 32, 48, 3)
     """
-    under = background_color(background.detach().cpu() if hasattr(background, "detach") else background)
+    background_rgb = background_color(background.detach().cpu() if hasattr(background, "detach") else background)
     options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}
     values = (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)
     tensors = [value for value in values if not isinstance(value, np.ndarray)]
@@ -85,14 +86,14 @@ def render(
     if tensors and _needs_gradient(gaussians, cameras):
         from gsmerge.raster.autograd import render_tensors  # here because only training needs it
 
-        drawn = render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
+        drawn = render_tensors(gaussians, cameras, background_rgb, with_depths=with_depths, **options)
     else:
         tile_one = _tiler(gaussians, cameras, options)
-        drawn = draw_views(tile_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
+        drawn = draw_views(tile_one, (len(cameras), cameras.height, cameras.width), background_rgb, with_depths)
     if not tensors:
         return drawn
-    parts: list[Any] = [None if part is None else like(part, tensors[0]) for part in vars(drawn).values()]
-    return Rendering(*parts)
+    outputs: list[Any] = [None if array is None else like(array, tensors[0]) for array in vars(drawn).values()]
+    return Rendering(*outputs)
 
 
 def render_in_batches(
@@ -108,22 +109,23 @@ def render_in_batches(
     """Yield the images ``[h,w,3]`` of :func:`render`, equal to the bit, each after ``convert``.
 
     At most ``at_once`` images are in memory. Large images are drawn and converted in bands, so ``convert`` has to work
-    pixel by pixel. ``columns`` are for each image the first and last + 1 column of pixels to draw; other tiles may have
-    the background only.
+    pixel by pixel. ``columns`` gives, for each image, the first and last + 1 column of pixels to draw. Tiles outside
+    these columns may show the background only.
     """
-    under = background_color(background)
+    background_rgb = background_color(background)
     tile_one = _tiler(gaussians, cameras, {"near": near}, columns)
     lines, band_lines = -(-cameras.height // TILE), max(1, BAND_PIXELS // (cameras.width * TILE))
     if lines > band_lines:
-        bands = [(first, min(first + band_lines, lines)) for first in range(0, lines, band_lines)]
+        bands = [(first_line, min(first_line + band_lines, lines)) for first_line in range(0, lines, band_lines)]
         for view in range(len(cameras)):
-            parts = (tile_one(view, band) for band in bands)
-            yield np.concatenate([convert(blend(part, view_colors(part), under)[0]) for part in parts])
+            tiled_bands = (tile_one(view, band) for band in bands)
+            yield np.concatenate([convert(blend(t, view_colors(t), background_rgb)[0]) for t in tiled_bands])
         return
-    for first in range(0, len(cameras), at_once):
-        count = min(at_once, len(cameras) - first)
+    for first_view in range(0, len(cameras), at_once):
+        count = min(at_once, len(cameras) - first_view)
         shape = count, cameras.height, cameras.width
-        yield from map(convert, draw_views(tile_one, shape, under, with_depths=False, first=first).images)
+        drawn = draw_views(tile_one, shape, background_rgb, with_depths=False, first_view=first_view)
+        yield from map(convert, drawn.images)
 
 
 def _tiler(
@@ -141,16 +143,16 @@ def _tiler(
 
 
 def seen_weights(scene: Scene) -> np.ndarray:
-    """Measure each Gaussian's largest summed blending weight in one view, ``[n]`` float32, pixels."""
-    most, lock = np.zeros(len(scene.gaussians), np.float32), Lock()
+    """Sum each Gaussian's blending weights in every view, and return the largest sum ``[n]`` float32, pixels."""
+    largest, lock = np.zeros(len(scene.gaussians), np.float32), Lock()
 
-    def one_view(_: int, tiled: TiledView) -> None:
+    def raise_largest(_: int, tiled: TiledView) -> None:
         sums, _peaks = contributions(tiled)
         with lock:
-            np.maximum(most, sums, out=most)
+            np.maximum(largest, sums, out=largest)
 
-    tile_views(scene, one_view)
-    return most
+    tile_views(scene, raise_largest)
+    return largest
 
 
 def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Sequence[int] | None = None) -> None:
@@ -161,11 +163,11 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Seque
     def one_view(view: int) -> None:
         use(view, tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR_PLANE))
 
-    ids = range(len(scene)) if views is None else views
+    view_ids = range(len(scene)) if views is None else views
     if len(splats) <= ONE_AT_A_TIME:
-        parallel_map(one_view, ids)
+        parallel_map(one_view, view_ids)
         return
-    for view in ids:
+    for view in view_ids:
         one_view(view)
 
 
@@ -177,7 +179,7 @@ def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def thin_out(gaussians: Gaussians, count: int) -> Gaussians:
-    """Sample every k-th Gaussian, at most ``count``, enlarged so that their total area is about that of all."""
+    """Sample every k-th Gaussian, at most ``count``, and enlarge the samples to about the area of all together."""
     step = max(1, -(-len(gaussians) // count))
-    some = gaussians[::step]
-    return Gaussians(some.means, some.quats, some.scales * math.sqrt(step), some.opacities, some.sh0, some.shN)
+    sample = gaussians[::step]
+    return replace(sample, scales=sample.scales * math.sqrt(step))

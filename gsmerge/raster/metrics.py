@@ -11,9 +11,9 @@ from gsmerge.kernels.pictures import blur
 WINDOW, SIGMA = 11, 1.5  # side of the windows of SSIM and their standard deviation, pixels
 C1, C2 = 0.01**2, 0.03**2  # stabilisers of SSIM (K1 = .01, K2 = .03) for a data range of 1
 MAX_LOSS = 0.5  # dB of PSNR that a result may lose against its input without a warning
-WORSE = "worse than the input does"  # words of the warning, by which commands tell it from notes
+WORSE = "worse than the input does"  # commands recognise the warning among the notes by these words
 MAX_PSNR = 120.0  # dB that replace the infinite PSNR of equal pictures
-POOR = 30.0  # dB of PSNR between the views of a result and its input, below which they look different
+POOR = 30.0  # dB of PSNR between a result and its input; below it their views look different
 
 
 def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
@@ -26,22 +26,22 @@ def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
 
 def pixel_mask(mask: Array, image: Array) -> Array:
     """Convert a mask to ``[h,w]`` bool; raise ValueError if it is empty or has another size than the image."""
-    chosen = as_array(mask).astype(bool)
-    if chosen.ndim == 3 and chosen.shape[2] == 1:
-        chosen = chosen[..., 0]
-    if chosen.shape != image.shape[:2]:
-        raise ValueError(f"mask: expected shape {list(image.shape[:2])}, got {list(chosen.shape)}")
-    if not chosen.any():
+    selected = as_array(mask).astype(bool)
+    if selected.ndim == 3 and selected.shape[2] == 1:
+        selected = selected[..., 0]
+    if selected.shape != image.shape[:2]:
+        raise ValueError(f"mask: expected shape {list(image.shape[:2])}, got {list(selected.shape)}")
+    if not selected.any():
         raise ValueError("mask: expected at least one pixel, got none")
-    return chosen
+    return selected
 
 
 def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
     """Return the PSNR (dB) of images ``[h,w,c]`` in [0, 1], within ``mask [h,w]`` if given."""
     first, second = image_pair(image, reference)
     if mask is not None:  # before the conversion, since a whole photo in float64 takes much memory
-        chosen = pixel_mask(mask, first)
-        first, second = first[chosen], second[chosen]
+        selected = pixel_mask(mask, first)
+        first, second = first[selected], second[selected]
     errors = np.subtract(first, second, dtype=np.float64)
     error = float(np.square(errors, out=errors).mean())
     return -10 * float(log10(error)) if error > 0 else float("inf")
@@ -58,7 +58,7 @@ def psnr_words(psnr: float) -> str:
 
 
 def describe_loss(name: str, before: float | None, after: float | None, pictures: str) -> str | None:
-    """Describe that a result shows the scene's own ``pictures`` worse than the input does; None up to ``MAX_LOSS``.
+    """Describe a loss of quality on the scene's own ``pictures``; None if the loss is at most ``MAX_LOSS``.
 
     ``before`` and ``after`` are the PSNR (dB) of the pictures from the input and from the result, or None.
     """
@@ -69,7 +69,7 @@ def describe_loss(name: str, before: float | None, after: float | None, pictures
 
 
 def describe_distance(psnr: float | None) -> str | None:
-    """Describe that a result with a ``psnr`` (dB) against its input looks different; None from ``POOR`` on."""
+    """Describe that a result looks different from its input; None if ``psnr`` (dB) is at least ``POOR``, or None."""
     if psnr is None or psnr >= POOR:
         return None
     return f"the result looks different from its input: {psnr:.1f} dB, below {POOR:g} dB"
@@ -92,7 +92,7 @@ def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
         raise ValueError(f"expected at least {WINDOW} x {WINDOW} pixels, got {list(first.shape[:2])}")
     border = WINDOW // 2
     inner = slice(border, -border), slice(border, -border)
-    chosen = None if mask is None else pixel_mask(pixel_mask(mask, first)[inner], first[inner])
+    selected = None if mask is None else pixel_mask(pixel_mask(mask, first)[inner], first[inner])
     # Variances are small differences of large numbers. With centred values float32 is exact enough.
     x, y = first.astype(np.float32) - np.float32(0.5), second.astype(np.float32) - np.float32(0.5)
 
@@ -103,4 +103,4 @@ def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
     variances, covariance = mean(x * x + y * y) - ux * ux - uy * uy, mean(x * y) - ux * uy
     ux, uy = ux + np.float32(0.5), uy + np.float32(0.5)
     scores = (2 * ux * uy + C1) * (2 * covariance + C2) / ((ux * ux + uy * uy + C1) * (variances + C2))
-    return float((scores if chosen is None else scores[chosen]).mean(dtype=np.float64))
+    return float((scores if selected is None else scores[selected]).mean(dtype=np.float64))

@@ -23,7 +23,7 @@ Score = TypeVar("Score")
 
 LEAST_OPACITY = 1 / 255  # rasterizers draw no smaller opacity
 NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
-# Above so many Gaussians views are tiled one at a time, since a tiled view is as large; threads then share the view
+# Gaussians. Larger scenes tile one view at a time, since a tiled view takes as much memory; threads share the view
 ONE_AT_A_TIME = 400_000
 BLOCK = 2  # tiles per side of the blocks that scored_tiles chooses among
 MASKED = np.float32(0.1)  # weight of pixels outside masks; with a weight of 0 the Gaussians there would drift
@@ -35,10 +35,10 @@ EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 class RenderScore(NamedTuple):
     """Score of one render against a photo."""
 
-    psnr: float  # dB over the pixels that count
-    covered_psnr: float  # dB over the covered ones of them; over all if nearly all are covered, NaN if none is
-    share: float  # share of covered pixels among those that count
-    covered: np.ndarray  # [h,w] bool, the pixels that count and are covered
+    psnr: float  # dB over the scored pixels: pixels inside the mask, and inside the scored tiles
+    covered_psnr: float  # dB over the scored pixels that are covered; psnr from a share of WHOLE on, NaN for share 0
+    share: float  # share of the scored pixels that are covered
+    covered: np.ndarray  # [h,w] bool, the scored pixels that are covered
 
 
 @dataclass(frozen=True)
@@ -75,27 +75,27 @@ WHOLE_PHOTO = Sample()
 class Photos:
     """V photos of one size, with their cameras and pixel weights."""
 
-    images: np.ndarray  # [v,h,w,3] float32, sRGB in [0, 1]; uint8 of photos larger than the grid, see image()
+    images: np.ndarray  # [v,h,w,3] float32, sRGB in [0, 1]; uint8 if the photos are larger than the grid, see image()
     viewmats: np.ndarray  # [v,4,4] world to camera
     Ks: np.ndarray  # [v,3,3] intrinsics at this size
-    # Low-pass variance in square pixels of this size. It equals that of the full-size image, so that Gaussians are
-    # fitted with the filter that they will be rendered with
+    # Variance of the low-pass, square pixels of this size. It is the variance of the full-size image, scaled, so that
+    # a fit filters Gaussians as the final render does
     eps2d: float
     weights: np.ndarray | None = None  # [v,h,w] float32 of the pixels, in [0, 1]; None: all 1
     empty: np.ndarray | None = None  # [v,h,w] float32 share of each pixel that shows the background; None: 0
-    importance: np.ndarray | None = None  # [v,h,w] float32, how many pixels each counts as in a fit; None: all one
+    importance: np.ndarray | None = None  # [v,h,w] float32, weight of each pixel in a fit; None: all 1
 
     def __len__(self) -> int:
         return len(self.images)
 
     def __getitem__(self, views: Sequence[int]) -> Photos:
-        """Return the photos of some views; of all views, in order, without a copy."""
+        """Select the photos of some views; return the same object, without a copy, for all views in order."""
         ids = list(views)
         if ids == list(range(len(self))):
             return self
-        of_pixels = (self.weights, self.empty, self.importance)
-        some = (None if values is None else values[ids] for values in of_pixels)
-        return Photos(self.images[ids], self.viewmats[ids], self.Ks[ids], self.eps2d, *some)
+        maps = (self.weights, self.empty, self.importance)
+        selected = (None if values is None else values[ids] for values in maps)
+        return Photos(self.images[ids], self.viewmats[ids], self.Ks[ids], self.eps2d, *selected)
 
     @property
     def height(self) -> int:
@@ -131,7 +131,7 @@ class Photos:
 
 
 def scene_pictures(scene: Scene) -> np.ndarray:
-    """Return the photos ``[v,h,w,3]`` of a scene, or without photos the base colours of the Gaussians in front."""
+    """Return a scene's photos ``[v,h,w,3]``; without photos, the base colours of the Gaussians in front."""
     return row_pictures(scene) if scene.images is None else scene.images
 
 
@@ -206,21 +206,21 @@ def photo_errors(
     """Render Gaussians into the photos' cameras and score every render, several views at once.
 
     ``score`` is called with the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance ``[h,w]``.
-    ``views`` are views of the photos, in the order of the result; None: all. ``near`` is in the unit of the Gaussians.
+    The result is in the order of ``views``; None: all. ``near`` is in the unit of the Gaussians.
     ``colors [n,3]`` replace the harmonics. ``keep(view)`` returns the mask ``[n]`` of the Gaussians to draw, and
     ``tiles(view)`` the mask ``[tile_height,tile_width]`` of the tiles that must be complete; None: all.
     """
     splats = gaussians if isinstance(gaussians, Splats) else make_splats(gaussians)
 
-    def one_view(view: int) -> Score:
+    def score_view(view: int) -> Score:
         shown, complete = (None if choose is None else choose(view) for choose in (keep, tiles))
         tiled = tile_view(splats, **photos.camera(view), near=near, keep=shown, tiles=complete)
         return score(view, *composite(tiled, colors))
 
-    chosen = range(len(photos)) if views is None else views
+    view_ids = range(len(photos)) if views is None else views
     if len(splats) > ONE_AT_A_TIME:
-        return [one_view(view) for view in chosen]
-    return parallel_map(one_view, chosen)
+        return [score_view(view) for view in view_ids]
+    return parallel_map(score_view, view_ids)
 
 
 def score_photos(
@@ -250,23 +250,19 @@ def score_photos(
 
 def _mean_score(scores: Sequence[RenderScore]) -> PhotoScore:
     """Average the scores of views, each clipped at MAX_PSNR, so that a view with equal pictures does not dominate."""
-    inside = [min(score.covered_psnr, MAX_PSNR) for score in scores if score.share > 0]
+    covered_psnrs = [min(score.covered_psnr, MAX_PSNR) for score in scores if score.share > 0]
     share = float(np.mean([score.share for score in scores]))
     mean = float(np.mean([min(score.psnr, MAX_PSNR) for score in scores]))
-    return PhotoScore(mean, float(np.mean(inside)) if inside else math.nan, share, tuple(s.covered for s in scores))
+    covered_mean = float(np.mean(covered_psnrs)) if covered_psnrs else math.nan
+    return PhotoScore(mean, covered_mean, share, tuple(score.covered for score in scores))
 
 
 def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> RenderScore:
-    """Score a render ``[h,w,3]`` over all pixels that count and over ``covered [h,w]``; the render is clipped in place.
+    """Score a render ``[h,w,3]`` over all scored pixels and over ``covered [h,w]``; the render is clipped in place.
 
     ``quarter`` is as in :func:`score_photos`.
     """
-    tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
-    mask = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
-    if photos.weights is not None:
-        counts = photos.weights[view] == 1
-        both = counts if mask is None or not (mask & counts).any() else mask & counts
-        mask = both if both.any() else mask
+    mask = _scored_pixels(photos, view, quarter=quarter)
     covered = covered if mask is None else covered & mask
     share = float(covered.sum() / (covered.size if mask is None else max(1, mask.sum())))
     psnr_of_all = psnr(np.clip(image, 0, 1, out=image), photos.images[view], mask)
@@ -275,14 +271,34 @@ def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: in
     return RenderScore(psnr_of_all, psnr(image, photos.images[view], covered), share, covered)
 
 
+def _scored_pixels(photos: Photos, view: int, *, quarter: bool) -> np.ndarray | None:
+    """Select the pixels ``[h,w]`` inside the view's mask and its scored tiles; None: all.
+
+    If no pixel is inside both, the mask alone selects; if the mask is empty, the tiles alone.
+    """
+    tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
+    in_tiles = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
+    if photos.weights is None:
+        return in_tiles
+    unmasked = photos.weights[view] == 1
+    if not unmasked.any():
+        return in_tiles
+    if in_tiles is None or not (in_tiles & unmasked).any():
+        return unmasked
+    return in_tiles & unmasked
+
+
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
-    """Select a quarter of a view's tiles as a mask ``[tile_height,tile_width]``; None for small views."""
+    """Select a quarter of a view's tiles as a mask ``[tile_height,tile_width]``; None, for all, in small views.
+
+    One block of every 2 x 2 blocks is selected. Its position alternates between blocks and views.
+    """
     tile_height, tile_width = -(-height // TILE), -(-width // TILE)
     if min(tile_height, tile_width) <= 3 * BLOCK:
         return None
     y, x = np.arange(tile_height)[:, None] // BLOCK, np.arange(tile_width) // BLOCK
-    chosen: np.ndarray = (y % 2 * 2 + x % 2) == (view + x // 2 + 2 * (y // 2)) % 4
-    return chosen
+    position, selected_position = y % 2 * 2 + x % 2, (view + x // 2 + 2 * (y // 2)) % 4
+    return np.asarray(position == selected_position)
 
 
 def render_photos(gaussians: Gaussians | Splats, photos: Photos, **settings: Any) -> list[np.ndarray]:

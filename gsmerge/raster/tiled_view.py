@@ -19,11 +19,17 @@ from gsmerge.types import Gaussians
 
 Array = NDArray[Any]
 
-PIECE = 1 << 13  # least number of Gaussians or intersections for another thread
-# Intersections of a view, and of each Gaussian on average. Above both, most Gaussians are hidden, and lists are cut off
-MANY, MANY_EACH = 1 << 24, 16
+PIECE = 1 << 13  # least number of Gaussians or intersections per thread
+# Intersections of a view, and mean intersections per Gaussian. Above both, most Gaussians are hidden, so lists are cut
+CROWDED, CROWDED_EACH = 1 << 24, 16
 EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
 NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
+# Directions are clamped at this share of the image outside its borders, as in gsplat, since the first-order projection
+# is too inexact farther out
+SPARE = 0.15
+FAR_ORIGIN = 16  # means are shifted if their centre is farther from zero than so many times their spread
+ORIGIN_SAMPLE = 4096  # least number of means, if there are as many, from which centre and spread are measured
+CACHE_LINE = 16  # float32 values per cache line
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,37 +74,38 @@ class TiledView:
 
 def _spread_origin(means: Array) -> Array:
     """Return zero, or the centre of Gaussians if they are too far from zero for float32."""
-    sample = means[:: max(1, len(means) // 4096)].astype(np.float64)
+    sample = means[:: max(1, len(means) // ORIGIN_SAMPLE)].astype(np.float64)
     sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
         return np.zeros(3)
     centre = np.median(sample, axis=0)
     spread = np.median(np.abs(sample - centre), axis=0).max()
-    return centre if np.abs(centre).max() > 16 * spread else np.zeros(3)
+    return centre if np.abs(centre).max() > FAR_ORIGIN * spread else np.zeros(3)
 
 
-def _shift(means: Array, start: Array) -> Array:
-    """Subtract ``start [3]`` from ``means [n,3]`` in float64 and round to float32."""
+def _shift(means: Array, origin: Array) -> Array:
+    """Subtract ``origin [3]`` from ``means [n,3]`` in float64 and round to float32."""
     shifted = np.empty(means.shape, np.float32)
     for axis in range(3):  # one axis at a time takes NumPy a third of the time
-        np.subtract(means[:, axis], start[axis], out=shifted[:, axis], dtype=np.float64, casting="unsafe")
+        np.subtract(means[:, axis], origin[axis], out=shifted[:, axis], dtype=np.float64, casting="unsafe")
     return shifted
 
 
 def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
-    """Convert Gaussians to float32 splats for the kernels, copying only what needs conversion.
+    """Convert Gaussians to float32 splats for the kernels; arrays of the right type and layout are not copied.
 
     Means may be float64, for scenes in geographic coordinates. ``origin [3]`` is the world point that becomes the zero
-    of the arrays. By default it is the zero of the world, unless that is far away compared with the size of the scene.
+    of the arrays. By default it is the world's zero, or the centre of the means if they are far from zero for their
+    spread.
     """
     gaussians = gaussians.numpy()
-    start = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
-    columns = vars(gaussians) | {"means": _shift(gaussians.means, start) if start.any() else gaussians.means}
-    return Splats(**{name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}, origin=start)
+    zero = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
+    columns = vars(gaussians) | {"means": _shift(gaussians.means, zero) if zero.any() else gaussians.means}
+    return Splats(**{name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}, origin=zero)
 
 
 def num_pieces(count: int, threads: int, least: int = PIECE) -> int:
-    """Return the number of pieces to split work into: several per thread, each with about ``least`` items or more."""
+    """Choose the number of pieces of work: up to four per thread, each with about ``least`` items or more."""
     return 1 if threads == 1 else max(1, min(4 * threads, count // least))
 
 
@@ -123,8 +130,7 @@ def camera_numbers(
 ) -> Array:  # fmt: skip
     """Return the numbers of a camera in the order of the kernels."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    # As in gsplat, directions are clamped 15 % of the image outside it, where the first-order projection is too inexact
-    spare_x, spare_y = 0.15 * width / fx, 0.15 * height / fy
+    spare_x, spare_y = SPARE * width / fx, SPARE * height / fy
     camera = np.zeros(projection.CAMERA, np.float32)
     camera[projection.ROTATION : projection.SHIFT] = viewmat[:3, :3].ravel()
     camera[projection.SHIFT : projection.FX] = viewmat[:3, 3]
@@ -150,10 +156,10 @@ def _visible(
     """Return the ascending ids of the Gaussians that may touch the image, or its selected tiles."""
 
     def cull(span: tuple[int, int]) -> Array:
-        part, ids = slice(*span), np.empty(span[1] - span[0], np.int32)
-        keep_part = None if keep is None else keep[part]
+        rows, ids = slice(*span), np.empty(span[1] - span[0], np.int32)
+        keep_rows = None if keep is None else keep[rows]
         count = projection.cull(
-            splats.means[part], splats.scales[part], opacities[part], keep_part, corner_sums, camera, span[0], ids
+            splats.means[rows], splats.scales[rows], opacities[rows], keep_rows, corner_sums, camera, span[0], ids
         )
         return ids[:count].copy()
 
@@ -162,9 +168,8 @@ def _visible(
 
 def cache_line_rows(count: int, width: int) -> Array:
     """Allocate ``[count,width]`` float32 at the start of a cache line, so that short rows do not span two lines."""
-    line = 16
-    buffer = np.empty(count * width + line, np.float32)
-    start = -(buffer.ctypes.data // buffer.itemsize) % line
+    buffer = np.empty(count * width + CACHE_LINE, np.float32)
+    start = -(buffer.ctypes.data // buffer.itemsize) % CACHE_LINE
     return buffer[start : start + count * width].reshape(count, width)
 
 
@@ -175,10 +180,10 @@ def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, thread
     boxes = np.empty((m, 4), np.int16)
 
     def project(span: tuple[int, int]) -> None:
-        part = slice(*span)
+        rows = slice(*span)
         projection.project(
-            splats.means, splats.quats, splats.scales, opacities, ids[part], camera,
-            conics[part], depths[part], boxes[part],
+            splats.means, splats.quats, splats.scales, opacities, ids[rows], camera,
+            conics[rows], depths[rows], boxes[rows],
         )  # fmt: skip
 
     parallel_map(project, pieces(m, threads))
@@ -187,7 +192,7 @@ def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, thread
 
 def hides_most(num_intersections: int, num_visible: int) -> bool:
     """Return whether a view has so many intersections that most of its Gaussians are hidden behind others."""
-    return num_intersections > max(MANY, MANY_EACH * num_visible)
+    return num_intersections > max(CROWDED, CROWDED_EACH * num_visible)
 
 
 def _bin(
@@ -205,8 +210,8 @@ def _bin(
     flatten_ids = np.empty(isect_offsets[-1], np.int32)
 
     def deal(piece: tuple[tuple[int, int], Array]) -> None:
-        part = slice(*piece[0])
-        deal_tiles(order[part], boxes[part], tile_width, piece[1], flatten_ids)
+        (start, end), tile_cursors = piece
+        deal_tiles(order[start:end], boxes[start:end], tile_width, tile_cursors, flatten_ids)
 
     parallel_map(deal, zip(spans, cursors, strict=True))
     return flatten_ids, isect_offsets
@@ -215,18 +220,18 @@ def _bin(
 def _bin_open(
     order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
 ) -> tuple[Array, Array]:
-    """Return the lists of :func:`_bin`, each cut off behind its last visible Gaussian to keep it short."""
+    """Return the tile lists of :func:`_bin`, each without the Gaussians behind its last visible one."""
     num = min(tile_height, 4 * threads)
     spans = [(tile_height * i // num, tile_height * (i + 1) // num) for i in range(num)]
 
     def deal(cursors: Array, flatten_ids: Array) -> None:
-        left = np.ones(len(cursors), np.float32)
+        bounds = np.ones(len(cursors), np.float32)  # upper bounds of the transmittance of each tile
         parallel_map(
-            lambda lines: deal_open_tiles(order, boxes, conics, tile_width, *lines, left, cursors, flatten_ids), spans
+            lambda lines: deal_open_tiles(order, boxes, conics, tile_width, *lines, bounds, cursors, flatten_ids), spans
         )
 
     counts = np.zeros(tile_height * tile_width, np.int64)
-    deal(counts, np.empty(0, np.int32))
+    deal(counts, np.empty(0, np.int32))  # without room for the lists, it only counts
     isect_offsets = np.concatenate([[0], np.cumsum(counts)])
     flatten_ids = np.empty(isect_offsets[-1], np.int32)
     deal(isect_offsets[:-1].copy(), flatten_ids)
@@ -241,6 +246,16 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
         raise ValueError(f"expected an image size from 1 to {most} pixels per side, got {width} x {height}")
     if not (K[0, 0] > 0 and K[1, 1] > 0):
         raise ValueError(f"expected positive focal lengths, got {K[0, 0]} and {K[1, 1]}")
+
+
+def _convert_columns(splats: Splats, opacities: Array | None, keep: Array | None) -> tuple[Array, Array | None]:
+    """Convert opacities ``[n]`` (None: the splats' own) and the mask ``keep [n]`` to the types of the kernels."""
+    opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
+    keep = None if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
+    num_flags = len(splats) if keep is None else len(keep)
+    if opacities.shape != (len(splats),) or num_flags != len(splats):
+        raise ValueError(f"expected {len(splats)} opacities and keep flags, got {len(opacities)} and {num_flags}")
+    return opacities, keep
 
 
 def tile_view(
@@ -267,9 +282,9 @@ def tile_view(
     Gaussian to compensate for the dilation (the 2D filter of Mip-Splatting). ``opacities [n]`` replace the opacities of
     the Gaussians. Gaussians with a False ``keep [n]`` are left out.
 
-    Only tiles of 16 x 16 pixels with a True ``tiles [tile_height,tile_width]`` have to be complete. ``band``, first and
-    last + 1 line of tiles, tiles only these lines, as an image of their own. ``columns``, first and last + 1 column of
-    tiles, leaves all other tiles empty.
+    Tiles have 16 x 16 pixels. Only tiles with a True ``tiles [tile_height,tile_width]`` have to be complete. ``band``
+    gives the first and last + 1 line of tiles; the result is an image of these lines alone. ``columns`` gives the first
+    and last + 1 column of tiles; all other tiles are empty.
 
     The size of the result depends on the number of visible Gaussians, not on n. Raises ValueError if a size or a number
     is out of range.
@@ -278,32 +293,27 @@ def tile_view(
     _check_view(viewmat, K, width, height)
     if not (0 < near < far and eps2d >= 0):
         raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
-    opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
-    keep = None if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
-    num_flags = len(splats) if keep is None else len(keep)
-    if opacities.shape != (len(splats),) or num_flags != len(splats):
-        raise ValueError(f"expected {len(splats)} opacities and keep flags, got {len(opacities)} and {num_flags}")
-
-    local = viewmat.copy()
-    local[:3, 3] += matmul(local[:3, :3], splats.origin)
-    camera = camera_numbers(local, K, width, height, eps2d, antialiased, near, far)
+    opacities, keep = _convert_columns(splats, opacities, keep)
+    local_viewmat = viewmat.copy()  # from the frame of the splats, whose zero is their origin
+    local_viewmat[:3, 3] += matmul(local_viewmat[:3, :3], splats.origin)
+    camera = camera_numbers(local_viewmat, K, width, height, eps2d, antialiased, near, far)
     tile_width, tile_height = -(-width // projection.TILE), -(-height // projection.TILE)
-    (first, last), (left, right) = band or (0, tile_height), columns or (0, tile_width)
+    (top, bottom), (left, right) = band or (0, tile_height), columns or (0, tile_width)  # tiles
     is_part = band is not None or columns is not None
     if is_part:
         tiles = np.zeros((tile_height, tile_width), bool)
-        tiles[first:last, left:right] = True
+        tiles[top:bottom, left:right] = True
     corner_sums = None if tiles is None else _corner_sums(tiles, tile_height, tile_width)
     with use_threads() as threads:
         ids = _visible(splats, opacities, keep, corner_sums, camera, threads)
         conics, depths, boxes = _project(splats, opacities, ids, camera, threads)
         if is_part:
             boxes[:, :2] = boxes[:, :2].clip(left, right)
-            boxes[:, 2:] = boxes[:, 2:].clip(first, last)
+            boxes[:, 2:] = boxes[:, 2:].clip(top, bottom)
         order = depth_order(depths.view(np.uint32))
         flatten_ids, isect_offsets = _bin(order, boxes, conics, tile_height, tile_width, threads)
-    eye, top = camera_centres(local).astype(np.float32), first * projection.TILE
+    eye, first_row = camera_centres(local_viewmat).astype(np.float32), top * projection.TILE
     return TiledView(
         splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width,
-        min(height, last * projection.TILE) - top, top,
+        min(height, bottom * projection.TILE) - first_row, first_row,
     )  # fmt: skip

@@ -1,7 +1,7 @@
 """Store the blending weights of a view as a sparse matrix, for stages that render one geometry many times.
 
 The image is W times the colours. W has one row per pixel and one column per Gaussian. With some twenty entries per
-pixel, a product takes a small part of the time that blending along the tile lists takes.
+pixel, a product takes a small share of the time of blending along the tile lists.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def apply(view: ViewWeights, colors: Array) -> Array:
 def apply_transposed(view: ViewWeights, image: Array) -> Array:
     """Multiply the transpose of W with ``image [h,w,c]``, up to four channels; return ``[m,c]`` float64.
 
-    The rows of the result are those of ``view.ids``.
+    The rows of the result belong to ``view.ids``.
     """
     channels = image.shape[2]
     padded = np.zeros((view.height, view.width, kernels.LANES), np.float32)

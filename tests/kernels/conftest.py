@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import pytest
 
-from gsmerge.kernels.library import _able_targets, load_library
+from gsmerge.kernels.library import _runnable_targets, load_library
 
 Function = Callable[[], Sequence[np.ndarray]]
 
@@ -18,7 +18,7 @@ def each_target(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Function]
 
     def run(function: Function) -> Sequence[np.ndarray]:
         results = []
-        for target in _able_targets():
+        for target in _runnable_targets():
             monkeypatch.setenv("GSMERGE_TARGET", target.name)
             load_library.cache_clear()
             results.append(function())

@@ -51,7 +51,7 @@ def set_level(monkeypatch: pytest.MonkeyPatch, level: int) -> None:
 
 
 def test_the_most_demanding_target_is_taken() -> None:
-    assert load_library()._name == str(FOLDER / find_platform().library_name(module._able_targets()[-1]))
+    assert load_library()._name == str(FOLDER / find_platform().library_name(module._runnable_targets()[-1]))
 
 
 @x86_only

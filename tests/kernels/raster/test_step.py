@@ -45,8 +45,8 @@ def step_numbers(rng: np.random.Generator) -> dict[str, np.ndarray]:
 def test_hostile_numbers_come_to_an_end(
     seed: int, many: int, num: int, threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tiled_view, "MANY", many)
-    monkeypatch.setattr(tiled_view, "MANY_EACH", 0)
+    monkeypatch.setattr(tiled_view, "CROWDED", many)
+    monkeypatch.setattr(tiled_view, "CROWDED_EACH", 0)
     rng = np.random.default_rng(seed)
     state, numbers = some_state(300, rng, num), step_numbers(rng)
     photo, weight = (rng.random((HEIGHT, WIDTH, *more), dtype=np.float32) for more in ((3,), ()))

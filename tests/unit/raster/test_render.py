@@ -215,8 +215,8 @@ def test_lists_end_behind_what_hides_a_tile(monkeypatch: pytest.MonkeyPatch) -> 
         return [*composite(tiled), *contributions(tiled)], [part.tolist() for part in lists]
 
     whole, all_lists = draw()
-    monkeypatch.setattr("gsmerge.raster.tiled_view.MANY", 0)
-    monkeypatch.setattr("gsmerge.raster.tiled_view.MANY_EACH", 0)
+    monkeypatch.setattr("gsmerge.raster.tiled_view.CROWDED", 0)
+    monkeypatch.setattr("gsmerge.raster.tiled_view.CROWDED_EACH", 0)
     drawn, lists = draw()
     assert sum(map(len, lists)) < 0.6 * sum(map(len, all_lists))
     for part, every in zip(lists, all_lists, strict=True):

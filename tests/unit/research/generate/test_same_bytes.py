@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from gsmerge.kernels.library import _able_targets
+from gsmerge.kernels.library import _runnable_targets
 
 SCENE = """
 import hashlib
@@ -28,7 +28,7 @@ OTHERS = {
 
 @pytest.mark.slow
 def test_scenes_do_not_depend_on_the_processor() -> None:
-    targets = [target.name for target in _able_targets()]
+    targets = [target.name for target in _runnable_targets()]
     scenes = {
         subprocess.run([sys.executable, "-c", SCENE], env=env, capture_output=True, text=True, check=True).stdout
         for env in (
