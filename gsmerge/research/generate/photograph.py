@@ -1,4 +1,8 @@
-"""Render photos and exact depth of a stage: rays, textures, light with shadows, exposure."""
+"""Render photos and exact depth of a stage.
+
+Rays find the first surface of every sample. Its colour comes from its texture and from lights with shadow maps. A film
+curve with an exposure turns the light into a photo.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +22,18 @@ from gsmerge.research.generate.textures import Picture, pyramid
 
 FAR = 1e6  # depth of pixels without a surface
 NEAR_PLANE = 1e-3
-SAMPLE_RAYS = 2  # rays per pixel and axis for the colours; depth is that of the pixel's centre
+REMAP_WIDTH = 4096  # columns of a table for cv2.remap, which takes at most 32767
+SAMPLE_RAYS = 2  # rays per pixel and axis for the colours; depth is measured at the pixel's centre
 KEY_MAPS, KEY_SIZE = 5, 640  # number of shadow maps of the direct light, for soft shadows, and their side in pixels
-AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # the same for the light from all sides
+AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # number and side of the shadow maps of the light from all sides
+KEY_BIAS, AMBIENT_BIAS = 2.0, 1.2  # texels of a shadow map by which surfaces may lie behind it and still be lit
 BEHIND = 1000.0  # distance of a shadow map's camera in radii, so that its rays are nearly parallel
 GLOW = 0.7  # brightness of glowing shapes, relative to a white wall in full light
-FROM_BELOW = 0.5  # light from below, relative to that from above
+FROM_BELOW = 0.5  # brightness of light from below, relative to light from above
+LAMP_GAIN, LAMP_FALLOFF = 2.5, 1.5  # brightness of the direct light at the lamp, and its decrease with the distance
+RIM = 0.25  # strength of reflections at grazing angles, relative to the gloss
+GAMMA = 2.2  # exponent from sRGB to linear light
+MIN_COSINE = 0.1  # least cosine of a surface's tilt in the size of a sample, which has no bound at grazing angles
 
 Float: TypeAlias = NDArray[Any]  # float32
 
@@ -82,8 +92,8 @@ class LitStage:
     shapes: ShapeArrays
     mips: tuple[list[Picture], ...]  # mipmaps of every texture
     axes: Array  # [k,3,3] axes of the lights, direct ones first
-    middle: Array  # [3] middle of the shadow maps
-    radius: float  # half side of the shadow maps
+    middle: Array  # [3] world point in the middle of the shadow maps
+    radius: float  # half side of the shadow maps, world units
     key: Float  # shadow maps of the direct light
     ambient: Float  # shadow maps of the light from all sides
     weights: Array  # [k] weights of the ambient maps
@@ -91,22 +101,33 @@ class LitStage:
 
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
     """Compute boxes x0, y0, x1, y1 ``[m,4]``, in samples, that contain each shape's image."""
+    points, valid = _clipped_corners(shapes, c2w)
+    pixels = points[..., :2] / np.where(valid, points[..., 2:], 1) * lens.focal + [lens.width / 2, lens.height / 2]
+    limits = np.array([lens.width, lens.height]) * samples
+    low = np.where(valid, np.floor(pixels * samples) - 1, np.inf).min(1)
+    high = np.where(valid, np.ceil(pixels * samples) + 1, -np.inf).max(1)
+    return np.concatenate([np.clip(low, 0, limits), np.clip(high, 0, limits)], 1).astype(np.int32)
+
+
+def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
+    """Clip the bounding boxes of shapes at the near plane.
+
+    Returns camera-frame points ``[m,20,3]``: the 8 corners, then the points where the 12 edges cross the near plane.
+    The mask ``[m,20,1]`` is True for corners in front of the plane and for edges that cross it.
+    """
     half = bounds(shapes)
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
     corners = matmul(half[:, None] * signs, shapes.rotations.swapaxes(1, 2)) + shapes.centres[:, None]
     local = matmul(corners - c2w[:3, 3], c2w[:3, :3])
-    edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
+    edges = np.array(
+        [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
+    )  # pairs that differ in one bit
     a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
-    with np.errstate(divide="ignore", invalid="ignore"):  # for edges that cross the near plane
+    with np.errstate(divide="ignore", invalid="ignore"):  # edges that are parallel to the plane do not cross it
         crossing = a + (b - a) * ((NEAR_PLANE - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))
     crosses = (a[..., 2] < NEAR_PLANE) != (b[..., 2] < NEAR_PLANE)
     points = np.concatenate([local, np.where(crosses[..., None], crossing, 0.0)], 1)
-    seen = np.concatenate([local[..., 2] >= NEAR_PLANE, crosses], 1)[..., None]
-    at = points[..., :2] / np.where(seen, points[..., 2:], 1) * lens.focal + [lens.width / 2, lens.height / 2]
-    limits = np.array([lens.width, lens.height]) * samples
-    low = np.where(seen, np.floor(at * samples) - 1, np.inf).min(1)
-    high = np.where(seen, np.ceil(at * samples) + 1, -np.inf).max(1)
-    return np.concatenate([np.clip(low, 0, limits), np.clip(high, 0, limits)], 1).astype(np.int32)
+    return points, np.concatenate([local[..., 2] >= NEAR_PLANE, crosses], 1)[..., None]
 
 
 def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
@@ -123,7 +144,7 @@ def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
 
 
 def _axes(towards: Array) -> Array:
-    """Compute the rows right, down, forward ``[3,3]`` of light that comes from a direction."""
+    """Compute the axes of a shadow map as rows right, down, forward ``[3,3]``; ``towards`` points to the light."""
     forward = -towards / norm(towards)
     right = np.cross([0.3, 1.0, 0.2], forward)
     right /= norm(right)
@@ -147,10 +168,7 @@ def light_stage(stage: Stage) -> LitStage:
     middle, radius = (low + high) / 2, norm(high - low) / 2
     rng = np.random.default_rng(0)
     key = [stage.light.towards + stage.light.softness * rng.normal(0, 0.6, 3) for _ in range(KEY_MAPS)]
-    rotations = np.arange(AMBIENT_MAPS) + 0.5  # evenly over the sphere (Fibonacci)
-    up, angle = 1 - 2 * rotations / AMBIENT_MAPS, np.pi * (1 + 5**0.5) * rotations
-    flat = np.sqrt(1 - up**2)
-    ambient = np.stack([flat * cos(angle), -up, flat * sin(angle)], 1)
+    ambient = _ambient_directions()
     axes = np.stack([_axes(towards) for towards in (*key, *ambient)])
     return LitStage(
         stage,
@@ -161,109 +179,125 @@ def light_stage(stage: Stage) -> LitStage:
         radius,
         np.stack([_shadow_map(opaque, a, middle, radius, KEY_SIZE) for a in axes[:KEY_MAPS]]),
         np.stack([_shadow_map(opaque, a, middle, radius, AMBIENT_SIZE) for a in axes[KEY_MAPS:]]),
-        np.where(up > 0, 1.0, FROM_BELOW) * 4 / AMBIENT_MAPS,
+        np.where(-ambient[:, 1] > 0, 1.0, FROM_BELOW) * 4 / AMBIENT_MAPS,
     )
 
 
+def _ambient_directions() -> Array:
+    """Spread the directions ``[AMBIENT_MAPS,3]`` of the ambient light evenly over the sphere (Fibonacci's spiral)."""
+    steps = np.arange(AMBIENT_MAPS) + 0.5
+    up, azimuth = 1 - 2 * steps / AMBIENT_MAPS, np.pi * (1 + 5**0.5) * steps
+    horizontal = np.sqrt(1 - up**2)
+    return np.stack([horizontal * cos(azimuth), -up, horizontal * sin(azimuth)], 1)
+
+
 def coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> tuple[Float, Float]:
-    """Compute texture coordinates ``[n,2]`` of points in shape frames, and texture repeats per world unit ``[n]``."""
+    """Compute texture coordinates ``[n,2]`` of points in shape frames, and texture repeats per world unit ``[n]``.
+
+    Round surfaces are unrolled about their y axis. Flat faces are projected along their axis.
+    """
     kinds, half = shapes.kinds[ids], shapes.sizes[ids, :3].astype(np.float32)
     x, y, z = points.T
     a, b, c = (np.abs(points) / np.maximum(half, 1e-9)).T
-    turned = (kinds == ELLIPSOID) | (kinds == BLOB) | ((kinds == CONE) & (b < 1 - 1e-5))
+    is_round = (kinds == ELLIPSOID) | (kinds == BLOB) | ((kinds == CONE) & (b < 1 - 1e-5))
     girth = np.maximum(half[:, 0], half[:, 2])
-    side = (kinds == BOX) & (a >= b) & (a >= c)
-    top = ((kinds == BOX) & (b > a) & (b >= c)) | ((kinds == CONE) & ~turned)
-    around = arctan2(x, z)
-    u = np.where(turned, around * girth, np.where(side, z, x))
-    v = np.where(top, z, y)
-    wide = np.where(turned, np.pi * girth, np.where(side, half[:, 2], half[:, 0]))
-    high = np.where(top, half[:, 2], half[:, 1])
+    is_side = (kinds == BOX) & (a >= b) & (a >= c)  # faces across x
+    is_top = ((kinds == BOX) & (b > a) & (b >= c)) | ((kinds == CONE) & ~is_round)  # faces across y
+    azimuth = arctan2(x, z)
+    u = np.where(is_round, azimuth * girth, np.where(is_side, z, x))
+    v = np.where(is_top, z, y)
+    half_width = np.where(is_round, np.pi * girth, np.where(is_side, half[:, 2], half[:, 0]))
+    half_height = np.where(is_top, half[:, 2], half[:, 1])
     materials = [s.material for s in shapes.shapes]
     repeat = np.array([material.repeat for material in materials], np.float32)[ids]
     shift = np.array([material.shift for material in materials], np.float32)[ids]
     once = repeat == 0
-    u = np.where(once, u / (2 * wide) + 0.5, u * repeat + shift[:, 0])
-    v = np.where(once, v / (2 * high) + 0.5, v * repeat + shift[:, 1])
-    return np.stack([u, v], 1).astype(np.float32), np.where(once, 0.5 / np.maximum(wide, high), repeat)
+    u = np.where(once, u / (2 * half_width) + 0.5, u * repeat + shift[:, 0])
+    v = np.where(once, v / (2 * half_height) + 0.5, v * repeat + shift[:, 1])
+    return np.stack([u, v], 1).astype(np.float32), np.where(once, 0.5 / np.maximum(half_width, half_height), repeat)
 
 
-def paint(view: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
+def paint(lit: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
     """Look up texture colours ``[n,3]``, sRGB; ``spread`` is the size of a sample on the surface, world units."""
-    uv, repeat = coordinates(view.shapes, ids, points)
-    textures = np.array([s.material.texture for s in view.shapes.shapes])[ids]
-    size = len(view.mips[0][0])
+    uv, repeat = coordinates(lit.shapes, ids, points)
+    textures = np.array([s.material.texture for s in lit.shapes.shapes])[ids]
+    size, num_levels = len(lit.mips[0][0]), len(lit.mips[0])
     levels = np.frexp(np.maximum(spread * repeat * size, 1) * 2**0.5)[1] - 1  # the nearest power of two
-    levels = np.minimum(levels, len(view.mips[0]) - 1)
-    group = textures * len(view.mips[0]) + levels
-    order = np.argsort(group, kind="stable")
+    levels = np.minimum(levels, num_levels - 1)
+    mip_ids = textures * num_levels + levels
+    order = np.argsort(mip_ids, kind="stable")
     out = np.empty((len(ids), 3), np.float32)
-    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
-    for rows in np.split(order, starts[1:]):
-        texture = view.mips[textures[rows[0]]][levels[rows[0]]]
+    starts = np.flatnonzero(np.diff(mip_ids[order], prepend=-1))
+    for rows in np.split(order, starts[1:]):  # the samples of one mipmap
+        texture = lit.mips[textures[rows[0]]][levels[rows[0]]]
         out[rows] = _lookup(texture, uv[rows])
     return out
 
 
 def _lookup(texture: Picture, uv: Float) -> Float:
     """Sample a repeating texture bilinearly; y of the texture points down."""
-    width = 4096  # cv2.remap takes at most 32767 columns
     size = len(texture)
-    rows = -(-len(uv) // width)
-    at = np.zeros((rows * width, 2), np.float32)
-    at[: len(uv)] = (uv - np.floor(uv)) * size - 0.5
-    x, y = at.reshape(rows, width, 2)[..., 0], at.reshape(rows, width, 2)[..., 1]
+    rows = -(-len(uv) // REMAP_WIDTH)
+    texels = np.zeros((rows * REMAP_WIDTH, 2), np.float32)
+    texels[: len(uv)] = (uv - np.floor(uv)) * size - 0.5
+    x, y = np.moveaxis(texels.reshape(rows, REMAP_WIDTH, 2), 2, 0)
     colors = cv2.remap(texture, x.copy(), y.copy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     return colors.reshape(-1, 3)[: len(uv)]
 
 
-def radiance(view: LitStage, c2w: Array, lens: Pinhole, samples: int) -> Float:
+def radiance(lit: LitStage, c2w: Array, lens: Pinhole, samples: int) -> Float:
     """Render the linear light ``[h,w,3]`` of a view."""
-    hits = trace(view.shapes, c2w, lens, samples)
+    hits = trace(lit.shapes, c2w, lens, samples)
     h, w = hits.depth.shape
     out = np.zeros((h * w, 3), np.float32)
-    ids = hits.ids.reshape(-1)
-    seen = ids >= 0
-    if seen.any():
-        out[seen] = _reflect(view, ids[seen], hits, seen, c2w, lens, samples)
+    rows = np.flatnonzero(hits.ids.reshape(-1) >= 0)
+    if len(rows):
+        out[rows] = _reflect(lit, hits, rows, c2w, lens, samples)
     return out.reshape(h, w, 3).reshape(lens.height, samples, lens.width, samples, 3).mean((1, 3))
 
 
-def _reflect(
-    view: LitStage, ids: NDArray[np.int32], hits: Hits, seen: Array, c2w: Array, lens: Pinhole, samples: int
-) -> Float:
-    """Compute the linear light ``[n,3]`` of the samples that hit a shape of the stage."""
-    points, normals = hits.points.reshape(-1, 3)[seen], hits.normals.reshape(-1, 3)[seen]
-    depth = hits.depth.reshape(-1)[seen]
-    y, x = np.divmod(np.flatnonzero(seen), hits.depth.shape[1])
+def _reflect(lit: LitStage, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens: Pinhole, samples: int) -> Float:
+    """Compute the linear light ``[n,3]`` of the samples ``rows [n]``, which hit a shape of the stage."""
+    points, normals = hits.points.reshape(-1, 3)[rows], hits.normals.reshape(-1, 3)[rows]
+    ids, depth = hits.ids.reshape(-1)[rows], hits.depth.reshape(-1)[rows]
+    y, x = np.divmod(rows, hits.depth.shape[1])
     rays = np.stack([(x + 0.5) / samples - lens.width / 2, (y + 0.5) / samples - lens.height / 2], 1) / lens.focal
     rays = rotate(np.concatenate([rays, np.ones((len(rays), 1))], 1), c2w[:3, :3])
-    world = (c2w[:3, 3] + rays * depth[:, None]).astype(np.float32)
+    positions = (c2w[:3, 3] + rays * depth[:, None]).astype(np.float32)
     rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    cosine = np.maximum(-(normals * rays).sum(1), 0.1)
+    cosine = np.maximum(-(normals * rays).sum(1), MIN_COSINE)
     spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
-    albedo = power(paint(view, ids, points, spread), 2.2)
-    return _shade(view, ids, albedo, world, normals, rays)
+    albedo = power(paint(lit, ids, points, spread), GAMMA)
+    return _shade(lit, ids, albedo, positions, normals, rays)
 
 
-def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, normals: Float, rays: Float) -> Float:
-    """Compute the linear light that points reflect or emit towards the camera."""
-    light, shapes = view.stage.light, view.shapes.shapes
-    direct, indirect = np.zeros((2, len(ids)), np.float32)
-    bias = 2.0 * 2 * view.radius / KEY_SIZE
-    even = np.full(KEY_MAPS, 1 / KEY_MAPS)
-    add_light(world, normals, view.axes[:KEY_MAPS], view.middle, view.radius, view.key, bias, even, direct)
-    bias = 1.2 * 2 * view.radius / AMBIENT_SIZE
-    around = view.axes[KEY_MAPS:], view.middle, view.radius, view.ambient, bias, view.weights
-    add_light(world, normals, *around, indirect)
-    away = np.linalg.norm(world - light.lamp.astype(np.float32), axis=1)
-    direct *= 2.5 / (1 + (away / norm(light.lamp - view.stage.focus)) ** 2 * 1.5)
+def _incoming_light(lit: LitStage, positions: Float, normals: Float) -> tuple[Float, Float]:
+    """Compute the direct and the ambient light ``[n]`` that arrives at points, with shadows."""
+    light, half_side = lit.stage.light, lit.radius
+    direct, indirect = np.zeros((2, len(positions)), np.float32)
+    bias = KEY_BIAS * 2 * half_side / KEY_SIZE
+    equal = np.full(KEY_MAPS, 1 / KEY_MAPS)
+    # add_light adds to its last argument
+    add_light(positions, normals, lit.axes[:KEY_MAPS], lit.middle, half_side, lit.key, bias, equal, direct)
+    bias = AMBIENT_BIAS * 2 * half_side / AMBIENT_SIZE
+    add_light(positions, normals, lit.axes[KEY_MAPS:], lit.middle, half_side, lit.ambient, bias, lit.weights, indirect)
+    lamp_distance = np.linalg.norm(positions - light.lamp.astype(np.float32), axis=1)
+    direct *= LAMP_GAIN / (1 + (lamp_distance / norm(light.lamp - lit.stage.focus)) ** 2 * LAMP_FALLOFF)
+    return direct, indirect
+
+
+def _shade(
+    lit: LitStage, ids: NDArray[np.int32], albedo: Float, positions: Float, normals: Float, rays: Float
+) -> Float:
+    """Compute the linear light ``[n,3]`` that points reflect or emit towards the camera."""
+    light, shapes = lit.stage.light, lit.shapes.shapes
+    direct, indirect = _incoming_light(lit, positions, normals)
     gloss = np.array([s.material.gloss for s in shapes], np.float32)[ids]
-    half = light.towards.astype(np.float32) - rays
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    shine = gloss * direct * power(np.clip((normals * half).sum(1), 0, 1), 8 + 120 * gloss)
+    halfway = light.towards.astype(np.float32) - rays  # between light and camera (Blinn 1977)
+    halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
+    shine = gloss * direct * power(np.clip((normals * halfway).sum(1), 0, 1), 8 + 120 * gloss)
     grazing = (1 + (normals * rays).sum(1)).clip(0, 1)
-    rim = 0.25 * gloss * (grazing * grazing) ** 2  # grazing views reflect more (Schlick 1994)
+    rim = RIM * gloss * (grazing * grazing) ** 2  # grazing views reflect more (Schlick 1994)
     key, ambient = light.key.astype(np.float32), light.ambient.astype(np.float32)
     out = albedo * (key * direct[:, None] + ambient * indirect[:, None])
     out += shine[:, None] * key + rim[:, None] * ambient
@@ -273,8 +307,8 @@ def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, 
 
 
 def find_exposure(pictures: Sequence[Float], brightness: float) -> float:
-    """Find the exposure factor that makes the mean of the pictures about ``brightness``, sRGB."""
-    values = np.concatenate([p.reshape(-1) for p in pictures])
+    """Find the exposure factor at which the developed pictures have the mean ``brightness``, sRGB, by bisection."""
+    values = np.concatenate([picture.reshape(-1) for picture in pictures])
     low, high = 1e-3, 1e3
     for _ in range(30):
         middle = (low * high) ** 0.5
