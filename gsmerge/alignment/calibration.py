@@ -30,10 +30,10 @@ from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
-_FOCALS = (1.2, 4.8)  # focal lengths, over the longer side, at which the search begins
-_FREE = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
+_FOCALS = (1.2, 4.8)  # focal lengths, in longer sides of the picture, at which the search begins
+_FREE_INTRINSICS = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
 _ROUNDS = 2  # of solving; each round leaves out the points that the round before found far from their pixels
-_FAR, _FAR_PX = 3.0, 1.0  # a point is far beyond that many times the median distance and that many pixels
+_FAR, _FAR_PX = 3.0, 1.0  # a point is far beyond this multiple of the median distance and this number of pixels
 _SMALLEST_PX = 1e-3  # smaller distances count as this, since means have only 24 bits
 _MAX_UNCERTAINTY = 0.05  # of the focal length, relative; larger where points are nearly a plane in front of the camera
 
@@ -72,13 +72,14 @@ class _Model:
 def calibrate(pairs: Correspondences, width: int, height: int, count: int = 0) -> Calibration | None:
     """Calibrate the cameras of views of ``width`` x ``height`` pixels from ``pairs`` of Gaussians and pixels.
 
-    ``count`` is the least number of views; pairs of later views add to it. A view without pairs gets the camera of the
-    view before. None if the points do not determine the cameras, or if they lie farther from their pixels than allowed.
+    ``count`` is the least number of views; pairs of later views increase it. A view without pairs gets the camera of
+    the view before. None if the points do not determine the cameras, or if they lie farther from their pixels than
+    allowed.
     """
     if not len(pairs.rows):
         return None
-    numbers = np.unique(pairs.views)
-    views = [pairs.select(pairs.views == view) for view in numbers]
+    view_ids = np.unique(pairs.views)
+    views = [pairs.select(pairs.views == view) for view in view_ids]
     middle = np.median(pairs.points, 0)
     unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
     points, pixels = [(view.points - middle) / unit for view in views], [view.pixels for view in views]
@@ -90,9 +91,9 @@ def calibrate(pairs: Correspondences, width: int, height: int, count: int = 0) -
         return None
     viewmats = model.poses.copy()
     viewmats[:, :3, 3] = unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], middle)
-    all_views = np.arange(max(count, int(numbers[-1]) + 1))
-    camera = np.maximum(np.searchsorted(numbers, all_views, side="right") - 1, 0)
-    return Calibration(Cameras(viewmats[camera], model.Ks[camera], width, height), model.worst_px)
+    all_views = np.arange(max(count, int(view_ids[-1]) + 1))
+    solved = np.maximum(np.searchsorted(view_ids, all_views, side="right") - 1, 0)  # index of the solved camera
+    return Calibration(Cameras(viewmats[solved], model.Ks[solved], width, height), model.worst_px)
 
 
 def _choose_model(
@@ -111,9 +112,10 @@ def _solve_models(
 ) -> Iterator[_Model]:
     """Yield models from simple to complex: with intrinsics common to all views, then with intrinsics for each view.
 
-    The latter are left out if common intrinsics are already as near to the pixels as projective cameras.
+    Models with intrinsics for each view are left out if common intrinsics are as near to the pixels as projective
+    cameras.
     """
-    simple = []
+    one_focal_models = []
     for share in _FOCALS:
         focal = share * max(size)
         K = make_pinhole(focal, focal, size[0] / 2, size[1] / 2)
@@ -122,19 +124,19 @@ def _solve_models(
         if len(poses) < len(starts):
             return
         start = _Model(np.tile(K, (len(starts), 1, 1)), poses, 0, ())
-        for free in _FREE:
+        for free in _FREE_INTRINSICS:
             model = _solve(points, pixels, start, free)
-            simple += [model] if free == ONE_FOCAL else []
+            one_focal_models += [model] if free == ONE_FOCAL else []
             start = start if free == ONE_FOCAL else model
             yield model
         if is_as_near(model.worst_px, bound):  # more intrinsics cannot be nearer
             return
-    model = min(simple, key=lambda model: model.worst_px)
-    for free in _FREE if len(points) > 1 else ():
-        alone = (replace(model, Ks=model.Ks[v : v + 1], poses=model.poses[v : v + 1]) for v in range(len(points)))
-        each = [_solve([p], [q], start, free) for p, q, start in zip(points, pixels, alone, strict=True)]
-        Ks, poses = (np.concatenate([getattr(part, name) for part in each]) for name in ("Ks", "poses"))
-        model = _Model(Ks, poses, free * len(each), tuple(part.errors[0] for part in each))
+    model = min(one_focal_models, key=lambda model: model.worst_px)
+    for free in _FREE_INTRINSICS if len(points) > 1 else ():
+        view_starts = (replace(model, Ks=model.Ks[v : v + 1], poses=model.poses[v : v + 1]) for v in range(len(points)))
+        views = [_solve([p], [q], start, free) for p, q, start in zip(points, pixels, view_starts, strict=True)]
+        Ks, poses = np.concatenate([view.Ks for view in views]), np.concatenate([view.poses for view in views])
+        model = _Model(Ks, poses, free * len(views), tuple(view.errors[0] for view in views))
         yield model
 
 
@@ -147,7 +149,7 @@ def _solve(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start: _M
     for _ in range(_ROUNDS):
         K, poses = refine_poses(near_points, near_pixels, K, poses, free=free)
         errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]
-        are_near = [e <= max(_FAR_PX, _FAR * float(np.median(e))) for e in errors]
-        near_points = [part[near] for part, near in zip(points, are_near, strict=True)]
-        near_pixels = [part[near] for part, near in zip(pixels, are_near, strict=True)]
+        is_near = [e <= max(_FAR_PX, _FAR * float(np.median(e))) for e in errors]  # one mask for each view
+        near_points = [view_points[mask] for view_points, mask in zip(points, is_near, strict=True)]
+        near_pixels = [view_pixels[mask] for view_pixels, mask in zip(pixels, is_near, strict=True)]
     return _Model(np.tile(K, (len(poses), 1, 1)), poses, free, tuple(errors))

@@ -88,16 +88,16 @@ class MovedCameras:
         if not self.moves:
             x, y = (self.cameras.Ks[:, :2, 2] - (self.cameras.width / 2, self.cameras.height / 2)).mean(0)
             return f"principal points lie ({x:.1f}, {y:.1f}) px from the middle, as the Gaussians' pixels show"
-        what = (
+        text = (
             f"the cameras are off by a median of up to {self.worst_px:.1f} px: each was moved to where its Gaussians"
             " lie in their pixels"
         )
         if self.confirmed:
-            what = (
+            text = (
                 f"the Gaussians are off their pixels by a median of up to {self.worst_px:.1f} px: those of each view"
                 " were moved to its camera, since the photos agree better from there"
             )
-        return f"{what}, {describe_moves(self.moves)}"
+        return f"{text}, {describe_moves(self.moves)}"
 
 
 def max_pixels(width: int, height: int) -> float:
@@ -139,9 +139,9 @@ def move_cameras(
 
 
 def _photos_confirm(pairs: Correspondences, images: np.ndarray, given: Cameras, moved: Cameras) -> bool:
-    """Return True if photos agree better from the given poses than from the moved ones.
+    """Return True if photos agree better from the given poses than from the moved poses.
 
-    For the given poses the Gaussians of each view are moved with its camera.
+    To compare photos from the given poses, the Gaussians of each view are moved with its camera.
     """
     motions = matmul(invert(given.viewmats), moved.viewmats)[pairs.views]
     points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
@@ -171,10 +171,10 @@ def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     weights = np.ones(x.shape[1])
     with np.errstate(all="ignore"):
         for _ in range(_LINE_ROUNDS):
-            left, right = ((weights * values).sum(1, keepdims=True) / weights.sum() for values in (x, y))
-            across, up = x - left, y - right
-            slopes = (weights * across * up).sum(1, keepdims=True) / (weights * across**2).sum(1, keepdims=True)
-            heights = right - slopes * left
+            mean_x, mean_y = ((weights * values).sum(1, keepdims=True) / weights.sum() for values in (x, y))
+            dx, dy = x - mean_x, y - mean_y
+            slopes = (weights * dx * dy).sum(1, keepdims=True) / (weights * dx**2).sum(1, keepdims=True)
+            heights = mean_y - slopes * mean_x
             errors = np.sqrt(((y - slopes * x - heights) ** 2).sum(0))
             weights = robust_weights(errors, 3, 1e-9)
     return slopes[:, 0], heights[:, 0], errors
@@ -188,11 +188,12 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
     if len(np.unique(pairs.views)) < 2:  # in a single view a shift of the picture looks like a rotation
         return None
     with np.errstate(all="ignore"):
-        places, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
-    good = (depth[:, 0] > 0) & np.isfinite(places[:, 0]).all(1)
-    before, wanted = places[good, 0], pairs.pixels[good]
-    axes = [fit_lines(before[:, [axis]], wanted[:, [axis]])[:2] for axis in range(2)]  # each with weights of its own
-    factors, shifts = np.array(axes)[:, :, 0].T
+        xy, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
+    in_front = (depth[:, 0] > 0) & np.isfinite(xy[:, 0]).all(1)
+    projected, pixels = xy[in_front, 0], pairs.pixels[in_front]
+    # x and y are fitted one by one, so that each axis has its own weights
+    lines = [fit_lines(projected[:, [axis]], pixels[:, [axis]])[:2] for axis in range(2)]
+    factors, shifts = np.array(lines)[:, :, 0].T
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]
     Ks[:, :2, 2] += shifts
     other = replace(cameras, Ks=Ks)
@@ -201,7 +202,11 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
 
 
 def _check_assumed(cameras: Cameras, other: Cameras, before_px: float, source: str) -> None:
-    """Raise SceneError unless only principal points differ that were in the middle of the image."""
+    """Raise SceneError if ``other`` cameras differ in more than assumed principal points.
+
+    Principal points count as assumed if all are in the middle of the image. ``before_px`` is the median error of the
+    stored cameras, pixels.
+    """
     factors = other.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
     middle = cameras.width / 2, cameras.height / 2
     if (cameras.Ks[:, :2, 2] == middle).all() and (np.abs(factors - 1) <= SAME_FOCAL).all():

@@ -19,15 +19,19 @@ from gsmerge.kernels.reproject import follow_pixels, nearest_centres
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
-_SAMPLE_POINTS, _LEAST_POINTS = 20_000, 60  # about as many points test cameras; fewer may lie near centres by chance
-# A first check uses that many points. Its limit is wider by four standard errors of the median, 0.72 / sqrt(2000) each
+# Approximate number of points that test cameras, and least number. Fewer points may all lie near centres by chance
+_SAMPLE_POINTS, _LEAST_POINTS = 20_000, 60
+# A first check uses fewer points. Its limit is wider by four standard errors of their median, which are
+# 0.72 / sqrt(2000) each
 _FIRST_POINTS, _ROUGHLY = 2000, 1.07
-_PART = 1 << 16  # points that are projected at once
+_ROWS_AT_ONCE = 1 << 16  # points that a task projects
 _MIN_SEEN = 0.95  # share of the points that must be in some view; the right cameras show all
-# A view is right if significantly more points than by chance lie around its centres. The radius is that many times the
-# median distance, at most that many pixels; significant are that many standard errors
+# A view is right if significantly more points than by chance lie within a radius of its centres. The radius is the
+# first number times the median distance, and at most the second number of pixels. The excess is significant if it is
+# larger than the third number of standard errors
 _WIDE, _WIDEST_PX, _ERRORS = 2.0, 0.4, 4.0
-# Largest median distance over that by chance. It is well below 1, because a grid seen from elsewhere forms patterns
+# Largest median distance, divided by the median distance by chance. It is well below 1, because grids seen from wrong
+# cameras form patterns
 _NEARER = 0.9
 _MIN_RIGHT = 0.9  # share of the points whose nearest centre must be in a right view
 _FIRST_ROWS = 20_000  # rows that must follow the order of the pixels before all rows are tried
@@ -52,7 +56,7 @@ class CentreCheck:
 
     @property
     def tells_pixels(self) -> bool:
-        """True if points lie so near to centres that the nearest centre is that of their own pixel."""
+        """True if points lie so near to centres that the nearest centre belongs to their own pixel."""
         return self.ok and self.px <= self.limit_px
 
     @property
@@ -83,9 +87,9 @@ def check_centres(points: np.ndarray, cameras: Cameras) -> CentreCheck:
 
 
 def _compare_with_chance(points: np.ndarray, cameras: Cameras) -> tuple[CentreCheck, np.ndarray]:
-    """Compare the distances of points from centres with chance; also return the view with the nearest centre of each.
+    """Compare the distances of points from pixel centres with chance.
 
-    Only points that some view shows have a view.
+    Also returns the view with the nearest centre, for each point that is shown in any view.
     """
     ids, distances, num_views = _find_nearest(points, cameras)
     shown = num_views > 0
@@ -97,16 +101,21 @@ def _compare_with_chance(points: np.ndarray, cameras: Cameras) -> tuple[CentreCh
 
 
 def find_rows(means: np.ndarray, valid: np.ndarray, cameras: Cameras, check: CentreCheck) -> np.ndarray | None:
-    """Find the pixel ``(view·H + y)·W + x`` of each row ``[n]`` from its mean ``[n,3]``; -1 for a few rows without.
+    """Find the pixel ``(view·H + y)·W + x`` of each row ``[n]`` from its mean ``[n,3]``.
 
-    ``valid [n]`` bool. Some pixels may have no row. If ``check`` tells pixels, rows may be in any order, otherwise they
-    must be in the order of the pixels. None if too many rows have no pixel, for example because several share one.
+    ``valid [n]`` bool. Some pixels may have no row, and a few rows may have no pixel, -1. If ``check`` tells pixels,
+    rows may be in any order, otherwise they must be in the order of the pixels. None if too many rows have no pixel,
+    for example because several rows share a pixel.
     """
     rows = np.flatnonzero(valid)
-    points, views = np.ascontiguousarray(means[rows], np.float32), len(cameras)
-    ids = _find_centres(points, cameras, check.limit_px) if check.tells_pixels else None
-    for mixed in (False, True)[:views] if ids is None else ():
-        ids = _follow(points, cameras, mixed=mixed) if ids is None else ids
+    points = np.ascontiguousarray(means[rows], np.float32)
+    ids: np.ndarray | None
+    if check.tells_pixels:
+        ids = _find_centres(points, cameras, check.limit_px)
+    else:
+        ids = _follow(points, cameras, mixed=False)
+        if ids is None and len(cameras) > 1:
+            ids = _follow(points, cameras, mixed=True)
     if ids is None or (ids >= 0).sum() < _MIN_PLACED * len(rows):
         return None
     out = np.full(len(means), -1, np.int64)
@@ -115,13 +124,16 @@ def find_rows(means: np.ndarray, valid: np.ndarray, cameras: Cameras, check: Cen
 
 
 def _follow(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:
-    """Find the pixels ``[n]`` of rows in the order of pixels, -1 for a few without; None for rows in another order."""
+    """Find the pixels ``[n]`` of rows in the order of pixels; None for rows in another order.
+
+    A few rows may have no pixel, -1. For ``mixed`` see :func:`follow_rows`.
+    """
     ids, size = None, (cameras.width, cameras.height)
-    for part in (points[:_FIRST_ROWS], points):
-        if len(part) * len(cameras) > _MOST_PLACES:
+    for tried in (points[:_FIRST_ROWS], points):  # the first rows rule out most other orders
+        if len(tried) * len(cameras) > _MOST_PLACES:
             return None
-        ids = follow_rows(part, *_matrices(cameras), *size, mixed=mixed)
-        if (ids >= 0).sum() < _MIN_PLACED * len(part):
+        ids = follow_rows(tried, *_matrices(cameras), *size, mixed=mixed)
+        if (ids >= 0).sum() < _MIN_PLACED * len(tried):
             return None
     return ids
 
@@ -142,7 +154,7 @@ def follow_rows(
 
 
 def _find_centres(points: np.ndarray, cameras: Cameras, limit_px: float) -> np.ndarray:
-    """Find the pixel ``[n]`` whose centre is within ``limit_px`` pixels of each point ``[n,3]``; -1 without.
+    """Find the pixel ``[n]`` of each point ``[n,3]``, whose centre is within ``limit_px`` pixels; -1 without.
 
     If several points are nearest to the same centre, the nearest point gets the pixel. The other points get their
     nearest free pixel in another view.
@@ -168,20 +180,20 @@ def _find_centres(points: np.ndarray, cameras: Cameras, limit_px: float) -> np.n
 
 
 def _find_nearest(points: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pixel ``[n]`` with the nearest centre to each point, its distance in pixels, and the number of views.
+    """Find the pixel ``[n]`` with the nearest centre to each point ``[n,3]`` in all views.
 
-    The number counts the views that show the point.
+    Also returns the distances ``[n]`` from these centres, pixels, and the number ``[n]`` of views that show each point.
     """
     count = len(points)
     ids, squares, num_views = np.empty(count, np.int64), np.empty(count), np.empty(count, np.int32)
     points, matrices = np.ascontiguousarray(points, np.float32), _matrices(cameras)
 
     def project(first: int) -> None:
-        part = slice(first, first + _PART)
+        rows = slice(first, first + _ROWS_AT_ONCE)
         size = cameras.width, cameras.height
-        nearest_centres(points[part], *matrices, ids[part], squares[part], num_views[part], *size)
+        nearest_centres(points[rows], *matrices, ids[rows], squares[rows], num_views[rows], *size)
 
-    parallel_map(project, range(0, count, _PART))
+    parallel_map(project, range(0, count, _ROWS_AT_ONCE))
     return ids, np.sqrt(squares), num_views
 
 

@@ -1,4 +1,7 @@
-"""Choose between the depths of Gaussians and of depth maps by the other views; Depth Anything 3 writes both."""
+"""Choose between the depths of Gaussians and the depths of maps, by votes of other views.
+
+Depth Anything 3 writes both.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,8 @@ _COLOR = 5.0  # reduction of a view's agreement per unit of difference in colour
 _MIN_LEAD = 0.5  # in agreement, by which one depth of a pixel wins the vote
 _MIN_DIFFERENT = 0.05  # share of a view's pixels whose depths differ; with fewer, no choice for the whole view
 _CLEAR_LEAD = 0.2  # mean lead among the votes of a view and of the scene that decides for the whole view
-# Otherwise the maps win a pixel by this lead among the votes around it, if this share of pixels around it votes. The
-# first number is the standard deviation of the neighbourhood, pixels
+# Otherwise the maps win a pixel if their lead among the votes around it exceeds the second number, and the share of
+# pixels around it that vote exceeds the third. The first number is the standard deviation of the neighbourhood, pixels
 _AROUND, _LOCAL_LEAD, _LOCAL_SHARE = 12.0, 0.6, 0.4
 
 
@@ -38,34 +41,38 @@ def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> tuple[Scene, i
     depths = camera_depths(means, viewmats[:, None])
     usable = (fronts >= 0) & (depths > 0) & (maps > 0) & np.isfinite(maps)
     ratios = np.where(usable, maps, 1) / np.where(usable, depths, 1)
-    best = np.zeros_like(usable), means, ratios  # mask of pixels that take the map's depth, their means, depth factors
+    # mask [v,p] of pixels whose Gaussians move, means [v,p,3] at the depths of the maps, and factors [v,p] of the depth
+    best = np.zeros_like(usable), means, ratios
     for scale in (unit, 1 / float(np.median(ratios[usable]))) if views > 1 and usable.any() else ():
         factors = np.where(usable, np.clip(scale * ratios, 1 / _MAX_FACTOR, _MAX_FACTOR), 1)
         differ = np.abs(factors - 1) > _SAME
         if not differ.any():
             return scene, 0
-        placed = np.stack([c + (m - c) * f[:, None] for c, m, f in zip(centres, means, factors, strict=True)])
-        votes = _count_votes(scene, means, placed, differ)
+        map_means = np.stack([
+            centre + (view_means - centre) * view_factors[:, None]
+            for centre, view_means, view_factors in zip(centres, means, factors, strict=True)
+        ])  # fmt: skip
+        votes = _count_votes(scene, means, map_means, differ)
         lead = float(votes.sum() / max(1, np.abs(votes).sum()))
         if scale == unit or lead > _CLEAR_LEAD:
-            best = _select_pixels(votes, differ) & usable, placed, factors
+            best = _select_pixels(votes, differ) & usable, map_means, factors
         if lead > _CLEAR_LEAD:
             break
-    chosen, placed, factors = best
-    rows = fronts[chosen]
+    is_moved, map_means, factors = best
+    rows = fronts[is_moved]
     if len(rows) == 0:
         return scene, 0
     means, scales = g.means.copy(), g.scales.copy()
-    means[rows], scales[rows] = placed[chosen], g.scales[rows] * factors[chosen][:, None]
+    means[rows], scales[rows] = map_means[is_moved], g.scales[rows] * factors[is_moved][:, None]
     return replace(scene, gaussians=replace(g, means=means, scales=scales)), len(rows)
 
 
-def _count_votes(scene: Scene, means: np.ndarray, placed: np.ndarray, differ: np.ndarray) -> np.ndarray:
+def _count_votes(scene: Scene, means: np.ndarray, map_means: np.ndarray, differ: np.ndarray) -> np.ndarray:
     """Let other views vote ``[v,h,w]`` on each pixel: 1 for the depth map, -1 for the Gaussian, 0 for neither.
 
-    ``means [v,p,3]`` are the Gaussians, and ``placed [v,p,3]`` the same Gaussians at the depths of the maps. A view
-    votes for the point that lies on its own surface and has its colour there. ``differ [v,p]`` are the pixels that are
-    voted on.
+    ``means [v,p,3]`` are the Gaussians, and ``map_means [v,p,3]`` the same Gaussians at the depths of the maps. A view
+    votes for the point that lies on its own surface and has its colour there. It votes on the pixels of other views
+    that are True in ``differ [v,p]``.
     """
     cameras, (views, pixels) = scene.cameras, differ.shape
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
@@ -73,7 +80,7 @@ def _count_votes(scene: Scene, means: np.ndarray, placed: np.ndarray, differ: np
     shown = scene_pixels.shown
     images = sh0_to_rgb(scene.gaussians.sh0[scene_pixels.fronts]) if scene.images is None else scene.images
     colors, opaque = np.ascontiguousarray(images, np.float32).reshape(-1, 3), np.ones(differ.size, np.float32)
-    both_points = [np.ascontiguousarray(points, np.float32).reshape(-1, 3) for points in (means, placed)]
+    both_points = [np.ascontiguousarray(points, np.float32).reshape(-1, 3) for points in (means, map_means)]
     ids = np.where(shown, np.arange(differ.size, dtype=np.int32).reshape(shown.shape), -1)
     centres = camera_centres(viewmats)
 
@@ -107,7 +114,8 @@ def _select_pixels(votes: np.ndarray, differ: np.ndarray) -> np.ndarray:
     sums, counts = votes.sum((1, 2)), np.abs(votes).sum((1, 2))
     leads = (sums / np.maximum(counts, 1) + sums.sum() / max(counts.sum(), 1)) / 2
     leads[differ.mean(1) < _MIN_DIFFERENT] = 0
-    around = np.stack([blur(np.stack([of_view, np.abs(of_view)], -1), _AROUND) for of_view in votes])
-    wins_locally = (around[..., 0] > _LOCAL_LEAD * around[..., 1]) & (around[..., 1] > _LOCAL_SHARE)
+    blurred = np.stack([blur(np.stack([view_votes, np.abs(view_votes)], -1), _AROUND) for view_votes in votes])
+    local_sums, local_counts = blurred[..., 0], blurred[..., 1]
+    wins_locally = (local_sums > _LOCAL_LEAD * local_counts) & (local_counts > _LOCAL_SHARE)
     leads, is_clear = leads[:, None, None], np.abs(leads[:, None, None]) > _CLEAR_LEAD
     return np.where(is_clear, leads > 0, wins_locally).reshape(differ.shape)

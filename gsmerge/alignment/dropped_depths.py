@@ -25,29 +25,38 @@ def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scen
     pixels = np.stack([x, y, np.ones(x.size)], 1)
     rays = matmul(pixels, invert(scene.cameras.Ks).transpose(0, 2, 1))  # [v,p,3] in the camera, z = 1
     z = camera_depths(g.means[fronts].astype(np.float64), V[:, None])
-    length, maps = np.linalg.norm(rays, axis=2), maps.reshape(len(scene), -1).astype(np.float64)
-    known = (maps > 0) & np.isfinite(maps)
-    usable = (fronts >= 0) & known & (z > 0)
+    lengths, maps = np.linalg.norm(rays, axis=2), maps.reshape(len(scene), -1).astype(np.float64)
+    has_depth = (maps > 0) & np.isfinite(maps)
+    usable = (fronts >= 0) & has_depth & (z > 0)
     if not usable.any():
         return scene
-    ratio = z[usable] / maps[usable]
-    fits = []
-    for is_distance, ratios in enumerate((ratio, ratio * length[usable])):
-        middle = float(np.median(ratios))
-        fits.append((float(np.median(np.abs(ratios / middle - 1))), middle, is_distance))
-    spread, unit, is_distance = min(fits)
+    spread, unit, is_distance = _fit_unit(z[usable], maps[usable], lengths[usable])
     if spread > _MAX_SPREAD:
         return scene
-    places = np.flatnonzero((fronts < 0) & known)
-    views = places // (height * width)
-    new_z = (unit * maps / (length if is_distance else 1)).reshape(-1)[places]
-    local = rays.reshape(-1, 3)[places] * new_z[:, None]
+    empty = np.flatnonzero((fronts < 0) & has_depth)  # pixels that get a Gaussian
+    views = empty // (height * width)
+    new_z = (unit * maps / (lengths if is_distance else 1)).reshape(-1)[empty]
+    local = rays.reshape(-1, 3)[empty] * new_z[:, None]
     means = (V[views, :3, :3] * (local - V[views, :3, 3])[:, :, None]).sum(1)
     previous = np.flatnonzero(usable)
-    previous = previous[np.maximum(np.searchsorted(previous, places) - 1, 0)]
+    previous = previous[np.maximum(np.searchsorted(previous, empty) - 1, 0)]
     models = g[fronts.reshape(-1)[previous]]
     scales = models.scales * (new_z / z.reshape(-1)[previous]).astype(np.float32)[:, None]
-    sh0 = rgb_to_sh0(images.reshape(-1, 1, 3)[places]).astype(g.sh0.dtype)
+    sh0 = rgb_to_sh0(images.reshape(-1, 1, 3)[empty]).astype(g.sh0.dtype)
     means = means.astype(g.means.dtype)
     added = Gaussians(means, models.quats, scales, models.opacities, sh0, np.zeros_like(models.shN))
-    return fill_pixels(scene, added, places)
+    return fill_pixels(scene, added, empty)
+
+
+def _fit_unit(z: np.ndarray, maps: np.ndarray, lengths: np.ndarray) -> tuple[float, float, bool]:
+    """Find the unit of depth maps, and whether they hold distances from the camera instead of depths along z.
+
+    ``z [n]`` are depths of Gaussians, ``maps [n]`` the depths of the maps in the same pixels, and ``lengths [n]`` the
+    distances of points at depth 1. The better of both kinds is returned, with its spread first: the median relative
+    deviation of the ratios.
+    """
+    fits = []
+    for is_distance, ratios in ((False, z / maps), (True, z / maps * lengths)):
+        unit = float(np.median(ratios))
+        fits.append((float(np.median(np.abs(ratios / unit - 1))), unit, is_distance))
+    return min(fits)

@@ -20,17 +20,19 @@ from gsmerge.alignment.score import find_correspondences, is_as_near
 from gsmerge.kernels.matrices import matmul
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line
-_SAMPLES = 1500  # rows whose nearest neighbour is searched among the rows after them
+_SAMPLES = 1500  # number of rows whose nearest neighbour is searched among the rows after them
 _MIN_SHARE, _MAX_LENGTHS = 0.02, 2  # share of samples with the same distance in rows; number of distances tried
 _SEEDS, _MAX_SERIES = 12, 200  # number of series of lines that are solved first, and in all
 _RARE = 0.05  # columns in a smaller share of the lines than the fullest column are left out
-_WRAP, _BELOW = 8.0, 0.25  # least step back to the left, over the usual step; largest step down, over the step back
+# Least step back to the left, divided by the usual step; and largest step down, divided by the step back
+_WRAP, _BELOW = 8.0, 0.25
 _MAX_JUMPS = 100  # long steps per line; with more, rows are in no order
 _MIN_LINES = 6  # complete lines that follow each other
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 1.0  # median distance of rows from their pixels
 _SAME = 2  # pixels of tolerance for the principal point
-_AHEAD, _MIN_AHEAD = 0.3, 2  # lines beyond the solved ones that a camera predicts: as a share of these, and at least
+# Number of lines beyond the solved lines that a camera predicts: as a share of the solved lines, and at least
+_AHEAD, _MIN_AHEAD = 0.3, 2
 _MAX_LOST = 16  # consecutive rows without a pixel, after which another view begins
 _MIN_PLACED = 0.9  # share of the rows that must have a pixel
 
@@ -68,8 +70,8 @@ def _find_lengths(points: np.ndarray) -> list[int]:
         return _MIN_SIDE + int(np.argmin(right * right + down * down + ahead * ahead))
 
     counts = np.bincount([find_nearest(start) for start in starts], minlength=2 * longest)
-    beside = np.maximum(np.roll(counts, 1), np.roll(counts, -1))
-    peaks = np.where(counts >= beside, counts, 0)
+    neighbours = np.maximum(np.roll(counts, 1), np.roll(counts, -1))
+    peaks = np.where(counts >= neighbours, counts, 0)
     highest = np.argsort(-peaks, kind="stable")[:_MAX_LENGTHS]
     return [int(length) for length in highest if peaks[length] >= _MIN_SHARE * len(starts)]
 
@@ -117,18 +119,34 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
     rows = np.flatnonzero(steps > _WRAP * usual) + 1
     if len(rows) * length > _MAX_JUMPS * len(points):
         return []
-    jumps, firsts = steps[rows - 1], points[rows]
-    before, least = np.full(len(rows), -1), _BELOW * jumps  # for each row, the row that begins the line before it
+    return _collect_series(rows, _link_lines(rows, points[rows], _BELOW * steps[rows - 1], length))
+
+
+def _link_lines(rows: np.ndarray, points: np.ndarray, limits: np.ndarray, length: int) -> np.ndarray:
+    """Find for each of ``rows [r]``, which may begin lines, the line before; return its index ``[r]``, -1 without.
+
+    The line before begins ``length`` rows earlier. Its first point is the nearest of ``points [r,3]``, within
+    ``limits [r]``.
+    """
+    before, least = np.full(len(rows), -1), limits
     for back in range(1, len(rows)):
         apart = rows[back:] - rows[:-back]
         if apart.min() > length:
             break
         ids = np.flatnonzero(apart == length)
-        distances = np.linalg.norm(firsts[ids + back] - firsts[ids], axis=1)
+        distances = np.linalg.norm(points[ids + back] - points[ids], axis=1)
         closer = distances < least[ids + back]
         ids, distances = ids[closer], distances[closer]
         before[ids + back], least[ids + back] = ids, distances
-    lines = np.zeros(len(rows), np.int64)  # number of lines before each
+    return before
+
+
+def _collect_series(rows: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
+    """Collect the longest series of lines that follow each other, without a shared line; the longest series first.
+
+    ``rows [r]`` begin the lines, and ``before [r]`` is the index of the line before, or -1.
+    """
+    lines = np.zeros(len(rows), np.int64)  # number of lines before each line in its series
     for i, previous in enumerate(before.tolist()):
         lines[i] = lines[previous] + 1 if previous >= 0 else 0
     series, used = [], np.zeros(len(rows), bool)
@@ -153,7 +171,7 @@ def _solve_lines(points: np.ndarray, starts: np.ndarray) -> _View | None:
 
 
 def _drop_rare_columns(view: _View) -> _View:
-    """Leave out the rows of outer columns that few lines have; count columns from the first remaining one."""
+    """Leave out outer columns that few lines have; count columns from the first remaining column."""
     first = int(view.x.min())
     counts = np.bincount(view.x - first)
     common = first + np.flatnonzero(counts >= _RARE * counts.max())
@@ -177,8 +195,8 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
         first, last = max(low, view.rows[0] - reach * width), min(high, view.rows[-1] + 1 + reach * width)
         shift = np.array([[1.0, 0, 0], [0, 1, reach - top], [0, 0, 1]])
         viewmat = np.concatenate([view.camera, [[0, 0, 0, 1]]])
-        part = np.ascontiguousarray(points[first:last], np.float32)
-        pixels = follow_rows(part, viewmat[None], shift[None], width, lines + 2 * reach)
+        followed = np.ascontiguousarray(points[first:last], np.float32)
+        pixels = follow_rows(followed, viewmat[None], shift[None], width, lines + 2 * reach)
         rows = np.flatnonzero(pixels >= 0)
         stretches = np.split(rows, np.flatnonzero(np.diff(rows) > _MAX_LOST) + 1)
         rows = max(stretches, key=len)
@@ -197,10 +215,10 @@ def _free_range(free: np.ndarray, rows: np.ndarray) -> tuple[int, int]:
 
 def _solve(points: np.ndarray, view: _View) -> _View:
     """Solve for the camera of a view."""
-    chosen = np.linspace(0, len(view.rows) - 1, min(_SOLVED_FROM, len(view.rows))).astype(int)
-    pixels = np.stack([view.x[chosen], view.y[chosen]], 1) + 0.5
-    camera, px = projective_camera(points[view.rows[chosen]], pixels)
-    depths = matmul(points[view.rows[chosen]], camera[2, :3]) + camera[2, 3]
+    sample = np.linspace(0, len(view.rows) - 1, min(_SOLVED_FROM, len(view.rows))).astype(int)
+    pixels = np.stack([view.x[sample], view.y[sample]], 1) + 0.5
+    camera, px = projective_camera(points[view.rows[sample]], pixels)
+    depths = matmul(points[view.rows[sample]], camera[2, :3]) + camera[2, 3]
     return replace(view, camera=camera * np.copysign(1.0, np.median(depths)), px=px)
 
 
@@ -223,11 +241,11 @@ def _choose_shifts(views: Sequence[tuple[np.ndarray, float]]) -> tuple[list[int]
     firsts, middles = np.array([pixels.min() for pixels, _ in views]), np.array([middle for _, middle in views])
     sizes = np.array([pixels.max() for pixels, _ in views]) - firsts + 1
     starts = firsts - middles
-    places = np.rint(starts - np.median(starts[sizes == sizes.max()])).astype(int)
-    inside = places.clip(0, sizes.max() - sizes)  # of the largest view
-    places = np.where(np.abs(places - inside) <= _SAME, inside, places)
-    places -= places.min()
-    return (places - firsts).tolist(), int((places + sizes).max())
+    corners = np.rint(starts - np.median(starts[sizes == sizes.max()])).astype(int)  # relative to the largest view
+    inside = corners.clip(0, sizes.max() - sizes)
+    corners = np.where(np.abs(corners - inside) <= _SAME, inside, corners)
+    corners -= corners.min()
+    return (corners - firsts).tolist(), int((corners + sizes).max())
 
 
 def _principal(view: _View, axis: int) -> float:

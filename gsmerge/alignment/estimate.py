@@ -28,7 +28,7 @@ def estimate_cameras(
     ``names`` are the names of the views. All views have one of the ``sizes`` (width, height) in pixels. ``valid [n]``
     is bool, and ``path`` is for messages. None if no order of the rows fits at least twice as well as all other orders.
     """
-    layouts = [each for size in dict.fromkeys(sizes) for each in exact_layouts(len(gaussians), len(names), *size)]
+    layouts = [layout for size in dict.fromkeys(sizes) for layout in exact_layouts(len(gaussians), len(names), *size)]
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
     fits = []
     for layout in possible:

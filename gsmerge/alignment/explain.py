@@ -22,7 +22,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, Convention
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.types import Cameras, Gaussians
 
-_SOME_CAMERA = 4.0  # times the limit; rows that are nearer to their pixels are the pixels of some projective camera
+_SOME_CAMERA = 4.0  # rows nearer than this multiple of the limit are the pixels of some projective camera
 _ORDERS = {  # other orders of rows in words, by the order of the layout
     "view-fastest": "row, column, view (view fastest)",
     "column-major": "view, column, row (column-major)",
@@ -44,13 +44,13 @@ def check_frame(inputs: AlignmentInput, camera_file: CameraFile) -> None:
     if inputs.order in MAY_BE_UNALIGNED or len(inputs.gaussians) != len(cameras) * cameras.width * cameras.height:
         return
     pairs = sample_pixels(inputs.gaussians, cameras, inputs.valid)
-    alignment, of_first_view = check_pairs(pairs, cameras), pairs.select(pairs.views == 0)
-    if projective_error(of_first_view.points, of_first_view.pixels) < _SOME_CAMERA * alignment.limit_px:
+    alignment, first_view = check_pairs(pairs, cameras), pairs.select(pairs.views == 0)
+    if projective_error(first_view.points, first_view.pixels) < _SOME_CAMERA * alignment.limit_px:
         raise misalignment_error(camera_file.path, alignment, None)
 
 
 def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
-    """Make the SceneError for as many rows as pixels that fit no layout, or several layouts if ``alignment`` is ok.
+    """Make the SceneError for rows that are as many as the pixels and fit no layout, or several if ``alignment`` is ok.
 
     ``reason``: another convention or order that fits, see :func:`explain_misalignment`.
     """

@@ -1,9 +1,9 @@
-"""Estimate the focal length of cameras of which only the poses are known.
+"""Estimate the focal length of cameras whose file has only poses.
 
 If rows are pixels, the focal length follows from their rays. Under a given pose, the coordinate of a pixel is a linear
 function of the slope of the direction to its Gaussian. The factor is the focal length, and the coordinate at slope 0 is
-the principal point. Otherwise the focal length is searched for which Gaussians project to pixels of their own colours
-in the photos.
+the principal point. Otherwise many focal lengths are tried; at the right one, Gaussians project to pixels of their own
+colours in the photos.
 """
 
 from __future__ import annotations
@@ -35,18 +35,19 @@ _GRID_GAUSSIANS = 500  # Gaussians per view that intrinsics are solved from
 _MAX_UNEVEN = 1.5  # largest ratio of the two focal lengths
 _MAX_VIEWS = 12  # number of photos that are compared with the Gaussians
 _SIDE = 256  # longer side of these photos, pixels
-_SHORTEST = 0.25  # shortest focal length that is tried, over the photo's longer side
+_SHORTEST = 0.25  # shortest focal length that is tried, divided by the photo's longer side
 _STEP = 1.06  # ratio of neighbouring focal lengths that are tried
 _STEPS = 48  # number of focal lengths that are tried; the last is four times the longer side
 _FEW_GAUSSIANS = 3000  # Gaussians that are compared with the photos at each of these focal lengths
 _SAMPLE_GAUSSIANS = 20_000  # Gaussians that are compared near the best focal length
-_SPANS = (0.3, 0.08, 0.02, 0.005, 0.00125)  # ranges around the best, over the focal length, that are searched in turn
+_SPANS = (0.3, 0.08, 0.02, 0.005, 0.00125)  # ranges around the best that are searched in turn, in focal lengths
 _STRIDES = 0, 1, 2, 4  # multiples of a round's change that are added, to move along a valley (Hooke and Jeeves 1961)
 _ROUNDS = 16  # of search in each range, at most
 _FINE, _FEWER = 0.01, 8  # in ranges above this one only every eighth Gaussian is compared
 _MAX_ERROR = 0.1  # largest colour error of a Gaussian, of 1; a larger one means that the photo shows another surface
 _HALF = 4  # number of steps to either side of the best
-_ENTRIES = (((0, 0), (1, 1)), ((0, 0),), ((1, 1),), ((0, 2),), ((1, 2),))  # of the intrinsics that change together
+# Entries of the intrinsics that change together: both focal lengths, fx, fy, cx, cy
+_ENTRIES = (((0, 0), (1, 1)), ((0, 0),), ((1, 1),), ((0, 2),), ((1, 2),))
 _CHANGES = [np.array([[float((i, j) in entries) for j in range(3)] for i in range(3)]) for entries in _ENTRIES]
 
 
@@ -56,7 +57,7 @@ class _Pictures:
 
     views: list[int]  # ids of the cameras in the camera file
     images: np.ndarray  # ``[v,h,w,3]`` float32
-    ratio: float  # width of a small photo over that of the original
+    ratio: float  # width of a small photo, divided by the width of the original
 
     def pinhole(self, focal: float) -> np.ndarray:
         """Make intrinsics with one focal length, in pixels of the small photos, and a central principal point."""
@@ -103,24 +104,24 @@ def _intrinsics_of_rays(
 ) -> np.ndarray | None:
     """Solve for intrinsics ``[3,3]``, pixels, under which the rows of a grid lie on their rays; None if that fails.
 
-    ``conventions`` are the poses ``[c,4,4]`` in each convention, and ``size`` is that of the photos.
+    ``conventions`` are the poses ``[c,4,4]`` in each convention, and ``size`` is the size of the photos.
     """
     count, views, names = len(ply.gaussians), len(camera_file), camera_file.names
     for grid in _possible_sizes(ply, size):
         fits: list[tuple[float, tuple[float, ...], int]] = []
-        for number, layout in enumerate(exact_layouts(count, views, grid.width, grid.height)):
+        for layout_id, layout in enumerate(exact_layouts(count, views, grid.width, grid.height)):
             if len(set(layout.views)) < views:
                 continue
             for sample in subsample(layout, _GRID_GAUSSIANS).with_views_in(view_orders(names)):
                 pairs = find_correspondences(ply.gaussians.means, ply.valid, sample)
                 solved = (_solve_intrinsics(pairs, viewmats) for viewmats in conventions)
-                fits += [(px, values, number) for px, values in solved]
+                fits += [(px, intrinsics, layout_id) for px, intrinsics in solved]
         fits.sort()
         if not fits or fits[0][0] > pixel_limit(grid.width, grid.height):
             continue
-        px, values, best = fits[0]
-        if all(is_clearly_nearer(px, other) for other, _, number in fits if number != best):
-            fx, fy, cx, cy = values
+        px, intrinsics, best_id = fits[0]
+        if all(is_clearly_nearer(px, other_px) for other_px, _, layout_id in fits if layout_id != best_id):
+            fx, fy, cx, cy = intrinsics
             x, y = (cx + grid.left) / grid.scale_x, (cy + grid.top) / grid.scale_y
             return make_pinhole(fx / grid.scale_x, fy / grid.scale_y, x, y)
     estimated = estimate_cameras(Path(camera_file.path), ply.gaussians, ply.valid, names, size)  # without the poses
@@ -128,7 +129,7 @@ def _intrinsics_of_rays(
 
 
 def _possible_sizes(ply: GaussianFile, size: Size) -> Iterator[PhotoTransform]:
-    """Yield transforms of photos to each size that the grid may have: their own, then those that the rows show."""
+    """Yield transforms of photos to each size that the grid may have: their own size, then sizes that rows show."""
     yield resize_to(size, size)
     shapes = ((layout.width, layout.height) for layout in find_layouts(ply.gaussians, ply.valid))
     for shape in dict.fromkeys(shapes):
@@ -136,23 +137,24 @@ def _possible_sizes(ply: GaussianFile, size: Size) -> Iterator[PhotoTransform]:
 
 
 def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[float, tuple[float, ...]]:
-    """Solve for intrinsics (fx, fy, cx, cy) in pixels under given poses; also return the error.
+    """Solve for intrinsics (fx, fy, cx, cy) in pixels under given poses; return the error and the intrinsics.
 
-    The error comes first. It is the largest median distance of a part of the rows from its pixels, or inf on failure.
+    The error is the median distance of rows from their pixels, in the worst part of the layout. On failure it is inf,
+    and the intrinsics are empty.
     """
     poses = viewmats[pairs.views]
     camera = transform(poses[:, :3, :3], pairs.points) + poses[:, :3, 3]
-    front = camera[:, 2] > 0
-    if not front.any() or front.mean() <= 0.5:
+    in_front = camera[:, 2] > 0
+    if not in_front.any() or in_front.mean() <= 0.5:
         return math.inf, ()
-    slopes = camera[front, :2] / camera[front, 2:]
-    (fx, fy), (cx, cy), errors = fit_lines(slopes, pairs.pixels[front])
-    parts = pairs.parts[front]
-    worst = max(float(np.median(errors[parts == part])) for part in np.unique(parts))
-    uneven = fx / fy if 0 < fx < math.inf and 0 < fy < math.inf else math.inf
-    if not (math.isfinite(worst) and 1 / _MAX_UNEVEN < uneven < _MAX_UNEVEN):
+    slopes = camera[in_front, :2] / camera[in_front, 2:]
+    (fx, fy), (cx, cy), errors = fit_lines(slopes, pairs.pixels[in_front])
+    parts = pairs.parts[in_front]
+    worst_px = max(float(np.median(errors[parts == part])) for part in np.unique(parts))
+    focal_ratio = fx / fy if 0 < fx < math.inf and 0 < fy < math.inf else math.inf
+    if not (math.isfinite(worst_px) and 1 / _MAX_UNEVEN < focal_ratio < _MAX_UNEVEN):
         return math.inf, ()
-    return worst, (float(fx), float(fy), float(cx), float(cy))
+    return worst_px, (float(fx), float(fy), float(cx), float(cy))
 
 
 def _intrinsics_of_colors(
@@ -160,16 +162,15 @@ def _intrinsics_of_colors(
 ) -> np.ndarray | None:
     """Search for intrinsics ``[3,3]``, pixels, under which the Gaussians have the photos' colours; None if none do."""
     pictures = _small_pictures(photos, size)
-    few = _sample(ply, _FEW_GAUSSIANS)
+    sample = _sample(ply, _FEW_GAUSSIANS)
     focals = [_SHORTEST * max(pictures.images.shape[1:3])]
     while len(focals) < _STEPS:
         focals.append(focals[-1] * _STEP)
     for viewmats in conventions:
-        checks = [_check(few, pictures, viewmats, focal) for focal in focals]
-        best = max(range(len(focals)), key=lambda number: checks[number].score)
+        checks = [_check(sample, pictures, viewmats, focal) for focal in focals]
+        best = max(range(len(focals)), key=lambda i: checks[i].score)
         if checks[best].ok and not math.isnan(checks[best].color_ratio):
-            many = _sample(ply, _SAMPLE_GAUSSIANS)
-            K = _refine(many, pictures, viewmats, focals[best])
+            K = _refine(_sample(ply, _SAMPLE_GAUSSIANS), pictures, viewmats, focals[best])
             return K * np.array([1 / pictures.ratio, 1 / pictures.ratio, 1])[:, None]
     return None
 
@@ -183,7 +184,7 @@ def _sample(ply: GaussianFile, count: int) -> Gaussians:
 def _small_pictures(photos: PhotoArrays, size: Size) -> _Pictures:
     """Select evenly spaced photos and reduce their size."""
     count = len(photos)
-    views = sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MAX_VIEWS))})
+    views = sorted({round(view) for view in np.linspace(0, count - 1, min(count, _MAX_VIEWS))})
     ratio = min(1.0, _SIDE / max(size))
     width, height = (max(1, round(side * ratio)) for side in size)
     small = resize_to(size, (width, height))
@@ -224,8 +225,8 @@ def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, foc
 def _color_error(points: np.ndarray, colors: np.ndarray, cameras: Cameras, images: np.ndarray) -> float:
     """Measure the mean error of colours ``[n,3]`` in the photos, at most 0.1 for each point and view.
 
-    Points outside a photo have an error of 0.1. The limit makes hidden points count nearly the same wherever they
-    project to.
+    Points outside a photo have an error of 0.1. Because of the limit, hidden points count nearly the same wherever they
+    project.
     """
     total = 0.0
     for view, image in enumerate(images):

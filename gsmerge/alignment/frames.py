@@ -20,9 +20,9 @@ from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, sol
 from gsmerge.types import Cameras
 
 _ROUNDS = 4  # of reweighted least squares
-_MAX_POINTS = 2000  # points that a camera's pose is solved from
+_MIN_POSE_POINTS, _MAX_POINTS = 6, 2000  # least and most points that a camera's pose is solved from
 _SAME_ROTATION = 0.01  # largest difference of entries of rotation matrices that count as equal
-_NEAR_ROTATION = 0.2  # largest difference of entries between an exporter's rotation and the one that own poses show
+_NEAR_ROTATION = 0.2  # largest difference of entries between an exporter's rotation and the mean rotation of own poses
 _MIN_AGREEMENT = 0.9  # smallest singular value of a mean rotation; it is near 1 if the rotations agree
 _SMALL_ROTATION, _SMALL_SCALE = 10.0, 0.05  # degrees, and natural logarithm
 _HALF = np.sqrt(0.5)
@@ -51,7 +51,7 @@ def _usual_rotations(cameras: Cameras) -> tuple[tuple[np.ndarray, str, str], ...
 def usual_frames(cameras: Cameras, scale: float | None = None) -> list[Similarity]:
     """List the frames of exporters in which nothing has to be solved for, the frame of the cameras first.
 
-    ``scale`` is the scale of the Gaussians' world over that of the cameras, if known.
+    ``scale`` is the length of one unit of the cameras' world in the world of the Gaussians, if known.
     """
     frames = [IDENTITY if scale is None else scale_by(scale, ", as given")]
     for rotation, name, kind in _usual_rotations(cameras)[1:]:
@@ -62,7 +62,7 @@ def usual_frames(cameras: Cameras, scale: float | None = None) -> list[Similarit
 def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Similarity]:
     """List the usual frames, the frames of viewers, and the frame of the first camera.
 
-    The frame of the cameras comes first, that of the first camera last.
+    The frame of the cameras comes first, and the frame of the first camera last.
     """
     pose, unit = cameras.viewmats[0], scale or 1.0
     origin = np.zeros(3)
@@ -112,7 +112,7 @@ def solved_frames(
 
 
 def mean_rotation(own: Mapping[int, np.ndarray], viewmats: np.ndarray) -> np.ndarray | None:
-    """Average over views the rotation from the frame of ``viewmats`` to that of ``own``; None if the views disagree.
+    """Average the rotation from the frame of ``viewmats`` to the frame of ``own`` over views; None if they disagree.
 
     ``viewmats [c,4,4]`` and ``own`` are poses of the same views in two frames.
     """
@@ -139,22 +139,22 @@ def solve_frame(
 
     ``rotation`` is given. Without ``shifted`` only the scale is solved for. None if the scale is not positive.
     """
-    rays, centres = (matmul(part, rotation.T) for part in rays_and_centres)
+    rays, centres = (matmul(vectors, rotation.T) for vectors in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     columns = [transform(across, centres)[:, :, None]] + ([across] if shifted else [])
     A, b = np.concatenate(columns, 2), transform(across, points)
     weights, solution = np.ones(len(points)), np.zeros(A.shape[2])
     for _ in range(_ROUNDS):
-        heavy = (A * weights[:, None, None]).reshape(-1, A.shape[2])
-        left, right = matmul(heavy.T, A.reshape(-1, A.shape[2])), matmul(heavy.T, b.reshape(-1))
-        unit = np.sqrt(np.maximum(np.diag(left), 1e-300))
-        solution = solve_symmetric(left / np.outer(unit, unit), right / unit) / unit
+        weighted = (A * weights[:, None, None]).reshape(-1, A.shape[2])
+        normal, target = matmul(weighted.T, A.reshape(-1, A.shape[2])), matmul(weighted.T, b.reshape(-1))
+        unit = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        solution = solve_symmetric(normal / np.outer(unit, unit), target / unit) / unit
         if not np.isfinite(solution).all() or solution[0] <= 0:
             return None
         shift = solution[1:] if shifted else np.zeros(3)
-        away = points - solution[0] * centres - shift
-        depth = np.abs((away * rays).sum(1)) + 1e-12
-        angle = np.linalg.norm(transform(across, away), axis=1) / depth
+        from_centres = points - solution[0] * centres - shift
+        depth = np.abs((from_centres * rays).sum(1)) + 1e-12
+        angle = np.linalg.norm(transform(across, from_centres), axis=1) / depth
         weights = robust_weights(angle, 3, 1e-12, depth)
     return Similarity(rotation, float(solution[0]), shift)
 
@@ -169,21 +169,21 @@ def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray |
     """Solve for the world-to-camera matrix ``[4,4]`` of a view from its own pixels; None if that fails."""
     rows = np.flatnonzero(pairs.views == view)
     rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
-    if len(rows) < 6:
+    if len(rows) < _MIN_POSE_POINTS:
         return None
     points, pixels = pairs.points[rows], pairs.pixels[rows]
     middle, unit = np.median(points, 0), float(np.median(np.abs(points - np.median(points, 0)))) or 1.0
-    near, K = (points - middle) / unit, K.astype(np.float64)
-    for _ in range(2):
-        start = start_pose(near, pixels, K)
+    points, K = (points - middle) / unit, K.astype(np.float64)
+    for _ in range(2):  # the second time without points far from their pixels
+        start = start_pose(points, pixels, K)
         if start is None:
             return None
         pose = start
-        error = projection_errors(near, pixels, K, pose)
-        good = error <= max(1.0, 3 * float(np.median(error)))
-        near, pixels = near[good], pixels[good]
+        errors = projection_errors(points, pixels, K, pose)
+        is_near = errors <= max(1.0, 3 * float(np.median(errors)))
+        points, pixels = points[is_near], pixels[is_near]
     try:
-        _, (pose,) = refine_poses([near], [pixels], K, pose[None])
+        _, (pose,) = refine_poses([points], [pixels], K, pose[None])
     except np.linalg.LinAlgError:  # points in one place
         return None
     pose[:3, 3] = unit * pose[:3, 3] - matmul(pose[:3, :3], middle)

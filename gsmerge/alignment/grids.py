@@ -1,4 +1,7 @@
-"""Bring cameras and photos to each size that the grid of the rows may have: sizes that files give or rows show."""
+"""Bring cameras and photos to each size that the grid of the rows may have.
+
+Files give some sizes, and the rows themselves show others.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ SQUARE = 256  # side of the images of pixelSplat and its relatives, pixels
 _MULTIPLES = (8, PATCH)  # if photos are cropped, both sides of the grid are multiples of one of these
 _STRETCHED, _MAX_STRETCH = 16, 0.15  # ReSplat stretches photos to multiples of 16 pixels, and by at most 15 %
 _MIN_CROP = 0.5  # smallest share of a photo's area that is left after cropping
-_NEAR_SIZE = 0.05  # largest difference, over the longer side, between assumed camera sizes and photo sizes
+_NEAR_SIZE = 0.05  # largest difference between assumed camera sizes and photo sizes, divided by the longer side
 _MAX_ENLARGED = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
 
 
@@ -37,7 +40,7 @@ class Grid:
     transform: PhotoTransform | None  # applied to the photos; None: nothing
     notes: tuple[str, ...]  # notes for the user, one sentence each
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
-    given: np.ndarray | None = None  # ``[c,4,4]`` given poses that the photos confirm; Gaussians are to be moved there
+    given: np.ndarray | None = None  # ``[c,4,4]`` given poses that the photos confirm; Gaussians move there
 
     @property
     def size(self) -> Size:
@@ -76,9 +79,9 @@ def with_poses(grid: Grid, poses: Poses) -> Grid:
 
 
 def with_photo_size(camera_file: CameraFile, size: Size | None, tolerance: float = 1) -> CameraFile:
-    """Give cameras the size of the photos if theirs differs by up to ``tolerance`` pixels.
+    """Give cameras the size of the photos if the cameras' own size differs by up to ``tolerance`` pixels.
 
-    Such a size may have been computed as twice the principal point. The same cameras are returned otherwise.
+    The own size may have been computed as twice the principal point. The same cameras are returned otherwise.
     """
     stored = sizes_of(camera_file)
     if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= tolerance:
@@ -105,8 +108,8 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> Grid:
             swapped = (w, h) == (height, width)
             remedy = "width and height are swapped" if swapped else "crop cameras and images alike"
             raise SceneError(camera_file.path, problem, remedy)
-    other = [s for s in sizes_of(camera_file) if s != size]
-    notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other)
+    scaled = [camera_size for camera_size in sizes_of(camera_file) if camera_size != size]
+    notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in scaled)
     return Grid(camera_file, to_cameras(camera_file, size), None, notes)
 
 
@@ -115,7 +118,7 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
 
     ``size`` is the size of the photos in memory, which may be reduced from ``file_size``.
     """
-    x, y = (whole / part for whole, part in zip(file_size, size, strict=True))
+    x, y = (file_side / side for file_side, side in zip(file_size, size, strict=True))
     transform = replace(transform, scale_x=x * transform.scale_x, scale_y=y * transform.scale_y)
     note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
     is_same = file_size == (transform.width, transform.height)
@@ -123,7 +126,7 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
 
 
 def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
-    """Return True if oblong pixels become square at the size of the photos: the model has stretched the photos."""
+    """Return True if the model has stretched the photos, so that oblong pixels become square at the photos' size."""
     if camera_file.focal is None:
         return False
     focals = camera_file.Ks[:, (0, 1), (0, 1)]
@@ -165,8 +168,8 @@ def grids_of(
     base = size or (sizes[0] if len(sizes) == 1 else None)
     if base is None or any(not same_shape(s, base) for s in sizes):
         return []
-    near = with_photo_size(camera_file, base, _NEAR_SIZE * max(base))
-    files = [camera_file] + [near] * (near is not camera_file)
+    at_photo_size = with_photo_size(camera_file, base, _NEAR_SIZE * max(base))
+    files = [camera_file] if at_photo_size is camera_file else [camera_file, at_photo_size]
     subject = "photos and cameras" if size is not None else "cameras"
     grids: list[Grid] = []
     for transform in transforms(base):
@@ -179,21 +182,27 @@ def grids_of(
 
 
 def shown_sizes(size: Size, shape: Size) -> list[PhotoTransform]:
-    """List the transforms that shrink photos to a grid that has the ``shape`` of the rows without its borders."""
+    """List the transforms that shrink photos of a ``size`` to a grid whose borders may have been cut off.
+
+    ``shape`` is (width, height) of the rows, the grid without its borders.
+    """
     transforms = []
     for trim in (0, *TRIMS):
-        to = shape[0] + 2 * trim, shape[1] + 2 * trim
-        if to == size or to[0] > size[0] or to[1] > size[1]:
+        grid_size = width, height = shape[0] + 2 * trim, shape[1] + 2 * trim
+        if grid_size == size or width > size[0] or height > size[1]:
             continue
-        aspect = to[0] * size[1] / (to[1] * size[0])
-        is_usual = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _MULTIPLES)
-        may_stretch = abs(aspect - 1) <= _MAX_STRETCH and to[0] % _STRETCHED == to[1] % _STRETCHED == 0
+        aspect = width * size[1] / (height * size[0])
+        is_usual = width == height or any(width % side == height % side == 0 for side in _MULTIPLES)
+        may_stretch = abs(aspect - 1) <= _MAX_STRETCH and width % _STRETCHED == height % _STRETCHED == 0
         may_crop = min(aspect, 1 / aspect) >= _MIN_CROP and is_usual
-        transforms += [resize_to(size, to)] * (abs(aspect - 1) <= ASPECT_TOLERANCE or (may_crop and may_stretch))
-        transforms += [resize_and_crop(size, to)] * may_crop
+        if abs(aspect - 1) <= ASPECT_TOLERANCE or (may_crop and may_stretch):
+            transforms.append(resize_to(size, grid_size))
+        if may_crop:
+            transforms.append(resize_and_crop(size, grid_size))
     for transform in (*(resize_to(size, half) for half in _half_sizes(size)), *patch_grids(size)):
-        to = transform.width, transform.height
-        transforms += [transform] * (da3_box(*to).pixels(*to).shape == shape[::-1])
+        width, height = transform.width, transform.height
+        if da3_box(width, height).pixels(width, height).shape == shape[::-1]:
+            transforms.append(transform)
     return list(dict.fromkeys(transforms))
 
 
@@ -227,7 +236,10 @@ def patch_grids(size: Size) -> list[PhotoTransform]:
 
 
 def small_photos_error(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
-    """Return the error for photos of another size than a pixel grid of the cameras' size; None for other photos."""
+    """Make the SceneError for rows that fill a grid of the cameras' size, while the photos have another size.
+
+    None for other numbers of rows and for photos of the cameras' size.
+    """
     grid_size = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
     if size is None or grid_size is None or grid_size == size:
         return None

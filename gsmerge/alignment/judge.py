@@ -25,7 +25,9 @@ from gsmerge.alignment.score import (
 )
 from gsmerge.errors import SceneError
 
-COLOR_MARGIN = 1.5  # least ratio of colour errors, of the next candidate and of shuffled pixels, over that of the best
+# Least colour error of the next candidate and of shuffled pixels, divided by the colour error of the best candidate
+COLOR_MARGIN = 1.5
+_COMPARED_ROWS = 200  # rows of each part that are compared to find out whether two layouts differ
 _WRONG_SIZE_PX = 0.3  # a grid of a wrong size has a larger median distance at every scale
 
 
@@ -52,10 +54,9 @@ class Recovery:
     """The chosen layout of the rows, and how clearly it is the right one."""
 
     chosen: Candidate
-    # distance of the Gaussians from shuffled pixels over the distance from their own pixels
-    margin: float
+    margin: float  # distance of the Gaussians from shuffled pixels, divided by their distance from their own pixels
     other: ScoredLayout | None = None  # another layout that fits the pixels as well; None if the pixels decided
-    color_margin: float | None = None  # colour error of the other layout over that of the chosen one
+    color_margin: float | None = None  # colour error of the other layout, divided by that of the chosen layout
     # True if the photos' colours agree with the layout, False if they do not, None without photos that could decide
     confirmed: bool | None = None
 
@@ -79,41 +80,47 @@ class Recovery:
 def judge(
     candidates: Sequence[Candidate], read: Callable[[Grid], AlignmentInput], rescore: Callable[[Candidate], Candidate]
 ) -> Recovery | None:
-    """Choose the candidate nearest to its pixels, or of equally near ones the one with the right colours.
+    """Choose the candidate that is nearest to its pixels; among equally near candidates the photos' colours decide.
 
     Only candidates with the least effort count, see :class:`ScoredLayout`. ``read`` reads the photos of a grid, and
     ``rescore`` scores a candidate on more Gaussians. None if no candidate stands out; SceneError if poses fit in
     several conventions.
     """
-    effort = min((each.scored.effort for each in candidates), default=0)
-    first, *_ = ranked = sorted((each for each in candidates if each.scored.effort == effort), key=lambda each: each.px)
-    near = [each for each in ranked if not is_clearly_nearer(first.px, each.px)]
-    conventions = list(dict.fromkeys(each.grid.camera_file.convention for each in near))
-    if len(conventions) > 1:
-        both = " and as ".join(map(describe_convention, conventions[:2]))
-        problem = f"expected poses that fit in one convention, found that they fit as {both}"
-        raise SceneError(first.grid.camera_file.path, problem, "convert them to the convention of the format")
-    if first.scored.layout.kind == "pruned":  # rows that lack pixels also fit into grids of nearly the same size
-        near = [each for each in near if each.grid.size == first.grid.size]
-    colors = [color_error(read(each.grid), each.scored.layout) for each in near] if len(near) > 1 else [math.nan]
-    order = sorted(range(len(near)), key=lambda i: (colors[i], i))
-    different = [i for i in order if _differs(near[i].scored.layout, near[order[0]].scored.layout)]
+    effort = min((candidate.scored.effort for candidate in candidates), default=0)
+    by_distance = sorted((c for c in candidates if c.scored.effort == effort), key=lambda candidate: candidate.px)
+    nearest = by_distance[0]
+    tied = [candidate for candidate in by_distance if not is_clearly_nearer(nearest.px, candidate.px)]
+    _check_one_convention(tied)
+    if nearest.scored.layout.kind == "pruned":  # rows that lack pixels also fit into grids of nearly the same size
+        tied = [candidate for candidate in tied if candidate.grid.size == nearest.grid.size]
+    colors = [color_error(read(c.grid), c.scored.layout) for c in tied] if len(tied) > 1 else [math.nan]
+    by_color = sorted(range(len(tied)), key=lambda i: (colors[i], i))
+    different = [i for i in by_color if _differs(tied[i].scored.layout, tied[by_color[0]].scored.layout)]
     if not different:  # the same layout, but photos resized by several transforms
-        equal = [i for i in order if is_as_near(near[i].px, first.px)]
-        return _accept(rescore(near[equal[0]]), read)
-    best, other = rescore(near[order[0]]), near[different[0]].scored
+        as_near = [i for i in by_color if is_as_near(tied[i].px, nearest.px)]
+        return _accept(rescore(tied[as_near[0]]), read)
+    best, other = rescore(tied[by_color[0]]), tied[different[0]].scored
     inputs = read(best.grid)
     shuffled_px, shuffled_color = score_shuffled(inputs, best.scored)
-    color, next_color = colors[order[0]], min(colors[different[0]], shuffled_color)
-    colors_decide = next_color > SAME_COLORS and next_color >= COLOR_MARGIN * color  # False without photos: NaN
+    color, next_color = colors[by_color[0]], min(colors[different[0]], shuffled_color)
+    colors_decide = next_color > SAME_COLORS and next_color >= COLOR_MARGIN * color  # False if colours are NaN
     if not (colors_decide and beats_shuffled(best.scored, shuffled_px)):
         return None
     margin = shuffled_px / max(best.px, AS_NEAR_PX)
     return Recovery(best, margin, other, next_color / max(color, 1e-3), True)
 
 
+def _check_one_convention(candidates: Sequence[Candidate]) -> None:
+    """Raise SceneError if candidates read the poses in several conventions."""
+    conventions = list(dict.fromkeys(candidate.grid.camera_file.convention for candidate in candidates))
+    if len(conventions) > 1:
+        both = " and as ".join(map(describe_convention, conventions[:2]))
+        problem = f"expected poses that fit in one convention, found that they fit as {both}"
+        raise SceneError(candidates[0].grid.camera_file.path, problem, "convert them to the convention of the format")
+
+
 def _accept(candidate: Candidate, read: Callable[[Grid], AlignmentInput]) -> Recovery | None:
-    """Accept the only candidate if it is much nearer to its pixels than to shuffled ones; None if it is not."""
+    """Accept the only candidate if it is much nearer to its pixels than to shuffled pixels; None if it is not."""
     inputs = read(candidate.grid)
     shuffled_px, shuffled_color = score_shuffled(inputs, candidate.scored)
     if not beats_shuffled(candidate.scored, shuffled_px):
@@ -128,7 +135,8 @@ def _differs(layout: Layout, other: Layout) -> bool:
     """Return True if two layouts assign rows to different pixels; only a sample of rows of each part is compared."""
     if (layout.width, layout.height, layout.views) != (other.width, other.height, other.views):
         return True
-    if [r.size for r in layout.rows] != [r.size for r in other.rows]:
+    if [part_rows.size for part_rows in layout.rows] != [part_rows.size for part_rows in other.rows]:
         return True
-    a, b = subsample(layout, 200), subsample(other, 200)
-    return not all(np.array_equal(x, y) for x, y in zip((*a.rows, *a.pixels), (*b.rows, *b.pixels), strict=True))
+    sample, other_sample = subsample(layout, _COMPARED_ROWS), subsample(other, _COMPARED_ROWS)
+    arrays, other_arrays = (*sample.rows, *sample.pixels), (*other_sample.rows, *other_sample.pixels)
+    return not all(map(np.array_equal, arrays, other_arrays))

@@ -17,7 +17,7 @@ TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at eve
 _MAX_TRIM = 0.25  # largest trim at every border, over the shorter side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
 _FEW_ROWS = 0.01  # parts with a smaller share of the rows of the largest part count as empty
-_ORDERED = 0.99  # share of consecutive rows that must be in ascending order of pixels
+_ORDERED = 0.99  # share of pairs of consecutive rows whose pixels must be in ascending order
 DEPTH_SHARE = 0.9  # share of each view's pixels that Depth Anything 3 exports, the nearest ones
 
 
@@ -69,7 +69,7 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class KeptBox:
+class PixelBox:
     """The exported pixels of a view: all but ``top`` lines above and below, and ``left`` columns on each side."""
 
     kind: str  # as in Layout
@@ -83,13 +83,13 @@ class KeptBox:
         return grid[self.top : height - self.top, self.left : width - self.left]
 
 
-def boxes(width: int, height: int) -> Iterator[KeptBox]:
+def boxes(width: int, height: int) -> Iterator[PixelBox]:
     """Yield the boxes of pixels that exporters may keep, likely boxes first.
 
-    First comes the whole picture. Boxes without 8 pixels at each border, and without 8/256 of the side as by Depth
-    Anything 3, follow. Boxes with any other border come last.
+    First comes the whole picture. The next box lacks 8 pixels at each border, as files of DepthSplat do. The third
+    lacks 8/256 of each side at both ends, as files of Depth Anything 3 do. Boxes with any other border come last.
     """
-    yield KeptBox("full", "every pixel", 0, 0)
+    yield PixelBox("full", "every pixel", 0, 0)
     usual, side = TRIMS[0], min(width, height)
     if side > 2 * usual:
         yield trim_box(usual)
@@ -99,15 +99,15 @@ def boxes(width: int, height: int) -> Iterator[KeptBox]:
     yield from (trim_box(trim) for trim in range(1, int(_MAX_TRIM * side) + 1) if trim != usual)
 
 
-def trim_box(trim: int) -> KeptBox:
+def trim_box(trim: int) -> PixelBox:
     """Return the box without ``trim`` pixels at every border."""
-    return KeptBox("trim", f"{trim} pixels trimmed at every border", trim, trim)
+    return PixelBox("trim", f"{trim} pixels trimmed at every border", trim, trim)
 
 
-def da3_box(width: int, height: int) -> KeptBox:
+def da3_box(width: int, height: int) -> PixelBox:
     """Return the box of pixels that Depth Anything 3 keeps."""
     top, left = da3_trim(height), da3_trim(width)
-    return KeptBox("box", f"{top} rows and {left} columns trimmed at every border", top, left)
+    return PixelBox("box", f"{top} rows and {left} columns trimmed at every border", top, left)
 
 
 def da3_trim(side: int) -> int:
@@ -156,25 +156,30 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
             num_used, remainder = divmod(count, (height - 2 * box.top) * (width - 2 * box.left) * per_pixel)
             if remainder or not 1 <= num_used <= views:
                 continue
-            chosen = next((ids for ids in every_nth(views) if len(ids) == num_used), tuple(range(num_used)))
-            yield from _orders(count, box, per_pixel, chosen, width, height)
+            cameras = next((ids for ids in every_nth(views) if len(ids) == num_used), tuple(range(num_used)))
+            yield from _orders(count, box, per_pixel, cameras, width, height)
 
 
 def dropped_layout(pixel_ids: np.ndarray, views: int, width: int, height: int) -> Layout:
-    """Make the layout of rows from their pixels ``(view·H + y)·W + x`` ``[n]``, -1 for none; pixels may have no row."""
+    """Make the layout of n rows from their pixels ``[n]``, if some pixels may have no row.
+
+    A pixel is ``(view·H + y)·W + x``, or -1 for a row without a pixel.
+    """
     area = width * height
     parts = [np.flatnonzero(pixel_ids // area == view) for view in range(views)]
     placed = pixel_ids[pixel_ids >= 0]
     keys = {"view-major": placed, "view-fastest": placed % area * views + placed // area}
     order = next((name for name, key in keys.items() if (np.diff(key) > 0).mean() >= _ORDERED), "unordered")
-    pixels, chosen = tuple(pixel_ids[rows] % area for rows in parts), tuple(range(views))
-    return Layout(f"some pixels dropped, {order}", "pruned", order, width, height, chosen, tuple(parts), pixels)
+    pixels = tuple(pixel_ids[rows] % area for rows in parts)
+    cameras = tuple(range(views))
+    return Layout(f"some pixels dropped, {order}", "pruned", order, width, height, cameras, tuple(parts), pixels)
 
 
 def move_layout(layout: Layout, width: int, height: int, left: int, top: int) -> Layout:
     """Move a layout into a grid of another size, so that its first pixel moves to (left, top)."""
-    places = (np.divmod(pixels, layout.width) for pixels in layout.pixels)
-    return replace(layout, width=width, height=height, pixels=tuple((y + top) * width + x + left for y, x in places))
+    coordinates = (np.divmod(pixels, layout.width) for pixels in layout.pixels)
+    pixels = tuple((y + top) * width + x + left for y, x in coordinates)
+    return replace(layout, width=width, height=height, pixels=pixels)
 
 
 def full_layouts(views: int, per_pixel: int, width: int, height: int) -> Iterator[Layout]:
@@ -189,29 +194,29 @@ def _row_type(count: int) -> type[np.signedinteger[Any]]:
 
 
 def _orders(
-    count: int, box: KeptBox, per_pixel: int, views: tuple[int, ...], width: int, height: int
+    count: int, box: PixelBox, per_pixel: int, views: tuple[int, ...], width: int, height: int
 ) -> Iterator[Layout]:
     """Yield the layouts of ``count`` rows in each order; the rows are the pixels of a box in ``views``."""
-    index, grid = np.arange(count, dtype=_row_type(count)), box.pixels(width, height)
+    row_ids, grid = np.arange(count, dtype=_row_type(count)), box.pixels(width, height)
     rows, columns, num_views = *grid.shape, len(views)
-    rows_by_order = {  # each [view,layer,line,column]
-        "view-major": index.reshape(num_views, rows, columns, per_pixel).transpose(0, 3, 1, 2),
-        "view-fastest": index.reshape(rows, columns, per_pixel, num_views).transpose(3, 2, 0, 1),
-        "column-major": index.reshape(num_views, columns, rows, per_pixel).transpose(0, 3, 2, 1),
-        "layer-major": index.reshape(per_pixel, num_views, rows, columns).transpose(1, 0, 2, 3),
+    rows_by_order = {  # arrays [view,layer,line,column]
+        "view-major": row_ids.reshape(num_views, rows, columns, per_pixel).transpose(0, 3, 1, 2),
+        "view-fastest": row_ids.reshape(rows, columns, per_pixel, num_views).transpose(3, 2, 0, 1),
+        "column-major": row_ids.reshape(num_views, columns, rows, per_pixel).transpose(0, 3, 2, 1),
+        "layer-major": row_ids.reshape(per_pixel, num_views, rows, columns).transpose(1, 0, 2, 3),
     }
-    layers = f", {per_pixel} Gaussians per pixel" if per_pixel > 1 else ""
-    for order, ids in rows_by_order.items():
+    layer_text = f", {per_pixel} Gaussians per pixel" if per_pixel > 1 else ""
+    for order, ordered_rows in rows_by_order.items():
         if (order == "layer-major" and per_pixel == 1) or (order == "view-fastest" and num_views == 1):
             continue
         yield Layout(
-            description=f"{box.description}{layers}, {order}",
+            description=f"{box.description}{layer_text}, {order}",
             kind=box.kind,
             order=order,
             width=width,
             height=height,
             views=tuple(view for view in views for _ in range(per_pixel)),
-            rows=tuple(layer for layers in ids for layer in layers),
+            rows=tuple(layer for view_layers in ordered_rows for layer in view_layers),
             pixels=(grid.reshape(-1),) * (num_views * per_pixel),
             per_pixel=per_pixel,
         )
@@ -225,21 +230,22 @@ def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
     """
     views, height, width = depths.shape
     inside = da3_box(width, height).pixels(width, height)
-    # the threshold is the interpolated 90 % quantile of the view's depths, so the lower of its two neighbours decides
+    # The threshold is the 90 % quantile of the view's depths, interpolated between two depths. No depth lies between
+    # these two, so the pixels up to the lower one are the same
     rank = int(DEPTH_SHARE * (width * height - 1))
     near_pixels = []
     for depth in depths:
         mask = depth <= np.partition(depth.reshape(-1), rank)[rank]
         near_pixels.append(inside[mask.reshape(-1)[inside]])
-    for step, chosen in enumerate(every_nth(views), 1):
-        pixels = tuple(near_pixels[view] for view in chosen)
+    for step, cameras in enumerate(every_nth(views), 1):
+        pixels = tuple(near_pixels[view] for view in cameras)
         ends = np.cumsum([len(view_pixels) for view_pixels in pixels])
         if ends[-1] == count:
             border = da3_box(width, height).description.removesuffix(" at every border")
             step_text = "" if step == 1 else f", every {step}. view"
             description = f"{border}, nearest 90 % of each view{step_text}, view-major"
             rows = tuple(np.split(np.arange(count, dtype=np.int64), ends[:-1]))
-            return [Layout(description, "box+depth", "view-major", width, height, chosen, rows, pixels)]
+            return [Layout(description, "box+depth", "view-major", width, height, cameras, rows, pixels)]
     return []
 
 
@@ -247,9 +253,9 @@ def subsample(layout: Layout, per_part: int) -> Layout:
     """Thin a layout to about ``per_part`` rows of each part, spread over all columns and lines."""
     rows, pixels = [], []
     for part_rows, part_pixels in zip(layout.rows, layout.pixels, strict=True):
-        chosen = np.arange(0, part_rows.size, spread_step(-(-part_rows.size // per_part), layout.width))
-        rows.append(part_rows.flat[chosen])
-        pixels.append(part_pixels[chosen])
+        sample = np.arange(0, part_rows.size, spread_step(-(-part_rows.size // per_part), layout.width))
+        rows.append(part_rows.flat[sample])
+        pixels.append(part_pixels[sample])
     return replace(layout, rows=tuple(rows), pixels=tuple(pixels))
 
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import chain
+from itertools import chain, compress
 
 import numpy as np
 
@@ -39,8 +39,8 @@ from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import NO_IMAGES, PhotoArrays, Size, as_floats, photo_size
 from gsmerge.types import Cameras
 
-# A layout is dropped if its error under projective cameras exceeds that many limits, or that many times the error of
-# the best layout
+# A layout is dropped if its error under projective cameras exceeds the first number times the limit, or the second
+# number times the error of the best layout
 _MAX_LIMITS, _MAX_RATIO = 2.0, 3.0
 _MAX_SELECTIONS = 64  # selections of every n-th camera that are tried; hundreds of cameras have more
 _PROJECTED_GAUSSIANS = 200  # Gaussians of a view that the projective camera is solved from
@@ -56,7 +56,7 @@ class RowSource:
     camera_file: CameraFile
     photos: PhotoArrays
     order: str  # hint on the order of the rows; "auto": unknown
-    scale: float | None  # hint on the scale of the Gaussians' world over that of the cameras
+    scale: float | None  # hint on the length of one unit of the cameras' world in the Gaussians' world
     depths: Callable[[], np.ndarray | None]  # reads the depth maps ``[c,h,w]`` next to the cameras
 
     @property
@@ -81,41 +81,43 @@ class RowSource:
         return self.order in ("auto", order)
 
     def orders(self, grid: Grid) -> list[tuple[int, ...]]:
-        """List the orders that the views may be in: that of the file, and that of the names.
+        """List the orders that the views may be in: the order of the file, and the order of the names.
 
-        An order that only exchanges views with equal poses and photos is equivalent, and replaced by that of the file.
+        If the order of the names only exchanges views with equal poses and photos, the order of the file replaces it.
         """
-        first, *others = view_orders(self.camera_file.names)
+        file_order, name_order = view_orders(self.camera_file.names)
         cameras, photos = grid.cameras, self.photos
 
         def are_equal(a: int, b: int) -> bool:
             pairs = [(cameras.viewmats[a, :3], cameras.viewmats[b, :3]), (cameras.Ks[a], cameras.Ks[b])]
             pairs += [(photos[a], photos[b])] if len(photos) else []
-            return all(np.array_equal(one, other) for one, other in pairs)
+            return all(np.array_equal(array, other) for array, other in pairs)
 
-        equivalent = (all(a == b or are_equal(a, b) for a, b in zip(first, other, strict=True)) for other in others)
-        return [first, *(first if skip else other for skip, other in zip(equivalent, others, strict=True))]
+        is_equivalent = all(a == b or are_equal(a, b) for a, b in zip(file_order, name_order, strict=True))
+        return [file_order, file_order if is_equivalent else name_order]
 
 
 def match_views(source: RowSource, grid_layouts: Sequence[GridLayout]) -> list[Candidate]:
     """Match the views of each layout with the file's cameras; list the candidates that fit.
 
-    Layouts whose rows no projective camera shows in their pixels are left out. Other pose conventions are tried only if
-    no layout fits in the file's own.
+    A layout is left out if no projective camera shows its rows in their pixels. Other pose conventions are tried only
+    if no layout fits in the convention of the file.
     """
-    errors = [_projective_error(source, *each) for each in grid_layouts]
+    errors = [_projective_error(source, grid, layout) for grid, layout in grid_layouts]
     limit = _MAX_RATIO * max(min(errors, default=0.0), AS_NEAR_PX)
-    shown = [each for each, error in zip(grid_layouts, errors, strict=True) if error <= limit and math.isfinite(error)]
-    candidates = [candidate for each in shown for candidate in _match_layout(source, *each)]
-    for grid, layout in shown if not candidates else ():
-        candidates += [each for other in other_grids(source, grid) for each in _match_layout(source, other, layout)]
+    is_possible = [error <= limit and math.isfinite(error) for error in errors]
+    possible = list(compress(grid_layouts, is_possible))
+    candidates = [candidate for grid, layout in possible for candidate in _match_layout(source, grid, layout)]
+    for grid, layout in possible if not candidates else ():
+        for other_grid in other_grids(source, grid):
+            candidates += _match_layout(source, other_grid, layout)
     return candidates
 
 
 def other_grids(source: RowSource, grid: Grid) -> Iterator[Grid]:
     """Return a grid with its poses in each other convention."""
     poses = other_conventions(source.camera_file.viewmats, source.camera_file.convention)
-    return (with_poses(grid, each) for each in poses)
+    return (with_poses(grid, other_poses) for other_poses in poses)
 
 
 def _projective_error(source: RowSource, grid: Grid, layout: Layout) -> float:
@@ -143,8 +145,8 @@ def _match_layout(source: RowSource, grid: Grid, layout: Layout) -> list[Candida
     """
     inputs = source.inputs(grid, photos=False)
     pairs = inputs.pairs(sample_layout(layout, QUICK_GAUSSIANS))
-    numbers, parts = np.unique(layout.views, return_inverse=True)  # numbers of the views; the view of each part
-    count, pairs = len(numbers), replace(pairs, views=parts[pairs.parts])
+    views, view_of_part = np.unique(layout.views, return_inverse=True)
+    count, pairs = len(views), replace(pairs, views=view_of_part[pairs.parts])
 
     @cache
     def solve_poses(Ks: bytes) -> dict[int, np.ndarray]:
@@ -154,10 +156,10 @@ def _match_layout(source: RowSource, grid: Grid, layout: Layout) -> list[Candida
         return solve_poses(grid.cameras.Ks[list(cameras)].astype(np.float64).tobytes())
 
     def make_candidate(cameras: Sequence[int]) -> Candidate:
-        own = {cameras[view]: pose for view, pose in own_poses_with(cameras).items()}
-        views = np.array(cameras)
-        matched = replace(layout, views=tuple(views[parts].tolist()))
-        return Candidate(grid, score_views(inputs, matched, replace(pairs, views=views[pairs.views]), own))
+        poses = {cameras[view]: pose for view, pose in own_poses_with(cameras).items()}
+        camera_of_view = np.array(cameras)
+        matched = replace(layout, views=tuple(camera_of_view[view_of_part].tolist()))
+        return Candidate(grid, score_views(inputs, matched, replace(pairs, views=camera_of_view[pairs.views]), poses))
 
     selections = [ids for ids in every_nth(len(grid.cameras)) if len(ids) == count]
     selections = [*selections[:: max(1, -(-len(selections) // _MAX_SELECTIONS))], tuple(range(count))]
@@ -165,10 +167,10 @@ def _match_layout(source: RowSource, grid: Grid, layout: Layout) -> list[Candida
     candidates = [make_candidate(order) for order in orders]
     nearest = _nearest_cameras(own_poses_with(next(iter(orders))), count, grid.cameras)
     if nearest is not None and nearest not in orders and source.scale is None:
-        other = make_candidate(nearest)
-        same_axes = ("same", "scaled", "shifted") if count > 1 else ("same",)  # one view fits any camera
-        candidates += [other] if other.scored.frame.kind in same_axes else []
-    return [each for each in candidates if each.scored.alignment.ok]
+        candidate = make_candidate(nearest)
+        unrotated = ("same", "scaled", "shifted") if count > 1 else ("same",)  # a moved camera fits any single view
+        candidates += [candidate] if candidate.scored.frame.kind in unrotated else []
+    return [candidate for candidate in candidates if candidate.scored.alignment.ok]
 
 
 def _nearest_cameras(own: Mapping[int, np.ndarray], count: int, cameras: Cameras) -> tuple[int, ...] | None:
@@ -197,27 +199,27 @@ def score_views(
     cameras, viewmats = inputs.cameras, inputs.cameras.viewmats.astype(np.float64)
     for view, pose in own.items():
         viewmats[view] = pose
-    bound = score_layout(replace(inputs, cameras=replace(cameras, viewmats=viewmats)), layout, IDENTITY, pairs)
-    least = bound.alignment
-    if not least.ok and set(own) >= set(layout.views):
-        return bound  # no frame can be nearer than own poses
+    own_fit = score_layout(replace(inputs, cameras=replace(cameras, viewmats=viewmats)), layout, IDENTITY, pairs)
+    own_alignment = own_fit.alignment
+    if not own_alignment.ok and set(own) >= set(layout.views):
+        return own_fit  # in no frame can the cameras be nearer than own poses
     frames = chain(
         ((0, frame) for frame in usual_frames(cameras, inputs.scale)), solved_frames(pairs, cameras, own, inputs.scale)
     )
     fitting: list[ScoredLayout] = []
     for effort, frame in frames:
         scored = replace(score_layout(inputs, layout, frame, pairs), effort=effort)
-        measured = scored.alignment
+        alignment = scored.alignment
         if effort == 2 and fitting:
             break
-        if measured.ok and is_as_near(measured.worst_px, least.worst_px):
+        if alignment.ok and is_as_near(alignment.worst_px, own_alignment.worst_px):
             return scored
         is_solved = effort > 0 and inputs.scale is None
-        if measured.ok and not (is_solved and is_clearly_nearer(least.middle_px, measured.middle_px)):
-            fitting.append(scored)  # a solved frame far behind own poses is left out: its cameras are wrong
-    lowest = min((scored.alignment.worst_px for scored in fitting), default=math.inf)
-    near = (scored for scored in fitting if is_as_near(scored.alignment.worst_px, lowest))
-    return next(near, replace(bound, alignment=replace(least, ok=False)))
+        if alignment.ok and not (is_solved and is_clearly_nearer(own_alignment.middle_px, alignment.middle_px)):
+            fitting.append(scored)  # a solved frame is left out if it fits far worse than own poses: cameras are wrong
+    lowest_px = min((scored.alignment.worst_px for scored in fitting), default=math.inf)
+    nearest = (scored for scored in fitting if is_as_near(scored.alignment.worst_px, lowest_px))
+    return next(nearest, replace(own_fit, alignment=replace(own_alignment, ok=False)))
 
 
 def rescore(source: RowSource, candidate: Candidate) -> Candidate:

@@ -17,13 +17,13 @@ MAX_STRETCH = 0.5  # largest relative change of a focal length in one step
 ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4  # numbers of free intrinsics: fx = fy; fx, fy; fx, fy, cx, cy
 _Fit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]  # intrinsics, poses, normal equations
 MIN_POINTS = 24  # with fewer points almost any projective camera fits
-_FLAT = 1e-10  # second moment of an axis, over the largest one, below which points lie in a plane across the axis
+_FLAT = 1e-10  # second moment of an axis, divided by the largest one; below this, points lie in a plane across the axis
 _PROJECTIVE_ROUNDS = 8  # of reweighted least squares
-_SMALLEST_ERROR = 1e-6  # over the spread of the pixels
+_SMALLEST_ERROR = 1e-6  # divided by the standard deviation of the pixels
 
 
 def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
-    """Solve for the pose ``[4,4]``, world to camera, that shows points ``[n,3]`` at ``pixels [n,2]``; None if it fails.
+    """Solve for the pose ``[4,4]``, world to camera, that shows points ``[n,3]`` at ``pixels [n,2]``; None on failure.
 
     The solution of SQPnP (Terzakis and Lourakis 2020) is close to the optimum. At least three points are needed, and
     they should lie near the origin.
@@ -37,9 +37,9 @@ def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndar
 
 def projection_errors(points: np.ndarray, pixels: np.ndarray, K: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Measure the distances ``[n]`` of projected points ``[n,3]`` from their ``pixels [n,2]``, pixels."""
-    places = matmul(matmul(points, pose[:3, :3].T) + pose[:3, 3], K.T)
+    projected = matmul(matmul(points, pose[:3, :3].T) + pose[:3, 3], K.T)
     with np.errstate(all="ignore"):
-        return np.asarray(np.linalg.norm(places[:, :2] / places[:, 2:] - pixels, axis=1))
+        return np.asarray(np.linalg.norm(projected[:, :2] / projected[:, 2:] - pixels, axis=1))
 
 
 def refine_poses(
@@ -150,20 +150,21 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     basis = axes[:, used] / np.sqrt(values[used])
     local = matmul(homogeneous, basis)
     centre, size = pixels.mean(0), float(pixels.std()) or 1.0
-    wanted = (pixels - centre) / size
+    targets = (pixels - centre) / size
     zero = np.zeros_like(local)
-    across = np.concatenate([local, zero, -wanted[:, :1] * local], 1)
-    down = np.concatenate([zero, local, -wanted[:, 1:] * local], 1)
+    across = np.concatenate([local, zero, -targets[:, :1] * local], 1)
+    down = np.concatenate([zero, local, -targets[:, 1:] * local], 1)
     weights = np.ones(len(points))
     camera, error = np.zeros((3, local.shape[1])), np.full(len(points), np.inf)
     for _ in range(_PROJECTIVE_ROUNDS):
-        heavy = np.concatenate([across * weights[:, None], down * weights[:, None]])
-        camera = eigh(matmul(heavy.T, heavy))[1][:, 0].reshape(3, -1)
-        places = matmul(local, camera.T)
+        equations = np.concatenate([across * weights[:, None], down * weights[:, None]])
+        camera = eigh(matmul(equations.T, equations))[1][:, 0].reshape(3, -1)
+        projected = matmul(local, camera.T)
         with np.errstate(all="ignore"):
-            error = np.linalg.norm(places[:, :2] / places[:, 2:] - wanted, axis=1)
+            error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - targets, axis=1)
             error = np.where(np.isfinite(error), error, np.inf)
-            weights = np.sqrt(robust_weights(error, 2, _SMALLEST_ERROR, np.abs(places[:, 2]) + _SMALLEST_ERROR))
+            depth = np.abs(projected[:, 2]) + _SMALLEST_ERROR
+            weights = np.sqrt(robust_weights(error, 2, _SMALLEST_ERROR, depth))
     camera = matmul(camera, basis.T)
     camera[:2] = size * camera[:2] + centre[:, None] * camera[2]
     camera[:, :3] /= unit

@@ -18,14 +18,16 @@ from gsmerge.types import Scene
 _SAMPLE_PIXELS = 3000  # pixels per view whose normals are used
 _MAX_VIEWS = 200  # views whose normals are used
 _STEP = 2  # pixels to the neighbours that span the surface
-_FLAT = 0.8  # largest ratio of the thinnest over the middle scale at which the thinnest axis is taken for the normal
+_FLAT = 0.8  # largest thinnest scale, divided by the middle scale, at which the thinnest axis is taken for the normal
 _MIN_TESTED = 300  # Gaussians
 # Another format needs this mean cosine between thinnest axis and normal, and this gain over wxyz
 _MIN_COSINE, _MIN_GAIN = 0.6, 0.15
 _SIGNED_GAIN = 0.04  # the gain needed for xyzw if the last column is never negative, which is typical of w
 _AROUND = 5  # side of the square over which means are averaged before roots are compared, pixels
 _FOLLOWS = 0.95  # cosine above which an axis is the normal of the surface
-_MAX_MISSES = 0.5  # share of Gaussians whose axis is no normal under either root, over the share under other formats
+# Share of Gaussians whose axis is no normal under either root, divided by the least share under the other formats
+_MAX_MISSES = 0.5
+_XYZW_TO_WXYZ = [3, 0, 1, 2]  # columns of xyzw in the order wxyz
 _FORMATS: tuple[QuatChoice, ...] = ("wxyz", "xyzw", "camera")
 _DESCRIPTIONS = {
     "xyzw": "stored with w last",
@@ -59,7 +61,7 @@ def read_rotations(scene: Scene, quats: QuatChoice, world_rotation: np.ndarray |
 
 def from_xyzw(quats: np.ndarray) -> np.ndarray:
     """Reorder quaternions ``[n,4]`` from xyzw to wxyz."""
-    return quats[:, [3, 0, 1, 2]]
+    return quats[:, _XYZW_TO_WXYZ]
 
 
 def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +90,7 @@ def choose_rotations(scene: Scene, world_rotation: np.ndarray | None = None) -> 
     free_pages([scene.gaussians.quats])
     as_xyzw = from_xyzw(quats)
     by_format = [quats, as_xyzw, multiply_quats(_camera_quats(scene, world_rotation)[views], quats)]
-    means = parallel_map(lambda each: float(_cosines(each, thinnest, normals).mean()), by_format)
+    means = parallel_map(lambda format_quats: float(_cosines(format_quats, thinnest, normals).mean()), by_format)
     cosine: dict[QuatChoice, float] = dict(zip(_FORMATS, means, strict=True))
     best: QuatChoice = max(_FORMATS, key=lambda name: cosine[name])
     gain = _SIGNED_GAIN if best == "xyzw" and w_seems_last(scene.gaussians.quats) else _MIN_GAIN
@@ -134,8 +136,9 @@ def _is_root(
     """
     pairs = [square_roots(by_format[0]), *((quats, _add_half_turn(quats)) for quats in by_format)]
     roots = square_roots(by_format[1])
-    of_roots, *of_others = parallel_map(lambda pair: _score_better_of(pair, thinnest, normals, 0.0), [roots, *pairs])
-    if of_roots <= max(of_others):
+    scores = parallel_map(lambda pair: _score_better_of(pair, thinnest, normals, 0.0), [roots, *pairs])
+    root_score, *other_scores = scores
+    if root_score <= max(other_scores):
         return False
     smooth = _smooth_normals(scene)[scene.get_pixels().homes[rows]]
     best_other = max(_score_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in pairs)
@@ -164,9 +167,9 @@ def _smooth_normals(scene: Scene) -> np.ndarray:
     weights, means = shown[..., None].astype(np.float32), scene.gaussians.means[fronts]
     middle = means.mean((0, 1, 2), np.float64, where=weights > 0).astype(means.dtype)
     with np.errstate(over="ignore"):
-        both = np.concatenate([np.where(weights > 0, means - middle, 0).astype(np.float32), weights], 3)
-    around = np.stack([_average_around(view) for view in both])
-    grid = around[..., :3] / np.maximum(around[..., 3:], np.float32(1e-6))
+        weighted = np.concatenate([np.where(weights > 0, means - middle, 0).astype(np.float32), weights], 3)
+    averages = np.stack([_average_around(view) for view in weighted])  # the last channel is the mean weight
+    grid = averages[..., :3] / np.maximum(averages[..., 3:], np.float32(1e-6))
     x, y = np.arange(w), np.arange(h)
     with np.errstate(all="ignore"):  # means as large as 1e38 overflow
         across = grid[:, :, np.minimum(x + _STEP, w - 1)] - grid[:, :, np.maximum(x - _STEP, 0)]
@@ -188,14 +191,14 @@ def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     inner = np.arange(h * w).reshape(h, w)[_STEP:-_STEP, _STEP:-_STEP].reshape(-1)
     step = spread_step(len(inner) // _SAMPLE_PIXELS, w - 2 * _STEP)
     views = np.arange(0, v, -(-v // _MAX_VIEWS))
-    places = (h * w * views[:, None] + inner[::step]).reshape(-1)
+    pixels = (h * w * views[:, None] + inner[::step]).reshape(-1)
     fronts, means = scene.get_pixels().fronts.reshape(-1), scene.gaussians.means
-    left, right, above, below = (fronts[places + away] for away in (-_STEP, _STEP, -_STEP * w, _STEP * w))
-    good = np.minimum.reduce([fronts[places], left, right, above, below]) >= 0
-    places, left, right, above, below = (each[good] for each in (places, left, right, above, below))
+    left, right, above, below = (fronts[pixels + offset] for offset in (-_STEP, _STEP, -_STEP * w, _STEP * w))
+    has_neighbours = np.minimum.reduce([fronts[pixels], left, right, above, below]) >= 0
+    pixels, left, right, above, below = (ids[has_neighbours] for ids in (pixels, left, right, above, below))
     with np.errstate(all="ignore"):  # means as large as 1e38 overflow, and their pixels are left out
         across, down = ((means[b] - means[a]).astype(np.float32) for a, b in ((left, right), (above, below)))
         normals = normalize(np.cross(across, down))
     finite = np.isfinite(normals).all(1)
-    places = places[finite]
-    return normals[finite], fronts[places], places // (h * w)
+    pixels = pixels[finite]
+    return normals[finite], fronts[pixels], pixels // (h * w)

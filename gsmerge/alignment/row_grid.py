@@ -21,16 +21,18 @@ from gsmerge.types import Gaussians
 _MIN_SIDE = 16  # pixels of a grid
 _MAX_FASTEST = 512  # most rows from one pixel to the next, if the views and layers of a pixel follow each other
 _STEPS = 2000  # steps that are measured for each distance in rows
-_AS_SHORT = 1.5  # steps between neighbouring pixels have at most that many times the shortest median length
+_AS_SHORT = 1.5  # median length of steps between neighbouring pixels, at most this multiple of the shortest median
 _SEGMENT, _SEGMENTS = 1 << 17, 8  # rows of a part of the file whose steps are correlated, and number of parts
 _MAX_STEP = 8.0  # times the median; longer steps, at the edges of things, are clipped
 _MIN_PEAK = 8.0  # times the median correlation of steps; a period has a higher peak
 _SHARE = 0.25  # of the highest peak; periods of lines may have lower peaks than periods of views
-_MAX_PERIODS = 6  # that are tried
-_SAMPLE_GAUSSIANS = 200  # of a view that a projective camera is solved from
-_MIN_GAUSSIANS, _MAX_GAUSSIANS = 60, 10_000  # that a calibration is solved from: least of a view, most of all views
+_MAX_PERIODS = 6  # number of periods that are tried
+_SAMPLE_GAUSSIANS = 200  # Gaussians of a view from which a projective camera is solved
+_MIN_GAUSSIANS, _MAX_GAUSSIANS = 60, 10_000  # Gaussians for a calibration: at least per view, and at most in all views
 _PLACES = tuple(number * 0.6180339887498949 % 1 for number in range(9))  # of the sampled views, as shares of the file
 _RECURRENCE = 0.7548776662466927, 0.5698402909980532  # powers of the inverse of the plastic number
+
+_GREEN = 1  # colour channel whose steps are measured
 
 _Size = tuple[int, int, int]  # rows from pixel to pixel, pixels of a line, lines of a view
 
@@ -43,8 +45,8 @@ def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibrat
     rounds = (_calibrate_layouts(gaussians.means, valid, layouts) for layouts in _shown_layouts(gaussians, valid))
     fits = next(filter(None, rounds), [])
     nearest = min((calibration.worst_px for _, calibration in fits), default=0.0)
-    near = [fit for fit in fits if is_as_near(fit[1].worst_px, nearest)]
-    return min(near, key=lambda fit: len(set(fit[0].views)), default=None)
+    nearest_fits = [fit for fit in fits if is_as_near(fit[1].worst_px, nearest)]
+    return min(nearest_fits, key=lambda fit: len(set(fit[0].views)), default=None)
 
 
 def find_layouts(gaussians: Gaussians, valid: np.ndarray) -> list[Layout]:
@@ -86,15 +88,15 @@ def _shows_pixels(means: np.ndarray, valid: np.ndarray, layout: Layout) -> bool:
 
 def _thin(layout: Layout, samples: int) -> Layout:
     """Thin a layout of all pixels to about ``samples`` pixels of each part."""
-    chosen = _spread(samples, layout.width, layout.height)
-    rows = tuple(part_rows.flat[chosen] for part_rows in layout.rows)
-    return replace(layout, rows=rows, pixels=(chosen,) * len(rows))
+    pixels = _spread(samples, layout.width, layout.height)
+    rows = tuple(part_rows.flat[pixels] for part_rows in layout.rows)
+    return replace(layout, rows=rows, pixels=(pixels,) * len(rows))
 
 
 def _spread(count: int, width: int, height: int) -> np.ndarray:
     """Choose about ``count`` pixels ``y·W + x`` evenly, by the additive recurrence of the plastic number."""
-    places = (np.arange(1, count + 1)[:, None] * _RECURRENCE) % 1
-    x, y = (places * (width, height)).astype(np.int64).T
+    shares = (np.arange(1, count + 1)[:, None] * _RECURRENCE) % 1  # of the width and the height
+    x, y = (shares * (width, height)).astype(np.int64).T
     return np.unique(y * width + x)
 
 
@@ -148,38 +150,54 @@ def _find_height(means: np.ndarray, valid: np.ndarray, step: int, width: int) ->
 
 
 def _divisors(number: int) -> list[int]:
-    small = [part for part in range(1, int(number**0.5) + 1) if number % part == 0]
-    return sorted({*small, *(number // part for part in small)})
+    small = [divisor for divisor in range(1, int(number**0.5) + 1) if number % divisor == 0]
+    return sorted({*small, *(number // divisor for divisor in small)})
 
 
 def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[int]]:
     """Find the step in rows between neighbouring pixels, and the periods of steps, which divide the number of rows."""
-    means, count = gaussians.means, len(gaussians)
-    lags = np.arange(1, min(_MAX_FASTEST, count // _MIN_SIDE**2) + 1)
-    if not len(lags):
+    count = len(gaussians)
+    longest = min(_MAX_FASTEST, count // _MIN_SIDE**2)
+    if longest < 1:
         return 1, []
-    starts = np.linspace(0, count - lags[-1] - 1, _STEPS).astype(int)
+    fastest = _find_pixel_step(gaussians.means, valid, longest)
+    correlation = _correlate_steps(gaussians, fastest)
+    peaks = np.zeros(len(correlation))
+    neighbours = (correlation[: -2 * fastest] + correlation[2 * fastest :]) / 2
+    peaks[fastest:-fastest] = correlation[fastest:-fastest] - neighbours
+    likely = [lag for lag in _divisors(count) if _MIN_SIDE <= lag < len(peaks)]
+    lowest = _MIN_PEAK * float(np.median(np.abs(peaks)))
+    lowest = max([lowest, *(_SHARE * peaks[lag] for lag in likely)])
+    return fastest, [lag for lag in likely if peaks[lag] >= lowest > 0][:_MAX_PERIODS]
+
+
+def _find_pixel_step(means: np.ndarray, valid: np.ndarray, longest: int) -> int:
+    """Find the step in rows, up to ``longest``, between neighbouring pixels: the first with short distances."""
+    lags = np.arange(1, longest + 1)
+    starts = np.linspace(0, len(means) - longest - 1, _STEPS).astype(int)
     starts = starts[valid[starts]]
     ends = starts + lags[:, None]
     right, down, ahead = (np.abs(values[ends].astype(np.float64) - values[starts]) for values in means.T)
     steps = right + down + ahead
     lengths = np.median(steps, 1) if np.isfinite(steps).all() else np.array(list(map(_median, steps)))
-    fastest = int(lags[np.argmax(lengths <= _AS_SHORT * lengths.min())])
+    return int(lags[np.argmax(lengths <= _AS_SHORT * lengths.min())])
+
+
+def _correlate_steps(gaussians: Gaussians, fastest: int) -> np.ndarray:
+    """Correlate the steps between neighbouring pixels, ``fastest`` rows apart, by their distance in rows.
+
+    Steps of positions and of a colour are measured in segments of the file. Returns the correlation at distances from 0
+    to half a segment.
+    """
+    means, count = gaussians.means, len(gaussians)
     segment = 1 << min(_SEGMENT, count - fastest).bit_length() - 1
-    places = np.linspace(0, count - fastest - segment, min(_SEGMENTS, -(-count // segment))).astype(int)
+    starts = np.linspace(0, count - fastest - segment, min(_SEGMENTS, -(-count // segment))).astype(int)
     power = np.zeros(segment + 1)
-    for place in places:
-        for values in (*means.T, gaussians.sh0[:, 0, 1]):
-            power += _power(values[place : place + segment + fastest], fastest)
-    correlation = np.fft.irfft(power)[:segment] / np.arange(segment, 0, -1)  # of steps, by their distance in rows
-    correlation = correlation[: segment // 2 + fastest]
-    peaks = np.zeros(len(correlation))
-    beside = (correlation[: -2 * fastest] + correlation[2 * fastest :]) / 2
-    peaks[fastest:-fastest] = correlation[fastest:-fastest] - beside
-    likely = [lag for lag in _divisors(count) if _MIN_SIDE <= lag < len(peaks)]
-    lowest = _MIN_PEAK * float(np.median(np.abs(peaks)))
-    lowest = max([lowest, *(_SHARE * peaks[lag] for lag in likely)])
-    return fastest, [lag for lag in likely if peaks[lag] >= lowest > 0][:_MAX_PERIODS]
+    for start in starts:
+        for values in (*means.T, gaussians.sh0[:, 0, _GREEN]):
+            power += _power(values[start : start + segment + fastest], fastest)
+    correlation = np.fft.irfft(power)[:segment] / np.arange(segment, 0, -1)
+    return correlation[: segment // 2 + fastest]
 
 
 def _power(values: np.ndarray, lag: int) -> np.ndarray:
@@ -187,8 +205,8 @@ def _power(values: np.ndarray, lag: int) -> np.ndarray:
     values = values.astype(np.float64)
     with np.errstate(invalid="ignore"):
         steps = np.nan_to_num(values[lag:] - values[:-lag], posinf=0.0, neginf=0.0)
-    most = _MAX_STEP * _median(np.abs(steps))
-    steps = steps.clip(-most, most)
+    longest = _MAX_STEP * _median(np.abs(steps))
+    steps = steps.clip(-longest, longest)
     spectrum = np.fft.rfft(steps - steps.mean(), 2 * len(steps))
     power = spectrum.real**2 + spectrum.imag**2
     return np.asarray(power / max(power.sum(), np.finfo(float).tiny))

@@ -1,10 +1,10 @@
 """Find the cameras that show the Gaussians of a file in place, and the pixel of each row if rows are pixels.
 
 Most files are plain: rows are the pixels in order, and the stored cameras show them there. In other files the rows are
-all pixels in another order, or their world is not that of the cameras. The pose of each view then follows from the rows
-alone. It remains to find the file's camera of each view, and the similarity from the world of the cameras to that of
-the Gaussians; this is tried for each convention of the poses and each likely order of the views. If rows are neither,
-the right cameras are those under which the Gaussians lie on the centres of pixels.
+all pixels in another order, or the Gaussians have another world than the cameras. The pose of each view then follows
+from the rows alone. Two things remain unknown: the file's camera of each view, and the similarity from the world of the
+cameras to the world of the Gaussians. They are searched in each convention of the poses and each likely order of the
+views. If no layout of all pixels fits, cameras are searched under which the Gaussians lie on the centres of pixels.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
 _PLAIN_PX = 0.5  # rows in order that are nearer to their pixels, pixels, need no search
-_MIN_ROWS, _MIN_SHARE = 24, 0.05  # finite rows needed to find pixels: that many, or that share of all
-_MANY_PIXELS = 4  # with that many times more pixels than rows, the grid is probably smaller than the photos
+_MIN_ROWS, _MIN_SHARE = 24, 0.05  # finite rows needed to find pixels: this number, or this share of all rows
+_MANY_PIXELS = 4  # pixels per row above which the grid is probably smaller than the photos
 _MOVED_GAUSSIANS = 2000  # Gaussians of a view that its moved pose is solved from
 
 
@@ -107,7 +107,7 @@ def align(
         camera_file: Its cameras.
         photos: c uint8 photos of one size, or none.
         order: The order of the rows if it is known, see :class:`gsmerge.settings.reading.ReadHints`.
-        scale: Scale of the Gaussians' world over that of the cameras, if it is given.
+        scale: Length of one unit of the cameras' world in the world of the Gaussians, if it is given.
         depths: Reads ``[c,h,w]`` depth maps next to the cameras; returns None if there are none.
         frames: Reads the frames that a file gives for the cameras; used only for rows without pixels.
 
@@ -149,11 +149,12 @@ def _align_in_order(source: RowSource, grids: Sequence[Grid]) -> Recovery | None
             candidates.append(Candidate(grid, score_layout(inputs, layout, IDENTITY)))
         elif count == len(grid.cameras) * math.prod(grid.size) and source.may_be("view-major") and _has_rows(source):
             layouts = plain_layout(len(grid.cameras), *grid.size).with_views_in(source.orders(grid))
-            best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
-            worst = best.alignment.worst_px
-            far = SHUFFLED_MARGIN * max(worst, AS_NEAR_PX)
-            if source.scale is None and worst <= _PLAIN_PX and all(o.alignment.worst_px >= far for o in others):
-                candidates.append(Candidate(grid, best))
+            in_order, *in_other_orders = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
+            worst_px = in_order.alignment.worst_px
+            far_px = SHUFFLED_MARGIN * max(worst_px, AS_NEAR_PX)
+            is_only_order = all(scored.alignment.worst_px >= far_px for scored in in_other_orders)
+            if source.scale is None and worst_px <= _PLAIN_PX and is_only_order:
+                candidates.append(Candidate(grid, in_order))
     candidates = [candidate for candidate in candidates if candidate.scored.alignment.ok]
     return judge(candidates, source.inputs, lambda candidate: candidate) if candidates else None
 
@@ -201,7 +202,8 @@ def _run_searches(source: RowSource, known_grids: Sequence[Grid]) -> Iterator[Re
         layouts = find_layouts(source.ply.gaussians, source.ply.valid)
         shape = (layouts[0].width, layouts[0].height) if layouts else (0, 0)
         grids = grids_of(source.camera_file, source.size, partial(shown_sizes, shape=shape)) if layouts else []
-        yield _match(source, [(g, each) for g in grids for each in _layouts(source, g) if _has_shape_of(each, layouts)])
+        grid_layouts = [(grid, layout) for grid in grids for layout in _layouts(source, grid)]
+        yield _match(source, [(grid, layout) for grid, layout in grid_layouts if _has_shape_of(layout, layouts)])
     network_grids = grids_of(source.camera_file, source.size, network_sizes)
     result = _align_by_centres(source, (place for grid in network_grids for place in _usual_places(source, grid)))
     yield result if isinstance(result, Recovery) else None  # without pixels, cameras at the photos' size are better
@@ -214,7 +216,10 @@ def _match(source: RowSource, grid_layouts: Sequence[GridLayout]) -> Recovery | 
 
 
 def _at_photo_size(place: Place, known_grids: Sequence[Grid]) -> Place:
-    """Bring cameras to the size of the photos, which show more detail than photos of the size of a network's grid."""
+    """Bring cameras to the size of the photos, because larger photos show more detail than photos at a network's size.
+
+    ``known_grids`` are the grids of the sizes that files give; the cameras stay unchanged if none has their shape.
+    """
     grid = next((grid for grid in known_grids if same_shape(grid.size, place.grid.size)), place.grid)
     cameras = replace(grid.cameras, viewmats=place.grid.cameras.viewmats)
     return replace(place, grid=replace(grid, camera_file=place.grid.camera_file, cameras=cameras))
@@ -234,10 +239,10 @@ def _align_by_centres(source: RowSource, places: Iterable[Place]) -> Recovery | 
     """
     points = sample_points(source.ply.gaussians.means, source.ply.valid)
     checked = [(check_centres(points, place.cameras), place) for place in places]
-    right = [each for each in checked if each[0].ok]
-    if not right:
+    passing = [(check, place) for check, place in checked if check.ok]
+    if not passing:
         return None
-    check, place = min(right, key=lambda each: each[0].px / each[0].chance_px)
+    check, place = min(passing, key=lambda checked_place: checked_place[0].px / checked_place[0].chance_px)
     recovery = _find_pixels(source, place, check)
     return place if recovery is None and _shows_colors(source, place) else recovery
 
@@ -257,9 +262,10 @@ def _find_pixels(source: RowSource, place: Place, check: CentreCheck) -> Recover
     """
     grid, frame = place.grid, place.frame
     inputs = source.inputs(grid, photos=False)
-    layouts = [each for layout in _layouts(source, grid) for each in layout.with_views_in(source.orders(grid))]
-    candidates = [Candidate(grid, score_layout(inputs, each, frame)) for each in layouts]
-    candidates = [each for each in candidates if each.scored.alignment.ok and each.px <= _PLAIN_PX]
+    scored = (score_layout(inputs, layout, frame) for layout in _ordered_layouts(source, grid))
+    candidates = [
+        Candidate(grid, score) for score in scored if score.alignment.ok and score.alignment.worst_px <= _PLAIN_PX
+    ]
     if not candidates:
         ids = find_rows(source.ply.gaussians.means, source.ply.valid, place.cameras, check)
         layout = None if ids is None else dropped_layout(ids, len(grid.cameras), *grid.size).without_empty_parts()
@@ -276,7 +282,7 @@ def _have_smaller_grid(source: RowSource, views: int, grid: Grid) -> bool:
 
 
 def _layouts(source: RowSource, grid: Grid) -> list[Layout]:
-    """List the layouts in a grid that have the right number of rows, also those made with depth maps."""
+    """List the layouts in a grid that have the right number of rows, including layouts made with depth maps."""
     views, (width, height), count = len(grid.cameras), grid.size, len(source.ply.gaussians)
     layouts = list(exact_layouts(count, views, width, height))
     if count < views * width * height and source.may_be("view-major"):
@@ -284,6 +290,12 @@ def _layouts(source: RowSource, grid: Grid) -> list[Layout]:
         if depths is not None and depths.shape == (views, height, width):
             layouts += depth_layouts(count, depths)
     return [layout for layout in layouts if source.may_be(layout.order)]
+
+
+def _ordered_layouts(source: RowSource, grid: Grid) -> list[Layout]:
+    """List the layouts in a grid that have the right number of rows, with the views in each likely order."""
+    orders = source.orders(grid)
+    return [ordered for layout in _layouts(source, grid) for ordered in layout.with_views_in(orders)]
 
 
 def _has_shape_of(layout: Layout, others: Sequence[Layout]) -> bool:
@@ -299,14 +311,13 @@ def _has_shape_of(layout: Layout, others: Sequence[Layout]) -> bool:
 def _move_cameras(source: RowSource, grid: Grid) -> Recovery | None:
     """Move inexact cameras so that they show rows in their pixels; None if slightly moved cameras do not fit.
 
-    Also None if the colours of the photos contradict the result: moved cameras also fit views in a wrong order.
+    Also None if the colours of the photos contradict the result, because moved cameras also fit views in a wrong order.
     """
     if source.scale is not None:
         return None
     inputs = source.inputs(grid)
-    layouts = [each for layout in _layouts(source, grid) for each in layout.with_views_in(source.orders(grid))]
-    scored = [score_layout(inputs, layout, IDENTITY) for layout in layouts]
-    best = min(scored, key=lambda each: each.alignment.worst_px, default=None)
+    scored = [score_layout(inputs, layout, IDENTITY) for layout in _ordered_layouts(source, grid)]
+    best = min(scored, key=lambda layout_score: layout_score.alignment.worst_px, default=None)
     if best is None or not NEAR_PX < best.alignment.worst_px <= max_pixels(*grid.size):
         return None
     pairs = inputs.pairs(subsample(best.layout, _MOVED_GAUSSIANS))
@@ -317,7 +328,9 @@ def _move_cameras(source: RowSource, grid: Grid) -> Recovery | None:
     given, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
     grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, given=given)
     candidate = Candidate(grid, score_layout(source.inputs(grid), best.layout, IDENTITY))
-    recovery = judge([candidate], source.inputs, lambda each: each) if candidate.scored.alignment.ok else None
+    if not candidate.scored.alignment.ok:
+        return None
+    recovery = judge([candidate], source.inputs, lambda unchanged: unchanged)
     return None if recovery is None or recovery.confirmed is False else recovery
 
 
@@ -348,13 +361,8 @@ def _choose_cameras(
     from gsmerge.alignment.unaligned import choose_cameras
     from gsmerge.alignment.upright import upright_rotation
 
+    _check_photo_size(source)
     camera_file, inputs = source.camera_file, source.inputs(grid)
-    small = small_photos_error(source.ply.info, camera_file, source.size)
-    if small is not None:
-        without_photos, camera_grids = replace(source, photos=()), [photo_grid(camera_file, None)]
-        recovery = _align_in_order(without_photos, camera_grids) or _search(without_photos, camera_grids)
-        if isinstance(recovery, Recovery):  # photos of rows without pixels may have any size
-            raise small
     rotation = upright_rotation(inputs) if place is None else None
     if rotation is not None:
         place = _place_upright(source, grid, rotation)
@@ -362,12 +370,12 @@ def _choose_cameras(
         recovery = _find_pixels(source, place, check_centres(points, place.cameras))
         if recovery is not None:
             return _make_result(source, recovery)
-    why, more_notes = count_error(source.ply.info, grid.cameras), list[str]()
+    no_pixels, more_notes = count_error(source.ply.info, grid.cameras), list[str]()
     if place is None:
         check_frame(inputs, camera_file)
         if source.scale is not None:
             grid = replace(grid, cameras=scale_by(source.scale).move(grid.cameras))
-        place, more_notes = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), why)
+        place, more_notes = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), no_pixels)
         result = None if place.frame is IDENTITY or source.order == "none" else _align_by_centres(source, [place])
         if isinstance(result, Recovery):
             return _make_result(source, result)
@@ -375,7 +383,18 @@ def _choose_cameras(
     if place.frame is not IDENTITY:
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
     notes, images = (*place.notes(source.camera_file.convention), *more_notes), source.inputs(grid).images
-    return AlignmentResult(None, cameras, images, camera_file, notes, grid.transform, problem=why.problem)
+    return AlignmentResult(None, cameras, images, camera_file, notes, grid.transform, problem=no_pixels.problem)
+
+
+def _check_photo_size(source: RowSource) -> None:
+    """Raise SceneError if rows are pixels of the cameras' grid, but the photos have another size."""
+    error = small_photos_error(source.ply.info, source.camera_file, source.size)
+    if error is None:
+        return
+    without_photos, camera_grids = replace(source, photos=()), [photo_grid(source.camera_file, None)]
+    result = _align_in_order(without_photos, camera_grids) or _search(without_photos, camera_grids)
+    if isinstance(result, Recovery):  # photos of rows without pixels may have any size
+        raise error
 
 
 def _place_upright(source: RowSource, grid: Grid, rotation: Similarity) -> Place:
@@ -383,20 +402,35 @@ def _place_upright(source: RowSource, grid: Grid, rotation: Similarity) -> Place
     from gsmerge.alignment.upright import solve_upright, upright_error
 
     grids = [grid, *grids_of(source.camera_file, source.size, square_sizes)] if len(source.photos) else []
-    solved = ((each, solve_upright(source.inputs(each), rotation)) for each in grids)
-    place = next((Place(each, frame, "photos' colours") for each, frame in solved if frame is not None), None)
-    if place is None:
-        raise upright_error(source.ply.info, len(source.photos))
-    return place
+    for photos_grid in grids:
+        frame = solve_upright(source.inputs(photos_grid), rotation)
+        if frame is not None:
+            return Place(photos_grid, frame, "photos' colours")
+    raise upright_error(source.ply.info, len(source.photos))
 
 
 def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
     """Make the result for rows that are pixels, with cameras in the frame of the Gaussians."""
-    grid, best = recovery.chosen.grid, recovery.best
+    grid, frame, layout = recovery.chosen.grid, recovery.best.frame, recovery.best.layout
     inputs = source.inputs(grid)
     free_pages(vars(inputs.gaussians).values())  # the search has read all rows
-    frame, layout, count = best.frame, best.layout, len(grid.cameras)
-    notes, usual = [*grid.notes], source.camera_file
+    return AlignmentResult(
+        pixel_ids=layout.pixel_ids(len(inputs.gaussians)),
+        cameras=grid.cameras if frame is IDENTITY else frame.move(grid.cameras),
+        images=inputs.images,
+        camera_file=grid.camera_file,
+        notes=tuple(_list_notes(source.camera_file, recovery)),
+        transform=grid.transform,
+        recovery=recovery,
+        moves=grid.moves,
+        given=None if grid.given is None else frame.move_viewmats(grid.given),
+    )
+
+
+def _list_notes(usual: CameraFile, recovery: Recovery) -> list[str]:
+    """List notes on how rows that are pixels were read, if not as usual; ``usual`` are the cameras as stored."""
+    grid, frame, layout = recovery.chosen.grid, recovery.best.frame, recovery.best.layout
+    notes, count = [*grid.notes], len(grid.cameras)
     if grid.camera_file.convention != usual.convention:
         notes.append(f"{describe_other_convention(grid.camera_file.convention, usual.convention)}: read so")
     if usual.source == ESTIMATED:
@@ -412,14 +446,4 @@ def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
         used = len(set(layout.views))
         notes.append(f"read as: {recovery.description}")
         notes += [f"{used} of {count} views are in the file"] * (used < count)
-    return AlignmentResult(
-        pixel_ids=layout.pixel_ids(len(inputs.gaussians)),
-        cameras=grid.cameras if frame is IDENTITY else frame.move(grid.cameras),
-        images=inputs.images,
-        camera_file=grid.camera_file,
-        notes=tuple(notes),
-        transform=grid.transform,
-        recovery=recovery,
-        moves=grid.moves,
-        given=None if grid.given is None else frame.move_viewmats(grid.given),
-    )
+    return notes

@@ -14,11 +14,13 @@ from gsmerge.runtime.memory import free_pages, gather
 from gsmerge.types import Cameras, Gaussians, Scene
 
 MARGIN = 2.0  # factor by which the best alternative must beat the next one
-SHUFFLED_MARGIN = 5.0  # factor by which it must beat shuffled pixels
-# Medians of some 400 distances differ by chance: 1.15 is three standard errors of their ratio, since the standard error
-# of a median distance in a plane is 0.72 / sqrt(n) of it. The pixels are the error of cameras that files round
+SHUFFLED_MARGIN = 5.0  # factor by which the best alternative must beat shuffled pixels
+# Two medians of some 400 distances differ by chance. The standard error of a median distance in a plane is
+# 0.72 / sqrt(n) of the median, so a ratio of 1.15 is three standard errors. Files round the numbers of cameras, which
+# displaces projections by up to 0.02 pixels
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
-RANDOM_SHARE = 0.85  # colour error over that of shuffled pixels, above which colours agree no better than at random
+# Colour error, divided by the colour error of shuffled pixels. Above this share colours agree no better than at random
+RANDOM_SHARE = 0.85
 SAME_COLORS = 0.01  # colour error of shuffled pixels below which colours vary too little to decide
 QUICK_GAUSSIANS, SAMPLE_GAUSSIANS = 1500, 6000  # Gaussians of a quick score, and of a score
 MIN_SAMPLE_GAUSSIANS = 60  # of each part
@@ -28,12 +30,12 @@ MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some of t
 
 @dataclass(frozen=True)
 class Correspondences:
-    """t Gaussians with the view and the pixel that each is assumed to belong to."""
+    """t Gaussians, each with the view and the pixel to which it is assumed to belong."""
 
     points: np.ndarray  # ``[t,3]`` float64 means
     pixels: np.ndarray  # ``[t,2]`` pixel centres (x, y)
     views: np.ndarray  # ``[t]`` ids of the cameras
-    parts: np.ndarray  # ``[t]`` the part of the layout, a view or one layer of it; ascending
+    parts: np.ndarray  # ``[t]`` the part of the layout: a view, or one layer of a view; ascending
     rows: np.ndarray  # ``[t]`` rows of the file
 
     def select(self, index: np.ndarray) -> Correspondences:
@@ -71,11 +73,14 @@ class AlignmentInput:
 
 
 def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -> Correspondences:
-    """Return the valid rows of a layout (``means [n,3]``, ``valid [n]``) with their pixels and views."""
+    """Return the valid rows of a layout, with their pixels and views.
+
+    ``means [n,3]`` belong to all n rows of the file. Rows that are False in ``valid [n]`` are left out.
+    """
     rows, pixels = np.concatenate(layout.rows), np.concatenate(layout.pixels)
     parts = np.repeat(np.arange(len(layout.views)), [len(part_rows) for part_rows in layout.rows])
-    good = valid[rows]
-    rows, pixels, parts = rows[good], pixels[good], parts[good]
+    is_valid = valid[rows]
+    rows, pixels, parts = rows[is_valid], pixels[is_valid], parts[is_valid]
     y, x = np.divmod(pixels, layout.width)
     points = gather(means, rows).astype(np.float64)
     return Correspondences(points, np.stack([x, y], 1) + 0.5, np.array(layout.views)[parts], parts, rows)
@@ -95,12 +100,12 @@ class Alignment:
     @property
     def middle_px(self) -> float:
         """Median of the views' median distances, pixels."""
-        return float(lower_median(np.array([m for m in self.median_px if not math.isnan(m)] or [math.inf])))
+        return float(lower_median(np.array([px for px in self.median_px if not math.isnan(px)] or [math.inf])))
 
     @property
     def worst_px(self) -> float:
         """Largest of the views' median distances, pixels."""
-        return max((m for m in self.median_px if not math.isnan(m)), default=math.nan)
+        return max((px for px in self.median_px if not math.isnan(px)), default=math.nan)
 
 
 @dataclass(frozen=True)
@@ -115,16 +120,16 @@ class ScoredLayout:
     @property
     def description(self) -> str:
         """Description of layout and frame in words."""
-        return ", ".join(part for part in (self.layout.description, self.frame.description) if part)
+        return ", ".join(filter(None, (self.layout.description, self.frame.description)))
 
 
 def is_as_near(px: float, least: float) -> bool:
-    """Return True if a median distance, pixels, exceeds the least one by no more than chance and rounding."""
+    """Return True if a median distance, pixels, equals the least distance up to chance and rounding."""
     return px <= max(AS_NEAR * least, least + AS_NEAR_PX)
 
 
 def is_clearly_nearer(px: float, other_px: float) -> bool:
-    """Return True if a median distance, pixels, is clearly smaller than that of another layout or frame."""
+    """Return True if a median distance, pixels, is clearly smaller than ``other_px`` of another layout or frame."""
     return other_px >= MARGIN * max(px, AS_NEAR_PX)
 
 
@@ -161,7 +166,10 @@ def beats_shuffled(scored: ScoredLayout, shuffled_px: float) -> bool:
 
 
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
-    """Measure the mean difference, 0 to 1, of base colours from photos at a layout's pixels; NaN without either."""
+    """Measure the mean difference, 0 to 1, between base colours and the photos at a layout's pixels.
+
+    NaN without photos, without rows, or if all Gaussians have one colour.
+    """
     return _color_distance(inputs, inputs.pairs(sample_layout(layout)))
 
 
@@ -207,28 +215,31 @@ def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> 
 
 
 def check_pixels(scene: Scene) -> Alignment:
-    """Measure how far a sample of the Gaussians in front of every view projects from their pixels."""
+    """Measure how far Gaussians project from their pixels, at a sample of the pixels of every view.
+
+    Only the foremost Gaussian of a pixel counts.
+    """
     free_pages(vars(scene.gaussians).values())
     width, views = scene.cameras.width, len(scene)
     step = spread_step(-(-scene.pixels_per_view // MAX_CHECKED), width)
-    places = np.arange(0, scene.pixels_per_view, step)
-    fronts = scene.get_pixels().fronts.reshape(views, -1)[:, places]
+    sample = np.arange(0, scene.pixels_per_view, step)
+    fronts = scene.get_pixels().fronts.reshape(views, -1)[:, sample]
     parts, columns = np.nonzero(fronts >= 0)
-    y, x = np.divmod(places[columns], width)
+    y, x = np.divmod(sample[columns], width)
     rows = fronts[parts, columns]
     points = gather(scene.gaussians.means, rows).astype(np.float64)
     return check_pairs(Correspondences(points, np.stack([x, y], 1) + 0.5, parts, parts, rows), scene.cameras)
 
 
 def check_pairs(pairs: Correspondences, cameras: Cameras, num_parts: int | None = None) -> Alignment:
-    """Measure how near a sample projects to its pixels, in each of ``num_parts`` parts; None: one part per view."""
+    """Measure how near Gaussians project to their pixels, in each of ``num_parts`` parts; None: one part per view."""
     limit = pixel_limit(cameras.width, cameras.height)
     errors = pixel_errors(pairs, cameras)
     medians = tuple(
-        float(np.quantile(part, 0.5, method="lower")) if len(part) else math.nan
-        for part in pairs.split(errors, len(cameras) if num_parts is None else num_parts)
+        float(np.quantile(part_errors, 0.5, method="lower")) if len(part_errors) else math.nan
+        for part_errors in pairs.split(errors, len(cameras) if num_parts is None else num_parts)
     )
     count = max(1, len(errors))
     in_front, within_1px = float(np.isfinite(errors).sum()) / count, float((errors <= 1).sum()) / count
-    fits = [middle < limit for middle in medians if not math.isnan(middle)]
-    return Alignment(medians, in_front, within_1px, limit, bool(fits) and all(fits) and in_front > 0.5)
+    is_near = [median_px < limit for median_px in medians if not math.isnan(median_px)]
+    return Alignment(medians, in_front, within_1px, limit, bool(is_near) and all(is_near) and in_front > 0.5)

@@ -18,15 +18,16 @@ from gsmerge.io.cameras.camera_file import Convention
 from gsmerge.kernels.elementary import exp
 from gsmerge.types import Cameras, Gaussians
 
-_FRAME_GAIN = 1.1  # least score of another frame over that of the given frame
-_PEAK_GAIN = 1.05  # least score of a scale chosen by colours over that of the scales two steps away
+_FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the given frame
+_PEAK_GAIN = 1.05  # least score of a scale chosen by colours, divided by the score of a scale two steps away
 _SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to count those that cameras see
 # Gaussians compared in other conventions and frames. They have 0.4 % of noise; scores that matter differ by 5 % or more
 _COMPARED_GAUSSIANS = 5000
 _MIN_GAUSSIANS, _MAX_PROJECTED = 200, 4_000_000  # least number of Gaussians, and most Gaussians times cameras
 _MIN_SEEN = 0.5  # share of the Gaussians that must be in some camera
 _MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, but for only the foremost Gaussians in a frame chosen by colours
-_FRONT, _PER_CELL = 1.05, 3  # depth of foremost Gaussians, over the least one of their cell; mean Gaussians per cell
+# Largest depth of a foremost Gaussian, divided by the least depth in its cell; and mean number of Gaussians per cell
+_FRONT, _PER_CELL = 1.05, 3
 _SCALES = np.geomspace(1 / 30, 30, 55)  # of the cameras' positions, tried in turn
 _SCALE_GAUSSIANS = 2000  # Gaussians that the scales are tried on
 # Finer searches around the best scale: range (natural logarithm), steps, Gaussians
@@ -39,8 +40,8 @@ class CameraCheck:
     """The share of Gaussians that cameras see, and how well the colours agree with the photos."""
 
     share_seen: float  # share of the Gaussians that project into at least one view
-    # colour error of the Gaussians in the photos, over the error after shuffling the pixels; NaN without photos, or if
-    # the colours hardly vary
+    # colour error of the Gaussians in the photos, divided by the error after shuffling the pixels; NaN without photos,
+    # or if the colours hardly vary
     color_ratio: float
     ok: bool  # True if these are probably the cameras of these Gaussians
     num_compared: int = 0  # Gaussians whose colours were compared in at least one photo
@@ -73,7 +74,7 @@ def check_cameras(
     """Measure the share of sampled Gaussians that views see, and how well their colours fit ``images [c,h,w,3]``.
 
     ``images`` may be empty. With ``foremost``, the colours of hidden Gaussians do not count. ``hiding`` are further
-    points ``[n,3]`` that hide Gaussians.
+    points ``[n,3]`` that hide Gaussians, but have no colours themselves.
     """
     samples = min(samples, max(_MIN_GAUSSIANS, _MAX_PROJECTED // len(cameras)))
     rows = np.flatnonzero(valid)
@@ -85,21 +86,21 @@ def check_cameras(
     visible, compared = np.zeros((2, len(points)), bool)
     errors, shuffled_errors = list[np.ndarray](), list[np.ndarray]()
     rng = np.random.default_rng(0)
-    at_once = 1 + _SEEN_GAUSSIANS // max(1, len(points))
-    for first in range(0, len(cameras), at_once):
-        batch = cameras[first : first + at_once]
+    views_at_once = 1 + _SEEN_GAUSSIANS // max(1, len(points))
+    for first_view in range(0, len(cameras), views_at_once):
+        batch = cameras[first_view : first_view + views_at_once]
         with np.errstate(all="ignore"):
             xy, depth = project_points(points[None], batch.viewmats, batch.Ks)
-        inside, x, y = (depth > 0) & is_inside(xy, cameras), xy[..., 0], xy[..., 1]
+        inside = (depth > 0) & is_inside(xy, cameras)
         visible |= inside.any(0)
         for view in np.flatnonzero(inside.any(1)) if len(images) else ():
             seen = np.flatnonzero(inside[view])
-            column, row = x[view, seen].astype(np.int64), y[view, seen].astype(np.int64)
+            column, row = xy[view, seen].astype(np.int64).T
             if foremost:
-                front = _are_foremost(column, row, depth[view, seen], cameras.width * cameras.height)
-                front &= seen < len(rows)
-                seen, column, row = seen[front], column[front], row[front]
-            photo = photo_colors(images, np.full(len(seen), first + view), row, column)
+                counts = _are_foremost(column, row, depth[view, seen], cameras.width * cameras.height)
+                counts &= seen < len(rows)
+                seen, column, row = seen[counts], column[counts], row[counts]
+            photo = photo_colors(images, np.full(len(seen), first_view + view), row, column)
             if (photo == photo[:1]).all():  # a view without a photo is black
                 continue
             compared[seen] = True
@@ -111,9 +112,9 @@ def check_cameras(
 
 
 def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: int) -> tuple[float, float]:
-    """Return the mean error over that of shuffled pixels, and its standard error with ``count`` Gaussians.
+    """Divide the mean error by the mean error of shuffled pixels; also return the standard error of the ratio.
 
-    Both are NaN if the colours hardly vary.
+    ``count`` is the number of Gaussians. Both results are NaN if the colours hardly vary.
     """
     if not errors or not (mean_shuffled := float(np.concatenate(shuffled).mean())) > SAME_COLORS:
         return np.nan, np.nan
@@ -129,7 +130,11 @@ def _mean_difference(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def _are_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
-    """Return True for points ``[n]`` in pixels that are about as near as the nearest point of their cell."""
+    """Return True for each of n points that is about as near as the nearest point of its cell.
+
+    ``column [n]`` and ``row [n]`` are the pixels of the points, and ``depth [n]`` their depths. A cell is a square of
+    pixels; its side follows from the ``area`` of the picture, pixels.
+    """
     if not len(row):
         return np.zeros(0, bool)
     side = max(1, int(np.sqrt(_PER_CELL * area / len(row))))
@@ -145,9 +150,9 @@ def choose_poses(
 ) -> tuple[Poses | None, CameraCheck, str | None]:
     """Choose the pose convention in which the cameras see most Gaussians and the colours fit best.
 
-    ``cameras`` are in the usual convention; other arguments are those of :func:`check_cameras`. Returns the poses, or
-    None if no other convention is clearly better than the usual one. Also returns the check of the chosen poses, and a
-    note if another convention fits the photos as well.
+    ``cameras`` are in the usual ``convention``; for the other arguments see :func:`check_cameras`. Returns the poses in
+    another convention, or None if none is clearly better than the usual one. Also returns the check of the chosen
+    poses, and a note if another convention fits the photos as well.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
@@ -158,8 +163,8 @@ def choose_poses(
     if not ranked or not ranked[0][1].ok:
         return None, usual, None
     poses, best = ranked[0]
-    scores = [check.score for check in (usual, *(check for _, check in ranked[1:2])) if check.ok]
-    if best.score >= MARGIN * max(scores, default=0.0):
+    rivals = [usual, *(check for _, check in ranked[1:2])]
+    if best.score >= MARGIN * max((check.score for check in rivals if check.ok), default=0.0):
         return poses, best, None
     # Without photos other conventions may see as many Gaussians of any scene, so no note is needed
     as_good = usual.ok and usual.num_compared > 0 and _FRAME_GAIN * best.score >= usual.score
@@ -168,37 +173,38 @@ def choose_poses(
 
 
 def choose_cameras(
-    inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], why: SceneError
+    inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], no_pixels: SceneError
 ) -> tuple[Place, list[str]]:
     """Choose cameras that see the Gaussians: unchanged, in another frame, or in another convention; also return notes.
 
-    ``frames`` are the frames that a file gives. The usual frames of exporters are tried next. ``why`` is the error that
+    ``frames`` are the frames that a file gives. The usual frames of exporters are tried next. The error ``no_pixels``
     explains why the rows have no pixels. It is raised, with what was tried, if no camera sees the Gaussians.
     """
     rows, unchanged = (inputs.gaussians, inputs.valid), Place(grid, IDENTITY)
     if frames:
-        least = check_cameras(*rows, inputs.cameras, inputs.images).score
+        given_score = check_cameras(*rows, inputs.cameras, inputs.images).score
         checks = [check_cameras(*rows, frame.move(inputs.cameras), inputs.images) for frame in frames]
         best = max(checks, key=lambda check: check.score)
-        if best.ok and best.score > least:
+        if best.ok and best.score > given_score:
             return replace(unchanged, frame=frames[checks.index(best)]), []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
     other = _choose_frame(inputs, check)
     if other is not None:
-        _check_colors(inputs, other.move(inputs.cameras), other.description, why)
+        _check_colors(inputs, other.move(inputs.cameras), other.description, no_pixels)
         return Place(grid, other, "photos' colours"), []
     if not check.ok:
-        raise SceneError(why.path, f"{why.problem}; {check.description}", why.remedy)
+        raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", no_pixels.remedy)
     if poses is None:
         return unchanged, [note] if note else []
-    _check_colors(inputs, replace(inputs.cameras, viewmats=poses.viewmats), f"read as {poses.description}", why)
+    cameras = replace(inputs.cameras, viewmats=poses.viewmats)
+    _check_colors(inputs, cameras, f"read as {poses.description}", no_pixels)
     return replace(unchanged, grid=with_poses(grid, poses)), []
 
 
-def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: SceneError) -> None:
-    """Raise the SceneError ``why`` if the colours of the foremost Gaussians do not fit the photos.
+def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels: SceneError) -> None:
+    """Raise SceneError if the colours of the foremost Gaussians do not fit the photos.
 
-    ``name`` describes the cameras in words.
+    ``name`` describes the cameras in words. The message begins with the problem of ``no_pixels``.
     """
     ratio = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True).color_ratio
     if ratio > _MAX_FRONT_RATIO:
@@ -207,14 +213,14 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: Scen
             " photos as from random pixels"
         )
         remedy = "name the exporter with --hint exporter, export all pixels, or give cameras in the file's frame"
-        raise SceneError(why.path, f"{why.problem}; {measured}", remedy)
+        raise SceneError(no_pixels.path, f"{no_pixels.problem}; {measured}", remedy)
 
 
 def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
-    """Choose an exporter's frame in which the colours fit the photos clearly better than in the given one; or None.
+    """Choose an exporter's frame in which the colours fit the photos clearly better than in the given frame; or None.
 
-    Colours fit best at the true scale, so the chosen frame must fit better than at nearby scales. If no frame does at
-    the scale of the cameras, the scale is solved for.
+    Colours fit best at the true scale. The chosen frame must therefore fit better than the same frame at nearby scales.
+    If no frame does so at the scale of the cameras, the scale is solved for.
     """
     if not len(inputs.images):
         return None
@@ -245,14 +251,14 @@ def _best_frame(
 ) -> tuple[Similarity, float]:
     """Return the first frame with the highest score, and the score."""
     scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
-    return max(scored, key=lambda each: each[1])
+    return max(scored, key=lambda frame_and_score: frame_and_score[1])
 
 
 def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool:
     """Return True if the ``score`` of a frame is clearly higher than at scales two steps away."""
     two_steps = float(_SCALES[2] / _SCALES[0])
-    beside = (_score_frame(inputs, _scale_frame(frame, factor)) for factor in (1 / two_steps, two_steps))
-    return all(score > _PEAK_GAIN * other for other in beside)
+    neighbour_scores = (_score_frame(inputs, _scale_frame(frame, factor)) for factor in (1 / two_steps, two_steps))
+    return all(score > _PEAK_GAIN * neighbour_score for neighbour_score in neighbour_scores)
 
 
 def _scale_frame(frame: Similarity, factor: float) -> Similarity:
@@ -272,8 +278,8 @@ def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
         best, _ = _best_frame(inputs, [_scale_frame(best, float(factor)) for factor in factors], samples)
     points = sample_points(inputs.gaussians.means, inputs.valid)
     for reach, steps in _CENTRED:
-        scales = [_scale_frame(best, float(factor)) for factor in exp(np.linspace(-reach, reach, steps))]
-        checks = [check_centres(points, each.move(inputs.cameras)) for each in scales]
-        nearest = min(range(steps), key=lambda number: checks[number].px)
-        best = scales[nearest] if checks[nearest].ok else best
+        frames = [_scale_frame(best, float(factor)) for factor in exp(np.linspace(-reach, reach, steps))]
+        checks = [check_centres(points, frame.move(inputs.cameras)) for frame in frames]
+        nearest = min(range(steps), key=lambda i: checks[i].px)
+        best = frames[nearest] if checks[nearest].ok else best
     return best

@@ -24,21 +24,21 @@ from gsmerge.io.formats.read import FileInfo
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
-_QUANTILE = 0.95  # quantile of the distances along the widest axis; it is 1 in these files
+_QUANTILE = 0.95  # this quantile of the distances along the widest axis is 1 in these files
 _TOLERANCE = 1e-3  # of the median and the quantile
 _ROUGH_ROWS, _ROUGH = 2000, 1.0  # rows of a first check, and its tolerance before the rotation is undone
 _PER_PIXEL = (1, 2, 3)  # Gaussians of a pixel
 _OUTSIDE = 999  # a colour that no pixel has
-_UNIQUE = 1.1  # least distance of the second-best place of a stretch, over that of the best place
+_UNIQUE = 1.1  # least distance of a stretch at its second-best place, divided by the distance at its best place
 _STEP = 2  # every second pixel of a stretch is compared
 _LENGTH, _STRETCHES = 48, 96  # rows of a stretch, and number of stretches that are searched
 _PER_STRETCH = 12  # rows of each stretch that the frame is solved from
 _SHARE = 3  # stretches of fused views are taken from the first and the last third of the rows
 _SLACK = 8  # pixels beyond the bounds on both sides that are searched too
-_MAX_COST = 3.0  # largest distance of a stretch, over the lower quartile of all distances
+_MAX_COST = 3.0  # largest distance of a stretch, divided by the lower quartile of all distances
 _NO_PLACE = 1 << 30  # distance of a stretch that cannot be in its photo
 _PAIRS = 200  # pairs of stretches from which a frame is tried
-_NEAR = 3.0  # limits within which a stretch agrees with a frame tried from a pair
+_NEAR = 3.0  # a stretch agrees with the frame of a pair if its error is below this multiple of the limit
 _ROUNDS = 3  # of solving for the frame from the stretches that agree with it
 _MIN_VIEWS, _MIN_STRETCHES, _MIN_AGREEING = 2, 3, 0.25  # views that agree, stretches of each, share of all stretches
 
@@ -50,19 +50,19 @@ class _Stretch:
     view: int
     start: int  # first row
     step: int  # from one row to the next
-    low: int  # least and largest place of the first row among the pixels of a trimmed photo
-    high: int
+    low: int  # first place, among the pixels of a photo, at which the first row is searched
+    high: int  # end of the places, exclusive
 
 
 def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
     """Find the camera from which rows were centred, rescaled and turned upright; return the rotation, or None."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
-    few = means[:: max(1, len(means) // _ROUGH_ROWS)]
-    if not len(few) or _deviation(few) > _ROUGH:
+    sample = means[:: max(1, len(means) // _ROUGH_ROWS)]
+    if not len(sample) or _deviation(sample) > _ROUGH:
         return None
     for view, viewmat in enumerate(inputs.cameras.viewmats):
         rotation = matmul(UPRIGHT, viewmat[:3, :3])
-        if _deviation(matmul(few, rotation)) < _ROUGH / 2 and _deviation(matmul(means, rotation)) < _TOLERANCE:
+        if _deviation(matmul(sample, rotation)) < _ROUGH / 2 and _deviation(matmul(means, rotation)) < _TOLERANCE:
             source = "the first camera" if view == 0 else f"camera {view + 1}"
             return Similarity(rotation, 1.0, np.zeros(3), f"rotated upright from {source}", "upright")
     return None
@@ -85,53 +85,82 @@ def solve_upright(inputs: AlignmentInput, rotation: Similarity) -> Similarity | 
 
 def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray, list[_Stretch]]]:
     """Yield the orders that ``count`` rows may have, as pixels ``[p]`` of a photo and the stretches to search."""
-    views = len(cameras)
-    inner, every = (trim_box(trim).pixels(cameras.width, cameras.height).reshape(-1) for trim in (TRIMS[0], 0))
-    for per_pixel in _PER_PIXEL:  # the order is line, column, layer, view, and some pixels are dropped
-        step = views * per_pixel
-        dropped = len(inner) * step - count
-        if 0 <= dropped < count and count >= _LENGTH * step:
-            starts = np.unique(np.linspace(0, count - _LENGTH * step, _STRETCHES).astype(int))
-            bounds = [(int(start), start // step - _SLACK, (start + dropped) // step + _SLACK) for start in starts]
-            yield (
-                inner,
-                [_Stretch(view, start, step, low, high) for start, low, high in bounds for view in range(views)],
-            )
-    # views that are fused one after another: the rows of the first view come first, those of the last view last
-    if _SHARE * _LENGTH <= count < views * len(every):
-        starts = np.unique(np.linspace(0, count // _SHARE, _STRETCHES).astype(int))
-        first = [_Stretch(0, int(start), 1, int(start) - _SLACK, len(every)) for start in starts]
-        ends = (len(every) - each.start - _LENGTH + _SLACK for each in first)
-        from_end = [count - _LENGTH - each.start for each in first]
-        last = [_Stretch(views - 1, start, 1, 0, end) for start, end in zip(from_end, ends, strict=True)]
-        yield every, first + last
+    trimmed, whole = (trim_box(trim).pixels(cameras.width, cameras.height).reshape(-1) for trim in (TRIMS[0], 0))
+    for per_pixel in _PER_PIXEL:
+        stretches = _interleaved_stretches(count, len(cameras), per_pixel, len(trimmed))
+        if stretches:
+            yield trimmed, stretches
+    stretches = _fused_stretches(count, len(cameras), len(whole))
+    if stretches:
+        yield whole, stretches
+
+
+def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: int) -> list[_Stretch]:
+    """List stretches of rows in the order line, column, layer, view, of which some are dropped.
+
+    Each view has ``num_pixels`` pixels with ``per_pixel`` rows. Empty if ``count`` rows do not have this order.
+    """
+    step = views * per_pixel
+    dropped = num_pixels * step - count
+    if not (0 <= dropped < count and count >= _LENGTH * step):
+        return []
+    starts = np.unique(np.linspace(0, count - _LENGTH * step, _STRETCHES).astype(int))
+    bounds = [(int(start), start // step - _SLACK, (start + dropped) // step + _SLACK) for start in starts]
+    return [_Stretch(view, start, step, low, high) for start, low, high in bounds for view in range(views)]
+
+
+def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
+    """List stretches of the first and the last view, if views of ``num_pixels`` were fused one after another.
+
+    The rows of the first view come first, and the rows of the last view last. Empty for too few or too many rows.
+    """
+    if not _SHARE * _LENGTH <= count < views * num_pixels:
+        return []
+    starts = np.unique(np.linspace(0, count // _SHARE, _STRETCHES).astype(int)).tolist()
+    first_view = [_Stretch(0, start, 1, start - _SLACK, num_pixels) for start in starts]
+    last_view = [
+        _Stretch(views - 1, count - _LENGTH - start, 1, 0, num_pixels - start - _LENGTH + _SLACK) for start in starts
+    ]
+    return first_view + last_view
 
 
 def _match(inputs: AlignmentInput, stretches: Sequence[_Stretch], pixels: np.ndarray) -> Correspondences:
-    """Search for stretches in the photos; return rows of those with a unique place of nearly equal colours.
+    """Search for stretches in the photos; return a sample of the rows of all stretches that match a photo.
 
-    Each stretch is a part of the result.
+    A stretch matches if a single place of its photo has nearly the colours of its rows. Each of these stretches is a
+    part of the result.
     """
-    colors, images = base_colors(inputs.gaussians), inputs.images
-    colors = np.ascontiguousarray(np.rint(255 * colors).astype(np.int16).T)
-    shown = [_shown_colors(np.rint(255 * photo).astype(np.uint8), pixels, _LENGTH) for photo in images]
-    rows = np.array([each.start + each.step * np.arange(_LENGTH) for each in stretches])
-    bounds = [(max(0, each.low), min(len(pixels), each.high)) for each in stretches]
-    places = np.array([
-        _place_stretch(shown[each.view], colors[:, ids], low, high) if low < high else (0, _NO_PLACE, 0)
-        for each, ids, (low, high) in zip(stretches, rows, bounds, strict=True)
-    ])  # fmt: skip
-    near = places[:, 1] <= _MAX_COST * max(1.0, float(np.quantile(places[:, 1], 0.25)))
-    chosen = np.flatnonzero(near & (places[:, 2] > _UNIQUE * places[:, 1]))
-    within = np.linspace(0, _LENGTH - 1, _PER_STRETCH).astype(int)
-    ids = rows[chosen][:, within].reshape(-1)
-    y, x = np.divmod(pixels[(places[chosen, :1] + within).clip(max=len(pixels) - 1).reshape(-1)], inputs.cameras.width)
-    views = np.array([each.view for each in stretches])[chosen].repeat(_PER_STRETCH)
-    parts = np.arange(len(chosen)).repeat(_PER_STRETCH)
-    pairs = Correspondences(
-        inputs.gaussians.means[ids].astype(np.float64), np.stack([x, y], 1) + 0.5, views, parts, ids
-    )
-    return pairs.select(inputs.valid[ids])
+    rows = np.array([stretch.start + stretch.step * np.arange(_LENGTH) for stretch in stretches])
+    places, sums, next_sums = _place_stretches(inputs, stretches, rows, pixels).T
+    is_near = sums <= _MAX_COST * max(1.0, float(np.quantile(sums, 0.25)))
+    matched = np.flatnonzero(is_near & (next_sums > _UNIQUE * sums))
+    sample = np.linspace(0, _LENGTH - 1, _PER_STRETCH).astype(int)
+    ids = rows[matched][:, sample].reshape(-1)
+    matched_pixels = pixels[(places[matched, None] + sample).clip(max=len(pixels) - 1).reshape(-1)]
+    y, x = np.divmod(matched_pixels, inputs.cameras.width)
+    views = np.array([stretch.view for stretch in stretches])[matched].repeat(_PER_STRETCH)
+    parts = np.arange(len(matched)).repeat(_PER_STRETCH)
+    points = inputs.gaussians.means[ids].astype(np.float64)
+    return Correspondences(points, np.stack([x, y], 1) + 0.5, views, parts, ids).select(inputs.valid[ids])
+
+
+def _place_stretches(
+    inputs: AlignmentInput, stretches: Sequence[_Stretch], rows: np.ndarray, pixels: np.ndarray
+) -> np.ndarray:
+    """Return for each stretch its place, its sum and its next sum ``[s,3]``; see :func:`_place_stretch`.
+
+    ``rows [s,l]`` are the rows of the stretches, and ``pixels [p]`` the pixels of a photo in which they are searched.
+    """
+    colors = np.ascontiguousarray(np.rint(255 * base_colors(inputs.gaussians)).astype(np.int16).T)
+    shown = [_shown_colors(np.rint(255 * photo).astype(np.uint8), pixels, _LENGTH) for photo in inputs.images]
+    places = []
+    for stretch, stretch_rows in zip(stretches, rows, strict=True):
+        low, high = max(0, stretch.low), min(len(pixels), stretch.high)
+        if low < high:
+            places.append(_place_stretch(shown[stretch.view], colors[:, stretch_rows], low, high))
+        else:
+            places.append((0, _NO_PLACE, 0))
+    return np.array(places)
 
 
 def _shown_colors(photo: np.ndarray, pixels: np.ndarray, length: int) -> np.ndarray:
@@ -140,17 +169,17 @@ def _shown_colors(photo: np.ndarray, pixels: np.ndarray, length: int) -> np.ndar
     return np.concatenate([shown, np.full((3, length), _OUTSIDE, np.int16)], 1)
 
 
-def _place_stretch(shown: np.ndarray, wanted: np.ndarray, low: int, high: int) -> tuple[int, int, int]:
-    """Find the place of the colours ``wanted [3,l]`` in ``shown [3,m]`` with the least sum of absolute differences.
+def _place_stretch(shown: np.ndarray, colors: np.ndarray, low: int, high: int) -> tuple[int, int, int]:
+    """Find the place of ``colors [3,l]`` in the colours ``shown [3,m]`` with the least sum of absolute differences.
 
     Places from ``low`` to before ``high`` are searched. Returns the best place, its sum, and the sum of the second-best
     place that is more than two pixels away.
     """
     sums, difference = np.zeros(high - low, np.int32), np.empty(high - low, np.int16)
-    for offset in range(0, wanted.shape[1], _STEP):
+    for offset in range(0, colors.shape[1], _STEP):
         for channel in range(3):
             values = shown[channel, low + offset : high + offset]
-            np.subtract(values, wanted[channel, offset], out=difference)
+            np.subtract(values, colors[channel, offset], out=difference)
             np.abs(difference, out=difference)
             sums += difference
     best = int(sums.argmin())
@@ -166,10 +195,10 @@ def _solve_agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation
         return None
     limit, rng = pixel_limit(inputs.cameras.width, inputs.cameras.height), np.random.default_rng(0)
 
-    def solve(chosen: np.ndarray) -> Similarity | None:
-        part = pairs.select(np.isin(pairs.parts, chosen))
-        rays = ray_directions(part, inputs.cameras)
-        return solve_frame(part.points, rays, rotation.rotation, shifted=True)
+    def solve(some_stretches: np.ndarray) -> Similarity | None:
+        selected = pairs.select(np.isin(pairs.parts, some_stretches))
+        rays = ray_directions(selected, inputs.cameras)
+        return solve_frame(selected.points, rays, rotation.rotation, shifted=True)
 
     def find_agreeing(frame: Similarity | None, limit: float) -> np.ndarray:
         if frame is None:

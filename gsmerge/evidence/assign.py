@@ -7,8 +7,8 @@ photo is replaced or left out
 - if it matches the view no better than wrong pairs match, or
 - if its parts lie farther from their places than the parts of the other proposed photos do.
 
-For all other views the photos with the highest scores are compared part by part. This tells neighbouring views apart:
-their photos show the same things in other places.
+For all other views the photos with the highest scores are compared part by part. This tells neighbouring views apart,
+because their photos show the same things in different places.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ from gsmerge.runtime.threads import parallel_map
 
 SIGNIFICANT = 2.0  # standard deviations of noise; smaller scores and smaller differences of scores count as noise
 MAX_COMPARED = 4  # photos with the highest scores that are compared with a view part by part
+MIN_EXPLAINED = 0.5  # share of the variance of a view that a photo explains; above it, the photo matches the view
 MIN_CONTRAST = 1 / 255  # root mean square, the rounding of 8 bits; pictures with less contrast cannot be compared
 IMPOSSIBLE = 1e6  # cost of a pair whose shapes differ
-MIN_PER_TASK, MAX_TASKS = 8, 16  # photos of a task, and tasks; each task reads the pictures of all views
+MIN_PER_TASK, MAX_TASKS = 8, 16  # photos per task, and number of tasks; each task reads the pictures of all views
 FIRST_PHOTOS = 256  # evenly spaced photos of a film that are compared first; their best neighbourhoods come next
 
 
@@ -103,13 +104,12 @@ class Assigner:
         """Compare photos with all views."""
         ids = tuple(dict.fromkeys(photos))
         new = [photo for photo in ids if photo not in self._correlations]
+        task_size = max(MIN_PER_TASK, -(-len(new) // MAX_TASKS))
 
-        size = max(MIN_PER_TASK, -(-len(new) // MAX_TASKS))
+        def compare(start: int) -> np.ndarray:
+            return self._comparer.correlate([self.candidates.read(photo) for photo in new[start : start + task_size]])
 
-        def compare(first: int) -> np.ndarray:
-            return self._comparer.correlate([self.candidates.read(photo) for photo in new[first : first + size]])
-
-        compared = parallel_map(compare, range(0, len(new), size))
+        compared = parallel_map(compare, range(0, len(new), task_size))
         self._correlations |= dict(zip(new, itertools.chain(*compared), strict=True))
         correlations = np.stack([self._correlations[photo] for photo in ids], 1)
         z = fisher_z(correlations)
@@ -134,20 +134,22 @@ class Assigner:
             self._offsets[view, assignment] = find_offsets(self.shown, view, np.ascontiguousarray(photo))
         return self._offsets[view, assignment]
 
-    def lies_elsewhere(self, view: int, given: Mapping[int, Assignment]) -> bool:
-        """Return True if the parts of a view's photo lie farther from their places than those of the other views do.
+    def lies_elsewhere(self, view: int, assignments: Mapping[int, Assignment]) -> bool:
+        """Return True if the parts of a view's photo are displaced farther than the parts of the other views' photos.
 
         The threshold is twice the median distance in the other views. Wrong depth displaces the drawn Gaussians of all
-        views, but no farther than it moves the parts of one view apart.
+        views, but by no more than ``NEAR_PIXELS``, the largest differences between the offsets of one view.
         """
-        offsets = self.find_offsets(view, given[view])
+        offsets = self.find_offsets(view, assignments[view])
         if offsets is None or offsets.verdict is not False:
             return False
-        pairs = [pair for pair in given.items() if pair[0] != view]
-        of_others = [each.distances for each in parallel_map(lambda pair: self.find_offsets(*pair), pairs) if each]
-        distances = np.concatenate([np.zeros(0), *of_others])
-        usual = 2 * float(np.median(distances)) if len(distances) else 0.0
-        return replace(offsets, tolerance=TOLERANCE + min(usual, NEAR_PIXELS)).verdict is False
+        other_pairs = [pair for pair in assignments.items() if pair[0] != view]
+        other_offsets = parallel_map(lambda pair: self.find_offsets(*pair), other_pairs)
+        distances = np.concatenate(
+            [np.zeros(0), *(view_offsets.distances for view_offsets in other_offsets if view_offsets)]
+        )
+        threshold = 2 * float(np.median(distances)) if len(distances) else 0.0
+        return replace(offsets, tolerance=TOLERANCE + min(threshold, NEAR_PIXELS)).verdict is False
 
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
         """Check the photos that names or their order propose for views.
@@ -166,21 +168,20 @@ class Assigner:
         photos are confirmed by their parts.
         """
         out, confirmed = list[Assignment | None]([None] * len(named)), [False] * len(named)
-        given = [(view, photo) for view, photo in enumerate(named) if photo is not None]
-        if not given:
+        named_pairs = [(view, photo) for view, photo in enumerate(named) if photo is not None]
+        if not named_pairs:
             return out, confirmed
-        scores = self.score(photo for _, photo in given)
-        proposed = {view: Assignment(photo, self._stored_or_tagged(scores, view, photo)) for view, photo in given}
-        columns = [scores.photos.index(photo) for _, photo in given]
+        scores = self.score(photo for _, photo in named_pairs)
+        proposed = {view: Assignment(photo, self._stored_or_tagged(scores, view, photo)) for view, photo in named_pairs}
+        columns = [scores.photos.index(photo) for _, photo in named_pairs]
         best = scores.best()[np.ix_(list(proposed), columns)]  # of each proposed view with each proposed photo
         own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)
-        matched, comparable = _match(best), own[self.has_contrast[list(proposed)]]
-        # half-way from wrong pairs to right ones, if the proposed photos together are right
-        least = min(SIGNIFICANT, float(np.median(comparable)) / 2) if _exceed_noise(comparable) else SIGNIFICANT
-        for place, (view, assignment) in enumerate(proposed.items()):
-            score, highest = own[place], max(best[place, place], best[place, matched[place]])
-            # more than wrong pairs have, or more than half of the variance is explained
-            matches = score > least or scores.correlations[view, columns[place], assignment.orientation] ** 2 > 0.5
+        matched = _match(best)
+        least = _least_score(own[self.has_contrast[list(proposed)]])
+        for row, (view, assignment) in enumerate(proposed.items()):
+            score, highest = own[row], max(best[row, row], best[row, matched[row]])
+            correlation = scores.correlations[view, columns[row], assignment.orientation]
+            matches = score > least or correlation**2 > MIN_EXPLAINED
             matches = matches and score > highest - SIGNIFICANT
             is_clear = score > MARGIN and score >= highest
             if is_clear and exact:
@@ -191,11 +192,14 @@ class Assigner:
                 confirmed[view] = bool(parts) or (is_clear and parts is None) or not self.has_contrast[view]
         return out, confirmed
 
-    def match_together(self, chosen: Sequence[Assignment | None]) -> bool:
-        """Return True if chosen photos together match their views better than as many wrong pairs would."""
-        given = [(view, each) for view, each in enumerate(chosen) if each is not None and self.has_contrast[view]]
+    def match_together(self, assignments: Sequence[Assignment | None]) -> bool:
+        """Return True if assigned photos together match their views better than equally many wrong pairs would."""
         scores = self.score(self._correlations)
-        own = [scores.of(*pair) for pair in given]
+        own = [
+            scores.of(view, assignment)
+            for view, assignment in enumerate(assignments)
+            if assignment is not None and self.has_contrast[view]
+        ]
         return not own or _exceed_noise(np.array(own))
 
     def _stored_or_tagged(self, scores: _Scores, view: int, photo: int) -> int:
@@ -205,8 +209,9 @@ class Assigner:
         return tag if tagged > stored + SIGNIFICANT else 0
 
     def search(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, Assignment]:
-        """Find which of ``photos`` show ``views`` by comparing the most similar ones part by part."""
-        pairs = [(view, each) for view, likely in self.list_likely(views, photos).items() for each in likely]
+        """Find which of ``photos`` show ``views``; the most similar photos are compared part by part."""
+        likely_by_view = self.list_likely(views, photos)
+        pairs = [(view, assignment) for view, likely in likely_by_view.items() for assignment in likely]
         if not pairs:
             return {}
         scores = self.score(self._correlations)
@@ -228,22 +233,23 @@ class Assigner:
         if not views or not photos:
             return {}
         step, tags = -(-len(photos) // FIRST_PHOTOS), self.candidates.tags
-        places = set(range(0, len(photos), step))  # of the compared photos
+        compared = set(range(0, len(photos), step))  # indices into ``photos``
         while True:
-            scores = self.score(photos[place] for place in sorted(places))
+            scores = self.score(photos[index] for index in sorted(compared))
             best = scores.best()
             columns = {view: np.argsort(-best[view], kind="stable")[:MAX_COMPARED] for view in views}
             peaks = {photos.index(scores.photos[column]) for ids in columns.values() for column in ids}
-            around = {place + away for place in peaks for away in range(1 - step, step)} & set(range(len(photos)))
-            if around <= places:
+            neighbours = {peak + offset for peak in peaks for offset in range(1 - step, step)}
+            neighbours &= set(range(len(photos)))
+            if neighbours <= compared:
                 break
-            places, step = places | around, 1
+            compared, step = compared | neighbours, 1
 
-        def list_of(view: int) -> list[Assignment]:
+        def list_assignments(view: int) -> list[Assignment]:
             likely = [scores.photos[column] for column in columns[view] if np.isfinite(best[view, column])]
             return [Assignment(photo, scores.choose_orientation(view, photo, tags[photo])) for photo in likely]
 
-        return {view: list_of(view) for view in views}
+        return {view: list_assignments(view) for view in views}
 
 
 def assign_photos(
@@ -263,14 +269,15 @@ def assign_photos(
     """
     assigner = Assigner(show, candidates)
     out, confirmed = assigner.confirm(named, exact=exact)
-    most_match = 2 * sum(each is not None for each in out) > len(out) and assigner.match_together(out)
+    num_assigned = sum(assignment is not None for assignment in out)
+    most_match = 2 * num_assigned > len(out) and assigner.match_together(out)
     if exact and most_match:  # search only for the views whose proposed photo was rejected
-        unknown = [view for view, each in enumerate(out) if each is None and named[view] is not None]
+        unknown = [view for view, photo in enumerate(named) if photo is not None and out[view] is None]
     else:
         unknown = [view for view, is_confirmed in enumerate(confirmed) if not is_confirmed]
     if not unknown:
         return out
-    used = {each.photo for view, each in enumerate(out) if each is not None and view not in unknown}
+    used = {assigned.photo for view, assigned in enumerate(out) if assigned is not None and view not in unknown}
     if stored is not None:
         assigner = Assigner(show, stored)
     results = assigner.search(unknown, [photo for photo in range(candidates.count) if photo not in used])
@@ -279,10 +286,18 @@ def assign_photos(
     return out
 
 
-def _exceed_noise(scores: np.ndarray) -> bool:
-    """Return True if the median of scores ``[n]`` is significantly above that of as many wrong pairs.
+def _least_score(scores: np.ndarray) -> float:
+    """Return the least score of a right photo, from the scores ``[n]`` of all proposed photos.
 
-    No single score moves the median.
+    If the proposed photos together are right, it is half their median, half-way from wrong pairs to right pairs.
+    """
+    return min(SIGNIFICANT, float(np.median(scores)) / 2) if _exceed_noise(scores) else SIGNIFICANT
+
+
+def _exceed_noise(scores: np.ndarray) -> bool:
+    """Return True if the median of scores ``[n]`` is significantly above the median of equally many wrong pairs.
+
+    The median is used because a single score hardly moves it.
     """
     return bool(len(scores) and np.median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
 
@@ -294,12 +309,12 @@ def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) ->
         return {}
     views = sorted({view for view, _, _ in possible})
     photos = sorted({assignment.photo for _, assignment, _ in possible})
-    gains, chosen = np.zeros((len(views), len(photos))), dict[tuple[int, int], Assignment]()
+    gains, assignments = np.zeros((len(views), len(photos))), dict[tuple[int, int], Assignment]()
     for view, assignment, score in possible:
         gains[views.index(view), photos.index(assignment.photo)] = score
-        chosen[view, assignment.photo] = assignment
+        assignments[view, assignment.photo] = assignment
     matched = ((view, photos[column]) for view, column in zip(views, _match(gains), strict=True) if column >= 0)
-    return {view: chosen[view, photo] for view, photo in matched if (view, photo) in chosen}
+    return {view: assignments[view, photo] for view, photo in matched if (view, photo) in assignments}
 
 
 def _match(scores: np.ndarray) -> np.ndarray:

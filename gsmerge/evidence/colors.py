@@ -39,13 +39,13 @@ class Blocks:
     solid: np.ndarray  # [v,H,W] True where a block is opaque enough to be compared
 
     def errors(self, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
-        """Return the mean difference ``[n]`` between photo and picture of each block of some views; NaN if faint."""
+        """Return the mean difference ``[n]`` between photo and picture, for each block of some views; NaN if faint."""
         return self.distances(self.pictures, views)
 
     def distances(self, colors: np.ndarray, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
-        """Return the mean difference ``[n]`` between photos and ``colors [v,H,W,3]`` of each block; NaN if faint."""
-        away = np.abs(self.photos - colors).mean(-1)
-        return np.where(self.solid, away, np.nan)[views].reshape(-1)
+        """Return the mean difference ``[n]`` between photos and ``colors [v,H,W,3]``, for each block; NaN if faint."""
+        differences = np.abs(self.photos - colors).mean(-1)
+        return np.where(self.solid, differences, np.nan)[views].reshape(-1)
 
 
 def is_visible(errors: np.ndarray) -> bool:
@@ -78,19 +78,18 @@ def fit_tones(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> n
 
 def map_tones(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
     """Map the colours of a photo ``[...,3]`` in [0, 1] by a tone curve ``[3,256]``, one row per channel."""
-    places = photo.astype(np.float32) * np.float32(255)
-    first = np.clip(places.astype(np.int64), 0, 254)
-    part, channel = places - first, np.arange(3)
-    return np.asarray(tones[channel, first] * (1 - part) + tones[channel, first + 1] * part)
+    levels = photo.astype(np.float32) * np.float32(255)
+    lower = np.clip(levels.astype(np.int64), 0, 254)
+    fraction, channel = levels - lower, np.arange(3)
+    return np.asarray(tones[channel, lower] * (1 - fraction) + tones[channel, lower + 1] * fraction)
 
 
 def fit_map(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Fit the linear map ``[4,3]`` of colours to targets by least squares; its last row is a constant."""
     columns = np.concatenate([colors, np.ones((len(colors), 1))], 1).astype(np.float64)
-    heavy = columns * weights[:, None]
-    return solve(
-        matmul(heavy.T, columns) + RIDGE * len(colors) * np.eye(4), matmul(heavy.T, targets.astype(np.float64))
-    )
+    weighted = columns * weights[:, None]
+    normal = matmul(weighted.T, columns) + RIDGE * len(colors) * np.eye(4)
+    return solve(normal, matmul(weighted.T, targets.astype(np.float64)))
 
 
 def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
@@ -100,26 +99,26 @@ def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
-    """Return blocks of photos after a tone curve for each group of views; curves are fitted to the other blocks."""
+    """Return blocks of photos after a tone curve for each group of views; see :func:`_cross_fit`."""
     toned = pairs.photos.copy()
 
     def fit(group: Sequence[int]) -> None:
-        part = pairs[group]
-        shown = part.shown
-        toned[group] = _cross_fit(part.photos, shown.pictures, shown.weights, _tone_change)
+        group_pairs = pairs[group]
+        shown = group_pairs.shown
+        toned[group] = _cross_fit(group_pairs.photos, shown.pictures, shown.weights, _tone_change)
 
     parallel_map(fit, groups)
     return cut_blocks(pairs.with_photos(toned))
 
 
 def map_blocks(blocks: Blocks) -> Blocks:
-    """Return blocks after a linear map of colours; the map is fitted to the other blocks."""
+    """Return blocks after a linear map of colours; see :func:`_cross_fit`."""
     mapped = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _map_change)
     return Blocks(mapped, blocks.pictures, blocks.solid)
 
 
 def plain_blocks(blocks: Blocks) -> Blocks:
-    """Return blocks of one colour, the mean colour of the Gaussians in the other blocks."""
+    """Return blocks of one colour, the mean colour of the Gaussians; see :func:`_cross_fit`."""
     plain = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _plain_change)
     return Blocks(plain, blocks.pictures, blocks.solid)
 
@@ -138,18 +137,22 @@ def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Ch
 
 
 def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: Fit) -> np.ndarray:
-    """Change photos ``[v,h,w,3]`` by two-fold cross-fitting: each half of the blocks by the fit to the other half."""
+    """Change photos ``[v,h,w,3]`` by two-fold cross-fitting.
+
+    Each half of the blocks is changed by the fit to the other half.
+    """
     out, side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
     y, x = ((np.arange(size) / side).astype(int) for size in photos.shape[1:3])
     black_squares = (y[:, None] + x) % 2 == 1  # of the chess board
     for fold in (black_squares, ~black_squares):
-        colors, targets = (each[:, ~fold].reshape(-1, 3) for each in (photos, pictures))
-        out[:, fold] = fit(colors, targets, weights[:, ~fold].reshape(-1))(photos[:, fold])
+        colors, targets = photos[:, ~fold].reshape(-1, 3), pictures[:, ~fold].reshape(-1, 3)
+        change = fit(colors, targets, weights[:, ~fold].reshape(-1))
+        out[:, fold] = change(photos[:, fold])
     return out
 
 
 def _join_quantiles(levels: np.ndarray, tones: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the curve ``[256]`` float32 that maps quantiles of ``levels`` to those of ``tones``, with linear ends."""
+    """Return the curve ``[256]`` float32 from quantiles of ``levels`` to those of ``tones``; both ends are linear."""
     used = weights > 0
     if not used.any():
         return np.linspace(0, 1, 256, dtype=np.float32)

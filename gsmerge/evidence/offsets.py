@@ -1,8 +1,8 @@
 """Search for the parts of a photo in the picture of a view, to decide whether the photo was taken from there.
 
 Pictures of neighbouring views are similar as a whole, but their parts are displaced. Each part of the view's picture is
-searched for around the same place in the photo. If the best place of a part stands out from all others, its offset
-counts: parts of the view's own photo have no offset, parts of a neighbour's photo do.
+searched for around the same place in the photo. The offset of a part counts if its best place stands out from all other
+places. Parts of the view's own photo have no offset. Parts of a neighbour's photo have one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NEAR_PIXELS = 3  # pixels by which offsets of parts may differ in one common mot
 
 @dataclass(frozen=True, eq=False)
 class PhotoOffsets:
-    """Offsets of those parts of a photo whose place stands out from all others."""
+    """Offsets of the parts of a photo whose best place stands out from all other places."""
 
     offsets: np.ndarray  # [n,2] pixels down and right
     similarity: float  # mean of Fisher's z of all parts at offset zero
@@ -70,15 +70,16 @@ def correlate_parts(shown: ViewPictures, view: int, photo: np.ndarray) -> np.nda
     """Return Fisher's z ``[n]`` of the correlations between parts of a photo and the same parts of a view."""
     weight = shown.weights[view]
     height, width = weight.shape
-    of_photo = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
-    of_view = find_contrast(shown.pictures[view], weight, AROUND)
+    photo_contrast = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
+    view_contrast = find_contrast(shown.pictures[view], weight, AROUND)
     starts = [np.arange(0, side, max(1, PART * max(height, width) // SIDE)) for side in (height, width)]
 
     def add(values: np.ndarray) -> np.ndarray:
+        """Add weighted values ``[h,w,3]`` over each part."""
         return np.add.reduceat(np.add.reduceat(values.sum(-1) * weight, starts[0], 0), starts[1], 1).reshape(-1)
 
-    squares = add(of_photo * of_photo) * add(of_view * of_view)
-    return fisher_z(add(of_photo * of_view) / np.sqrt(np.maximum(squares, 1e-12)))
+    squares = add(photo_contrast * photo_contrast) * add(view_contrast * view_contrast)
+    return fisher_z(add(photo_contrast * view_contrast) / np.sqrt(np.maximum(squares, 1e-12)))
 
 
 def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffsets | None:
@@ -91,9 +92,10 @@ def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffs
     height, width = weight.shape
     if min(height, width) < 2 * PART:
         return None
-    of_photo = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
-    of_view = find_contrast(shown.pictures[view], weight, AROUND)
-    scores = _score_offsets(np.pad(of_photo, ((REACH, REACH), (REACH, REACH), (0, 0))), of_view, weight)
+    photo_contrast = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
+    view_contrast = find_contrast(shown.pictures[view], weight, AROUND)
+    padded = np.pad(photo_contrast, ((REACH, REACH), (REACH, REACH), (0, 0)))
+    scores = _score_offsets(padded, view_contrast, weight)
     middle = np.median(scores, 1)
     noise = NORMAL * np.median(np.abs(scores - middle[:, None]), 1) + 1e-6
     stand_out = scores.max(1) - middle > MARGIN * noise
@@ -106,15 +108,21 @@ def _score_offsets(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -
     rows, columns = (np.arange(0, side - PART + 1, PART) + (side % PART) // 2 for side in weight.shape)
     corners = [(top, left) for top in rows for left in columns]
 
-    def cut(array: np.ndarray, side: int) -> np.ndarray:
+    def transform_parts(array: np.ndarray, side: int) -> np.ndarray:
+        """Cut out the parts, squares of ``side`` pixels, and return their Fourier transforms."""
         parts = np.stack([array[top : top + side, left : left + side] for top, left in corners])
         return np.fft.rfft2(np.moveaxis(parts, -1, 1) if parts.ndim == 4 else parts, (TAPS, TAPS))
 
     shifts = slice(0, 2 * REACH + 1)
-    heavy, squares = picture * weight[..., None], (photo * photo).sum(-1)
-    products = np.fft.irfft2((cut(photo, PART + 2 * REACH) * cut(heavy, PART).conj()).sum(1))[:, shifts, shifts]
-    energies = np.fft.irfft2(cut(squares, PART + 2 * REACH) * cut(weight, PART).conj())[:, shifts, shifts]
-    power = (heavy * picture).sum(-1)
-    own = np.stack([power[top : top + PART, left : left + PART].sum() for top, left in corners])
-    sizes = np.sqrt(np.maximum(energies, 1e-9) * np.maximum(own, 1e-9)[:, None, None])
-    return fisher_z(products / sizes).reshape(len(corners), -1)
+    searched = PART + 2 * REACH  # side of the square of the photo in which a part is searched
+    weighted, photo_squares = picture * weight[..., None], (photo * photo).sum(-1)
+    spectrum = transform_parts(photo, searched) * transform_parts(weighted, PART).conj()
+    products = np.fft.irfft2(spectrum.sum(1))[:, shifts, shifts]
+    photo_spectrum = transform_parts(photo_squares, searched) * transform_parts(weight, PART).conj()
+    photo_energies = np.fft.irfft2(photo_spectrum)[:, shifts, shifts]
+    picture_squares = (weighted * picture).sum(-1)
+    picture_energies = np.stack([
+        picture_squares[top : top + PART, left : left + PART].sum() for top, left in corners
+    ])  # fmt: skip
+    lengths = np.sqrt(np.maximum(photo_energies, 1e-9) * np.maximum(picture_energies, 1e-9)[:, None, None])
+    return fisher_z(products / lengths).reshape(len(corners), -1)

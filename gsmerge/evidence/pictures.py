@@ -1,7 +1,7 @@
 """Make small pictures of what Gaussians show from cameras, to compare them with photos.
 
 Transparency is divided out, so faint or sparse Gaussians have the colours of solid ones. The opacity of a pixel is its
-weight. Photos are averaged with the same weights, so pixels without Gaussians do not count in either of the two.
+weight. Photos are averaged with the same weights, so pixels without Gaussians count in neither photos nor pictures.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Pairs:
 def fit_size(size: Sequence[int], side: int) -> tuple[int, int]:
     """Return width and height in the proportion of ``size``, with at most ``side`` pixels on the longer side."""
     reduction = max(1.0, max(size) / side)
-    width, height = (max(1, round(whole / reduction)) for whole in size)
+    width, height = (max(1, round(full_side / reduction)) for full_side in size)
     return width, height
 
 
@@ -127,7 +127,10 @@ def _show_rows(scene: Scene, side: int) -> ViewPictures:
 
 
 def _sample_grid(cameras: Cameras, side: int) -> tuple[slice, slice, slice]:
-    """Return slices of views, lines and columns that sample every so many pixels, from the middle of the first step."""
+    """Return slices of views, lines and columns that sample pixels in equal steps, at most ``side`` per line.
+
+    The first sample is in the middle of the first step.
+    """
     step = -(-max(cameras.width, cameras.height) // side)
     pixels = slice(min(step // 2, cameras.width - 1, cameras.height - 1), None, step)
     return slice(None), pixels, pixels
@@ -136,8 +139,8 @@ def _sample_grid(cameras: Cameras, side: int) -> tuple[slice, slice, slice]:
 def draw_views(gaussians: Gaussians, cameras: Cameras, side: int) -> ViewPictures:
     """Render canonical Gaussians, and divide their transparency out."""
     blank = blank_photos(cameras, max(1.0, max(cameras.width, cameras.height) / side))
-    drawn = photo_errors(gaussians, blank, lambda _, image, left: (image, 1 - left))
-    images, opacities = map(np.stack, zip(*drawn, strict=True))
+    renders = photo_errors(gaussians, blank, lambda _, image, transmittance: (image, 1 - transmittance))
+    images, opacities = map(np.stack, zip(*renders, strict=True))
     pictures = np.divide(
         images, opacities[..., None], out=np.zeros_like(images), where=opacities[..., None] > LEAST_OPACITY
     )

@@ -25,45 +25,50 @@ SAME = 3 / 255  # largest difference of equal colours after rounding to 8 bits a
 def find_on_rays(scene: Scene, views: Sequence[int], photos: Sequence[np.ndarray]) -> np.ndarray:
     """Find which photos have Gaussians of their colours on the rays of their views, as a mask ``[v]``.
 
-    ``scene`` is canonical. ``photos [h,w,3]`` are those that names give to ``views``, at the size of the views. Each
-    photo is measured in its own view and in all others, as the share of pixels with a Gaussian of their colour. A photo
-    passes if its share in its own view exceeds the mean of two numbers: the largest share of a wrong photo in that
-    view, and the median share of all photos in their own views. No photo passes if that median is not clearly above the
-    shares of wrong pairs.
+    ``scene`` is canonical. ``photos [h,w,3]`` are the photos that names assign to ``views``, at the size of the views.
+    Each photo is measured in its own view and in all other views, as the share of pixels with a Gaussian of their
+    colour. A photo passes if its share in its own view exceeds the mean of two numbers: the largest share of a wrong
+    photo in that view, and the median share of all photos in their own views. No photo passes if this median is not
+    clearly above the shares of wrong pairs.
     """
     shares = measure_on_rays(scene, views, photos)
-    own, wrong = np.diag(shares).copy(), shares[~np.eye(len(shares), dtype=bool)].reshape(len(shares), -1)
-    if wrong.size == 0:
-        return np.zeros(len(own), bool)
-    middle = float(np.median(wrong))
-    noise = NORMAL * float(np.median(np.abs(wrong - middle))) + 1 / SAMPLE_PIXELS
-    if not np.median(own) - middle > MARGIN * noise:
-        return np.zeros(len(own), bool)
-    return np.asarray(own > (wrong.max(1) + np.median(own)) / 2)
+    is_wrong = ~np.eye(len(shares), dtype=bool)
+    own_shares, wrong_shares = np.diag(shares).copy(), shares[is_wrong].reshape(len(shares), -1)
+    if wrong_shares.size == 0:
+        return np.zeros(len(own_shares), bool)
+    middle = float(np.median(wrong_shares))
+    noise = NORMAL * float(np.median(np.abs(wrong_shares - middle))) + 1 / SAMPLE_PIXELS
+    if not np.median(own_shares) - middle > MARGIN * noise:
+        return np.zeros(len(own_shares), bool)
+    return np.asarray(own_shares > (wrong_shares.max(1) + np.median(own_shares)) / 2)
 
 
 def measure_on_rays(scene: Scene, views: Sequence[int], photos: Sequence[np.ndarray]) -> np.ndarray:
-    """Measure the share ``[v,p]`` of sampled pixels of each view with a Gaussian of each photo's colour on their ray.
+    """Measure the share ``[v,p]`` of each view's sampled pixels with a Gaussian of the photo's colour on their ray.
 
-    Only pixels with any Gaussian on their ray count.
+    Each of p photos is measured in each of v views. Only pixels with any Gaussian on their ray count.
     """
     g, cameras = scene.gaussians, scene.cameras
     means, scales = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales))
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
     size = cameras.width, cameras.height
-    numbers = np.full(scene.pixels_per_view, -1, np.int32)  # of sampled pixels; -1 for all other pixels
-    sample = np.random.default_rng(0).permutation(len(numbers))[:SAMPLE_PIXELS]
-    numbers[sample] = np.arange(len(sample), dtype=np.int32)
+    sample_ids = np.full(scene.pixels_per_view, -1, np.int32)  # of sampled pixels; -1 for all other pixels
+    sample = np.random.default_rng(0).permutation(len(sample_ids))[:SAMPLE_PIXELS]
+    sample_ids[sample] = np.arange(len(sample), dtype=np.int32)
+
+    def count_pixels(ids: np.ndarray) -> int:
+        """Count the different sampled pixels among ``ids [n]``."""
+        return int(np.count_nonzero(np.bincount(ids, minlength=len(sample))))
 
     def measure(view: int) -> np.ndarray:
         ids, pixels, _, areas = project_centres(means, scales, viewmats[view], Ks[view], *size, NEAR_PLANE)
-        rows = np.flatnonzero((numbers[pixels] >= 0) & (areas > 0))  # Gaussians whose centres lie in the picture
-        places, colors = numbers[pixels[rows]], sh0_to_rgb(g.sh0[ids[rows], 0]).clip(0, 1)
-        num_covered = max(1, int(np.count_nonzero(np.bincount(places, minlength=len(sample)))))
+        rows = np.flatnonzero((sample_ids[pixels] >= 0) & (areas > 0))  # Gaussians whose centres lie in the picture
+        sampled, colors = sample_ids[pixels[rows]], sh0_to_rgb(g.sh0[ids[rows], 0]).clip(0, 1)
+        num_covered = max(1, count_pixels(sampled))
         shares = np.zeros(len(photos))
-        for number, photo in enumerate(photos):
-            apart = np.abs(photo.reshape(-1, 3)[pixels[rows]] - colors).max(1)
-            shares[number] = np.count_nonzero(np.bincount(places[apart <= SAME], minlength=len(sample))) / num_covered
+        for photo_id, photo in enumerate(photos):
+            differences = np.abs(photo.reshape(-1, 3)[pixels[rows]] - colors).max(1)
+            shares[photo_id] = count_pixels(sampled[differences <= SAME]) / num_covered
         return shares
 
     return np.stack(parallel_map(measure, views))

@@ -21,10 +21,10 @@ from gsmerge.kernels.pictures import ORIENTATIONS, blur, turn_back
 from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
 
 SIZES = (24, 64)  # pixels of the longer side at which pictures are compared
-AROUND = 6  # the side of the picture is that many standard deviations of the local mean
+AROUND = 6  # side of the picture in standard deviations of the local mean
 REACH = 2  # standard deviations at which the local mean is cut off
 MARGIN = 5.0  # standard deviations of noise by which evidence must exceed the noise
-NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+NORMAL = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
 CLOSEST = 0.999  # larger correlations are clipped to it
 
 
@@ -70,11 +70,13 @@ class Comparer:
 
     @cached_property
     def _upright(self) -> list[_Filters]:
-        return [_make_filters(each, (0, 2)) for each in self._small]
+        """Filters at each size for photos that are stored upright or upside down."""
+        return [_make_filters(shown, (0, 2)) for shown in self._small]
 
     @cached_property
-    def _lying(self) -> list[_Filters]:
-        return [_make_filters(each, (1, 3)) for each in self._small]
+    def _sideways(self) -> list[_Filters]:
+        """Filters at each size for photos that are stored on their side."""
+        return [_make_filters(shown, (1, 3)) for shown in self._small]
 
     def measure_contrast(self) -> np.ndarray:
         """Return the root mean square contrast ``[v]`` of each view, over the pixels that show Gaussians."""
@@ -92,12 +94,13 @@ class Comparer:
         shapes = np.array([photo.shape for photo in photos]).reshape(-1, 3)
         square, portrait = shapes[:, 0] == shapes[:, 1], shapes[:, 0] > shapes[:, 1]
         upright = self._square | square | (portrait == self._portrait)
-        lying = self._square | square | (portrait != self._portrait)
-        for is_upright, fits in ((True, upright), (False, lying)):
+        sideways = self._square | square | (portrait != self._portrait)
+        for is_upright, fits in ((True, upright), (False, sideways)):
             ids = np.flatnonzero(fits)
             if len(ids):
-                filters = self._upright if is_upright else self._lying
-                scores = np.mean([_correlate([small[photo] for photo in ids], each) for each in filters], 0)
+                filters = self._upright if is_upright else self._sideways
+                fitting = [small[photo] for photo in ids]
+                scores = np.mean([_correlate(fitting, size_filters) for size_filters in filters], 0)
                 orientations = np.array(filters[0].orientations)
                 out[np.ix_(ids, np.arange(self.views), orientations)] = scores.reshape(len(ids), self.views, -1)
         out[:, self._empty] = np.nan
@@ -105,15 +108,16 @@ class Comparer:
 
 
 def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
-    """Make filters in the orientations of stored photos: by some ``quarters`` of a turn, plain and mirrored."""
+    """Make filters for photos that are stored turned by one of ``quarters``, quarter turns, plain or mirrored."""
     orientations = tuple(quarter + mirrored for mirrored in (0, ORIENTATIONS // 2) for quarter in quarters)
     products, weights, lengths = [], [], []
     for picture, weight in zip(small.pictures, small.weights, strict=True):
-        heavy = find_contrast(picture, weight) * weight[..., None]
-        length = float(np.sqrt((heavy * heavy / np.maximum(weight, LEAST_OPACITY)[..., None]).sum(dtype=np.float64)))
-        heavy = heavy / max(length, 1e-9)
+        weighted = find_contrast(picture, weight) * weight[..., None]
+        squares = weighted * weighted / np.maximum(weight, LEAST_OPACITY)[..., None]
+        length = float(np.sqrt(squares.sum(dtype=np.float64)))
+        weighted = weighted / max(length, 1e-9)
         lengths.append(length)
-        products += [turn_back(heavy, orientation).reshape(-1) for orientation in orientations]
+        products += [turn_back(weighted, orientation).reshape(-1) for orientation in orientations]
         weights += [turn_back(weight, orientation).reshape(-1) for orientation in orientations]
     height, width = turn_back(small.weights[0], orientations[0]).shape
     return _Filters((width, height), orientations, np.stack(products), np.stack(weights), np.array(lengths))
@@ -158,6 +162,6 @@ def signed_ranks(gains: np.ndarray) -> float:
 def stands_out(gains: np.ndarray) -> bool:
     """Return True if gains ``[n]`` are above zero by more than :data:`MARGIN` standard deviations of their noise.
 
-    The gains must be held out: those of views, or of parts of views, that were not used to fit the change.
+    The gains must be held out: their views, or their parts of views, were not used to fit the change.
     """
     return signed_ranks(gains) > MARGIN

@@ -30,8 +30,8 @@ def content_hash(files: Sequence[Path]) -> str:
     """Compute one SHA-256 over the names and contents of files and of everything in folders."""
     state = hashlib.sha256()
     for root in files:
-        inside = sorted(p for p in walk_files(root) if p.is_file()) if root.is_dir() else [root]
-        for path in inside:
+        paths = sorted(path for path in walk_files(root) if path.is_file()) if root.is_dir() else [root]
+        for path in paths:
             name = path.relative_to(root).as_posix() if root.is_dir() else path.name
             with read_errors(path), path.open("rb") as file:
                 state.update(f"{len(name)}:{name}:{path.stat().st_size}:".encode())
@@ -46,7 +46,7 @@ def list_files(files: SceneFiles) -> list[Path]:
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
         folders = (root, files.cameras.parent, files.ply.parent)
-        paths += [place / name for place in folders for name in EXTRA_FILES if (place / name).exists()]
+        paths += [folder / name for folder in folders for name in EXTRA_FILES if (folder / name).exists()]
         paths += list_photos(files.cameras) or ([] if files.images else images_beside(files.ply))
     return list(dict.fromkeys(paths))
 

@@ -1,4 +1,4 @@
-"""Estimate cameras for rows without any or with poses alone, and find how photos were resized to the rows' grid.
+"""Estimate cameras for rows that have none or only poses, and find how photos were resized to the rows' grid.
 
 Models resize photos without their aspect ratio or crop them, and some cut a border off their output. Therefore photos
 of any size are compared with the pictures of a grid, which are the colours of its rows.
@@ -52,7 +52,7 @@ class GridFit:
 
     size: Size  # of the grid
     crops: bool = False  # True: resized in proportion and cropped at the centre; False: width and height independently
-    trim: tuple[int, int] = (0, 0)  # columns and lines that the model cut off each side after that
+    trim: tuple[int, int] = (0, 0)  # columns and lines that the model then cut off at each side
 
     def transform(self, size: Size) -> PhotoTransform:
         """Return the transform of photos of a size to the grid with the borders that the model cut off."""
@@ -62,7 +62,7 @@ class GridFit:
     def cut(self, photo: np.ndarray) -> np.ndarray:
         """Resize and crop a photo ``[h,w,3]`` of any size to the pixels of the grid.
 
-        A landscape photo of a portrait grid, or the reverse, is turned for that, and the result is turned back.
+        If one is landscape and the other portrait, the photo is turned first, and the result is turned back.
         """
         (width, height), (x, y) = self.size, self.trim
         if (photo.shape[1] - photo.shape[0]) * (width - height) < 0:
@@ -91,12 +91,14 @@ def list_fits(size: Size) -> list[GridFit]:
 
 
 def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: Sequence[GridFit]) -> GridFit:
-    """Choose the fit by which photos ``[h,w,3]`` match the pictures of their views best; of equal fits the first."""
+    """Choose the fit with which photos ``[h,w,3]`` match the pictures of their views best; of equal fits the first."""
     views = [view for view, photo in enumerate(photos) if photo is not None]
 
     def score(fit: GridFit) -> np.ndarray:
-        parts = [correlate_parts(shown, view, fit.cut(photos[view])) for view in views]  # type: ignore[arg-type]
-        return np.concatenate(parts)
+        return np.concatenate([
+            correlate_parts(shown, view, fit.cut(photos[view]))  # type: ignore[arg-type]
+            for view in views
+        ])  # fmt: skip
 
     best, best_scores = fits[0], score(fits[0])
     for fit in fits[1:]:

@@ -41,9 +41,9 @@ class Model:
     """A model or program, whose code for saving was read to describe its files."""
 
     title: str  # the name that people use
-    source: str  # repository and commit; a second commit is that of a file that was read again later
-    output: str  # what it writes, as far as the exporter does not describe it
-    result: str = "read right"  # how gsmerge reads that output, and what the user adds
+    source: str  # repository and commit; files with a commit of their own were read again later
+    output: str  # description of its files, as far as the exporter does not describe them
+    result: str = "read right"  # how gsmerge reads these files, and what the user has to add
     place: str = ""  # pattern of its files' paths, if no other model with the same columns uses these paths
     camera_advice: str = ""  # how to get its cameras if they are missing, a clause
 
@@ -431,8 +431,8 @@ def choose_exporters(
     exporter = find_exporter(name)
     if exporter is not None:
         return (exporter,)
-    possible = [e for e in EXPORTERS.values() if e.may_have_written(info, layout, frame, cameras)]
-    return tuple([e for e in possible if e.is_marked] or possible)
+    possible = [entry for entry in EXPORTERS.values() if entry.may_have_written(info, layout, frame, cameras)]
+    return tuple([entry for entry in possible if entry.is_marked] or possible)
 
 
 def find_cameras_of_model(info: FileInfo) -> str:
@@ -440,7 +440,8 @@ def find_cameras_of_model(info: FileInfo) -> str:
 
     A model is recognised by the path of the file, or by a mark of its exporter. All recognised models must agree.
     """
-    path, exporters = Path(info.path).absolute(), [e for e in EXPORTERS.values() if e.writes_columns(info)]
+    path = Path(info.path).absolute()
+    exporters = [exporter for exporter in EXPORTERS.values() if exporter.writes_columns(info)]
     models = [(model, exporter.is_marked) for exporter in exporters for model in exporter.models if model.camera_advice]
     matching = [model for model, is_marked in models if (path.match(model.place) if model.place else is_marked)]
     advice = {model.camera_advice for model in matching}

@@ -40,9 +40,9 @@ _CHECK_SCENE_FILE = LazyFunction("gsmerge.scene.no_gaussians", "check_scene_file
 _NO_GAUSSIANS = LazyFunction("gsmerge.scene.no_gaussians", "no_gaussians")
 _HOLDS_VIEWS = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
 _FIND_DEPTH_MAPS = LazyFunction("gsmerge.io.formats.depth_maps", "find_depth_maps")
-# The first that exists and is no result wins; then the folder's only .ply.
+# The first of these files that exists and is no result is read; otherwise the folder's only .ply
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
-# Of several trained scenes in a folder, that of the most steps is read: INRIA's, and gsplat's
+# Among several trained scenes in a folder, the scene of the most steps is read. The places are INRIA's and gsplat's
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # DepthSplat and its relatives write NAME.ply there, with the photos in images/NAME
 IMAGE_PLACES = (
@@ -51,7 +51,7 @@ IMAGE_PLACES = (
 )  # fmt: skip
 MASK_PLACES = ("masks",)
 _PICTURES = ("images", "masks", "protect")  # fields of SceneFiles that are folders of pictures
-_POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names that other programs use for them
+_POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
 # Ends of paths that programs give to all their scenes
@@ -65,7 +65,7 @@ _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 _PACKED = {*SCENE_SUFFIXES} - {".ply", DEPTHS.ending}
 _MAX_HEADERS = 1_000  # headers of a folder's files that are read; further files count as scenes
 _MAX_DEPTH = 3  # of the folders that are searched below a folder without a scene
-_MAX_ENTRIES = 10_000  # files and folders in them
+_MAX_ENTRIES = 10_000  # largest number of files and folders in these folders
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def find_scene_files(
     These folders are searched in this order:
 
     - the given folder;
-    - the folder of the ``.ply``, and that of the file that it links to;
+    - the folder of the ``.ply``, and the folder of the file to which it links;
     - the folder above it if its own is ``gs_ply/``, ``ply/`` or ``gaussians/``, or the folder two above it if its own
       is ``point_cloud/iteration_n/``;
     - the folders above it up to ``within``, by default up to the given folder.
@@ -197,31 +197,48 @@ def find_scene_files(
             _CHECK_SCENE_FILE(part)
     roots = _search_roots(path, ply, within)
     if cameras is None:
-        places = (find(root) for find in (find_cameras, find_other_cameras, find_unread) for root in roots)
-        own = ply.parent.parent / POSES if is_frame(ply) else ply  # the cameras of depth maps
-        camera_path = own if ply.suffix == DEPTHS.ending else result_cameras(ply)
-        camera_path = camera_path or next((place for place in places if place is not None), None)
-    if images is None and is_frame(ply):
-        image_path = ply
-    elif images is None and camera_path is not None:
-        has_images = camera_path.suffix in (CHUNK, STATE_ENDING) or (
-            camera_path.suffix == ".npz" and holds_images(camera_path)
-        )
-        image_path = camera_path if has_images else None
-    if image_path is None and images is None:
-        folders = [f for root in roots for place in IMAGE_PLACES if can_be_listed(f := root / place, "images")]
-        # If a folder has several scenes, each may have its own folder of images
-        names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
-        own_folders = [place / name for place in folders for name in names]
-        image_path = next((f for f in own_folders + folders if f.is_dir() and list_images(f)), None)
+        camera_path = _find_camera_path(ply, roots)
+    if images is None:
+        image_path = _find_image_path(ply, camera_path, roots)
     if masks is None:
-        beside = [] if image_path is None else [image_path.parent]
-        candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
-        mask_path = next((f for f in candidates if can_be_listed(f, "masks") and list_images(f)), None)
+        mask_path = _find_mask_path(image_path, roots)
     parts = tuple(plys) if len(plys) > 1 else ()
     pictures = image_path, mask_path, protect
     files = SceneFiles(ply, camera_path, *pictures, parts=parts, num_copies=num_copies, named=named)
     return files if within is not None else replace(files, above=_find_above(files, roots))
+
+
+def _find_camera_path(ply: Path, roots: Sequence[Path]) -> Path | None:
+    """Find the cameras of a scene, in the order of precedence of :func:`find_scene_files`; None without."""
+    if ply.suffix == DEPTHS.ending:
+        return ply.parent.parent / POSES if is_frame(ply) else ply
+    of_result = result_cameras(ply)
+    if of_result is not None:
+        return of_result
+    searched = (find(root) for find in (find_cameras, find_other_cameras, find_unread) for root in roots)
+    return next((path for path in searched if path is not None), None)
+
+
+def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
+    """Find the images of a scene: inside its depth maps or its cameras' file, or in a folder; None without."""
+    if is_frame(ply):
+        return ply
+    if cameras is not None:
+        holds_all = cameras.suffix in (CHUNK, STATE_ENDING)
+        if holds_all or (cameras.suffix == ".npz" and holds_images(cameras)):
+            return cameras
+    folders = [f for root in roots for place in IMAGE_PLACES if can_be_listed(f := root / place, "images")]
+    # If a folder has several scenes, each may have its own folder of images
+    names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
+    own_folders = [folder / name for folder in folders for name in names]
+    return next((folder for folder in own_folders + folders if folder.is_dir() and list_images(folder)), None)
+
+
+def _find_mask_path(images: Path | None, roots: Sequence[Path]) -> Path | None:
+    """Find the folder of masks beside the images, or else in the searched folders ``roots``; None without."""
+    image_folder = [] if images is None else [images.parent]
+    candidates = (root / place for root in (*image_folder, *roots) for place in MASK_PLACES)
+    return next((folder for folder in candidates if can_be_listed(folder, "masks") and list_images(folder)), None)
 
 
 def can_be_listed(folder: Path, option: str) -> bool:
@@ -272,7 +289,7 @@ def _check_folders(**folders: Path | None) -> None:
 
 def _list_between(folder: Path, top: Path) -> list[Path]:
     """List the folders above a folder up to ``top``, the nearest first."""
-    return [each for each in folder.parents if each.is_relative_to(top)] if folder.is_relative_to(top) else []
+    return [above for above in folder.parents if above.is_relative_to(top)] if folder.is_relative_to(top) else []
 
 
 def scene_title(ply: Path) -> str:
@@ -282,7 +299,10 @@ def scene_title(ply: Path) -> str:
 
 
 def result_cameras(ply: Path) -> Path | None:
-    """Find the cameras that ``compact`` wrote beside a result, or beside that of a level of detail; None without."""
+    """Find the cameras that ``compact`` wrote beside a result; None without.
+
+    A level of detail has the cameras of the result to which it belongs, if it has none of its own.
+    """
     names = ply.name, _LEVEL.sub("", ply.name)
     beside = (viewer_cameras_path(ply.with_name(name)) for name in names)
     return next((path for path in beside if path.is_file()), None)
@@ -428,7 +448,7 @@ def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
 
 
 def named_ply(folder: Path) -> Path | None:
-    """Find the scene with a usual name in a folder; of trained scenes, that of the most steps. None without any."""
+    """Find the scene with a usual name in a folder; among trained scenes, the scene of the most steps. None without."""
     for place in PLY_PLACES:
         if (folder / place).is_file() and _is_scene(folder / place):
             return folder / place
@@ -455,6 +475,6 @@ def _results_in(folder: Path) -> list[Path]:
 
 
 def _is_scene(path: Path) -> bool:
-    """Return whether a file may be a scene: neither its name nor its header is that of a result or a point cloud."""
+    """Return whether a file may be a scene, because neither its name nor its header shows a result or a point cloud."""
     is_other = path.name in _POINT_CLOUDS or _RESULT.search(path.name)
     return not is_other and header_content(path) == "Gaussians"

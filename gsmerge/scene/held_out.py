@@ -23,9 +23,9 @@ from gsmerge.scene.views import limit_photo_size
 from gsmerge.types import Scene, StrPath, Views
 
 _MAX_ANGLE = 0.2  # degrees by which a view's two poses may differ after one frame is moved to the other
-_MAX_SHIFT = 0.005  # distance of these two poses, relative to the extent of all views
+_MAX_SHIFT = 0.005  # largest distance between a view's two poses, relative to the extent of all views
 _MIN_SHARED = 3  # views that determine the similarity between two worlds
-_SAME_POSE = 1e-4  # largest difference of poses of the same view: relative to the scene's distance, and of rotations
+_SAME_POSE = 1e-4  # largest distance of equal poses, relative to the scene's distance; and difference of rotations
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,17 @@ class HeldOutViews(Views):
     """Held-out views: t views that the scene was not made from, in the frame of its Gaussians."""
 
     places: tuple[int, ...]  # index of each view in the camera file, which is its place along the trajectory
-    context_places: tuple[int, ...] | None  # such indices of the scene's views; None if the file lacks one of them
+    context_places: tuple[int, ...] | None  # index of each view of the scene in the file; None if one is not in it
     notes: tuple[str, ...] = ()  # what was adapted, one sentence each
 
 
 def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
     """Read held-out photos and their cameras, in any format of a scene.
 
-    Views that the scene was made from are left out. If the file has these views too, under the same names, their poses
-    give the map from its world to that of the Gaussians. Otherwise its world is assumed to be that of the scene's own
-    cameras. Poses are read in the convention in which the scene's cameras fit. ``images``: folder of the photos; None:
-    the files that the camera file names. SceneError if a file is missing or damaged, or no view is left.
+    Views from which the scene was made are left out. If the file has these views under the same names, their poses give
+    the map from the file's world to the world of the Gaussians. Otherwise the file is assumed to share the world of the
+    scene's own cameras. Poses are read in the convention in which the scene's cameras fit. ``images``: folder of the
+    photos; None: the files that the camera file names. SceneError if a file is missing or damaged, or no view is left.
     """
     path = Path(cameras)
     if not path.exists():
@@ -54,22 +54,22 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
     if not places:
         problem = "expected held-out views, found only views that the scene was made from"
         raise SceneError(path, problem, "name a camera file that has other views of the scene")
-    chosen = select_views(camera_file, places)
-    photos = stored_photos(SceneFiles(load.files.ply, path, _folder(path, chosen, images)), chosen)
+    held_out = select_views(camera_file, places)
+    photos = stored_photos(SceneFiles(load.files.ply, path, _folder(path, held_out, images)), held_out)
     if not len(photos):
         root = path if path.is_dir() else path.parent
-        missing = next((name for name in chosen.names if find_image(root, name) is None), chosen.names[0])
+        missing = next((name for name in held_out.names if find_image(root, name) is None), held_out.names[0])
         raise SceneError(
             path, f"expected photos of its views, found none for {missing}", "name their folder with --target-images"
         )
-    pinholes, photos, _ = as_pinholes(chosen, photos)
+    pinholes, photos, _ = as_pinholes(held_out, photos)
     photos, notes = limit_photo_size(photos, 0, AUTO.max_side, unaligned=False)
     place_of_view = {view: place for place, view in shared.items()}
     has_all = 0 < len(place_of_view) == len(load.scene)
     return HeldOutViews(
         cameras=to_cameras(pinholes, photo_size(photos)),
         images=as_floats(photos),
-        names=chosen.names,
+        names=held_out.names,
         places=tuple(places),
         context_places=tuple(place_of_view[view] for view in range(len(load.scene))) if has_all else None,
         notes=tuple(notes),
@@ -85,8 +85,11 @@ def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int
     candidates = [stored]
     if cameras is not None and cameras.source == stored.source and cameras.convention != stored.convention:
         candidates.insert(0, with_convention(stored, cameras.convention))  # in which the scene's own cameras fit
-    worlds = [(each, *_find_world(each, _shared_views(each, load.scene.names), load)) for each in candidates]
-    camera_file, world, shared = next((each for each in worlds if each[2]), worlds[0])
+    worlds = []
+    for candidate in candidates:
+        world, shared = _find_world(candidate, _shared_views(candidate, load.scene.names), load)
+        worlds.append((candidate, world, shared))
+    camera_file, world, shared = next((entry for entry in worlds if entry[2]), worlds[0])
     return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
 
 
@@ -94,8 +97,8 @@ def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | N
     """Find the folder of the photos: the named one, or a folder beside cameras that name no files."""
     if images is not None:
         if not Path(images).is_dir():
-            found = "a file" if Path(images).exists() else "no such folder"
-            raise SceneError(images, f"expected a folder of photos, found {found}", "name it with --target-images")
+            actual = "a file" if Path(images).exists() else "no such folder"
+            raise SceneError(images, f"expected a folder of photos, found {actual}", "name it with --target-images")
         return Path(images)
     if len(cameras.images):
         return path
@@ -116,7 +119,11 @@ def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, 
 
 
 def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) -> tuple[Similarity, dict[int, int]]:
-    """Find the similarity from the file's world to that of the Gaussians, and the views that the scene also has."""
+    """Find the similarity from the file's world to the world of the Gaussians, and the views that the scene also has.
+
+    ``named`` maps indices in the file to views of the scene with the same name. The result is this map, or empty if the
+    poses of these views differ.
+    """
     stored = _stored_world(load)
     if not named:
         return stored, {}
@@ -135,7 +142,7 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) ->
 
 
 def _stored_world(load: Loaded) -> Similarity:
-    """Find the similarity from the world of the scene's own camera file to that of its Gaussians."""
+    """Find the similarity from the world of the scene's own camera file to the world of its Gaussians."""
     if load.recovery is not None:
         return load.recovery.best.frame
     if load.cameras is None or load.files.cameras is None:

@@ -22,7 +22,7 @@ from gsmerge.types import PROTECTED, Cameras
 
 _MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 _WHITE = np.uint8(255)
-_ROUNDING = 1 / 255  # mean difference of two pictures, or of two channels, that rounding to 8 bits may cause
+_ROUNDING = 1 / 255  # mean difference of two pictures or channels that rounding to 8 bits may cause
 _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
 
 
@@ -88,9 +88,9 @@ class MaskFiles:
     def _reduce(self, levels: np.ndarray, view: int) -> np.ndarray:
         """Average the brightness of a mask over each pixel of the view."""
         whole = cv2.resize(levels, self.stored, interpolation=cv2.INTER_NEAREST)
-        part = self.cut(view, whole[..., None].repeat(3, -1))[..., 0]
+        shown = self.cut(view, whole[..., None].repeat(3, -1))[..., 0]
         size = self.cameras.width, self.cameras.height
-        return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA))
+        return np.asarray(cv2.resize(shown, size, interpolation=cv2.INTER_AREA))
 
 
 def read_masks(
@@ -114,10 +114,13 @@ def read_masks(
         protecting, unused = match_masks(files.protect, names, "--protect")
         notes += unused
     if paths:
-        places = {path: i for i, path in enumerate(path for path in paths if path is not None)}
-        masks, protecting = (
-            [None if path is None else of[places[path]] for path in paths] for of in (masks, protecting)
-        )
+        index_of_photo = {path: i for i, path in enumerate(path for path in paths if path is not None)}
+
+        def spread(pictures: Sequence[Path | None]) -> list[Path | None]:
+            """Spread the pictures of existing photos over all views; None for a view without a photo."""
+            return [None if path is None else pictures[index_of_photo[path]] for path in paths]
+
+        masks, protecting = spread(masks), spread(protecting)
     turns = photos.turns or (0,) * len(masks)
     mask_files = MaskFiles(tuple(paths), turns, masks, protecting, stored, cut, cameras)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
@@ -158,21 +161,22 @@ def _stack(
     values: Sequence[np.ndarray | None], default: bool | np.float32, shape: tuple[int, int]
 ) -> np.ndarray | None:
     """Stack values ``[h,w]`` of views to ``[v,h,w]``, with the ``default`` for None; None if all are the default."""
-    if all(each is None or (each == default).all() for each in values):
+    if all(view_values is None or (view_values == default).all() for view_values in values):
         return None
-    return np.stack([np.full(shape, default) if each is None else each for each in values])
+    return np.stack([np.full(shape, default) if view_values is None else view_values for view_values in values])
 
 
 def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | None]) -> str:
-    """Describe which share of the pixels is protected, and for how many photos there is a picture of that."""
+    """Describe which share of the pixels is protected, and how many photos have a picture that protects pixels."""
     count = sum(mask is not None for mask in masks)
-    most = 1.0 if importance is None else float(importance.max())
+    max_weight = 1.0 if importance is None else float(importance.max())
     photos = f"{count} photo{'' if count == 1 else 's'} of {len(masks)}"
-    if importance is None or most <= 1:
+    if importance is None or max_weight <= 1:
         return f"protect: the pictures of {photos} have no white pixel, so no pixel gets a higher weight"
-    is_white = most >= PROTECTED / 2
-    share = 100 * float((importance >= (PROTECTED / 2 if is_white else (1 + most) / 2)).mean())
-    weight = f"{PROTECTED:g}" if is_white else f"at most {most:.2g}"
+    has_white = max_weight >= PROTECTED / 2
+    threshold = PROTECTED / 2 if has_white else (1 + max_weight) / 2
+    share = 100 * float((importance >= threshold).mean())
+    weight = f"{PROTECTED:g}" if has_white else f"at most {max_weight:.2g}"
     return f"protect: {share:.1f} % of the photos' pixels have a weight of {weight}, by the pictures of {photos}"
 
 

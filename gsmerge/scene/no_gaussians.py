@@ -78,13 +78,13 @@ def no_gaussians(folder: Path) -> SceneError:
 
 
 def find_remedy(folder: Path) -> str:
-    """Return what to do about a folder of folders without a scene; empty if none has known content."""
+    """Return what to do about a folder whose folders have no scene; empty if none of them has known content."""
     with suppress(OSError):
-        inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
-        places = [(place, _content(place)) for place in (folder, *islice(inside, MAX_FOLDERS))]
-        for place, content in sorted(places, key=lambda entry: entry[1] == _PHOTOS):
+        subfolders = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
+        contents = [(path, _content(path)) for path in (folder, *islice(subfolders, MAX_FOLDERS))]
+        for path, content in sorted(contents, key=lambda entry: entry[1] == _PHOTOS):  # photos come last
             if content is not None:
-                return f"{place} has {content[0]}: {content[1]}"
+                return f"{path} has {content[0]}: {content[1]}"
     return ""
 
 
@@ -107,10 +107,10 @@ def _content(folder: Path) -> tuple[str, str] | None:
         return f"points or a mesh ({points.name})", _NAME
     foreign = next((path for path in sorted(folder.glob("[!.]*")) if path.suffix.lower() in FOREIGN), None)
     if foreign is not None:
-        what, remedy = FOREIGN[foreign.suffix.lower()]
-        return f"{what} ({foreign.name})", remedy
-    beside = any(path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES for path in folder.glob("[!.]*"))
-    return _PHOTOS if beside or any(list_images(folder / place) for place in IMAGE_PLACES) else None
+        kind, remedy = FOREIGN[foreign.suffix.lower()]
+        return f"{kind} ({foreign.name})", remedy
+    has_photos = any(path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES for path in folder.glob("[!.]*"))
+    return _PHOTOS if has_photos or any(list_images(folder / place) for place in IMAGE_PLACES) else None
 
 
 def check_scene_file(path: Path) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import compress
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -56,7 +57,7 @@ _READ_IMAGES = LazyFunction("gsmerge.io.formats.depth_maps", "read_images")
 _MODEL_FOLDERS = ("0", "sparse", "colmap")  # names of COLMAP models in a scene's folder, which may also be one itself
 UNNAMED = "view 0"  # name of the first camera if the format, or rows without cameras, have no names
 _REDUCED = "images_*"  # folders of smaller copies; their names end with the factor
-SEEN_PLACE = "images_resized"  # WorldMirror writes its input photos there; those in "images" are squeezed if tall
+SEEN_PLACE = "images_resized"  # WorldMirror writes its input photos there; tall photos in "images" are squeezed
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ class ScenePhotos:
 
     @property
     def file_size(self) -> Size | None:
-        """Size of most turned photos in their files, of equally many the larger one; None if they are in no files."""
+        """Most frequent size of turned photos in their files, of two the larger one; None if they are in no files."""
         sizes = [_turned_size(path, turn) for path, turn in zip(self.paths, self.turns, strict=True) if path]
         return max(set(sizes), key=lambda size: (sizes.count(size), size[0] * size[1])) if sizes else None
 
@@ -125,24 +126,13 @@ def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | Non
     Files that cannot be read are left out.
     """
     names = camera_file.names
-    if files.images is not None:
-        if not files.images.is_dir():
-            return None
+    if files.images is None and "images" not in files.named:
+        folder, pool, named = _find_near_cameras(files, camera_file)
+    elif files.images is not None and files.images.is_dir():
         folder, pool = files.images, list_images(files.images)
         named = propose_images(folder, pool, names, _count_pixels)
     else:
-        if "images" in files.named:
-            return None
-        path = Path(camera_file.path)
-        folder = path if path.is_dir() and path.name not in _MODEL_FOLDERS else path.parent
-        named = [find_image(folder, name) for name in names]
-        pool = list(dict.fromkeys(path for path in named if path is not None))
-        nameless = all(name.removeprefix("view ").isdecimal() for name in names)
-        if not pool:
-            pool, named = _find_reduced(folder, names)
-            named = named or [None] * len(names)
-        if not pool and nameless:
-            folder, pool = files.ply.parent, images_beside(files.ply)  # AnySplat writes its Gaussians among the photos
+        return None
     exact = any(named) and camera_file.source != ESTIMATED
     if not any(named) and len(pool) == len(names):
         named = list(pool)
@@ -153,6 +143,24 @@ def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | Non
         for name, path in zip(names, named, strict=True)
     )
     return _drop_unreadable(Proposal(folder, tuple(pool), (), exact, faults), named)
+
+
+def _find_near_cameras(files: SceneFiles, camera_file: CameraFile) -> tuple[Path, list[Path], list[Path | None]]:
+    """Find photos near the camera file: the files that it names, smaller copies of them, or files beside the ``.ply``.
+
+    Returns their folder, all files, and the file that belongs to each camera by its name; None without.
+    """
+    path, names = Path(camera_file.path), camera_file.names
+    folder = path if path.is_dir() and path.name not in _MODEL_FOLDERS else path.parent
+    named = [find_image(folder, name) for name in names]
+    pool = list(dict.fromkeys(path for path in named if path is not None))
+    if not pool:
+        pool, named = _find_reduced(folder, names)
+        named = named or [None] * len(names)
+    is_nameless = all(name.removeprefix("view ").isdecimal() for name in names)
+    if not pool and is_nameless:
+        folder, pool = files.ply.parent, images_beside(files.ply)  # AnySplat writes its Gaussians among the photos
+    return folder, pool, named
 
 
 def _find_reduced(folder: Path, names: Sequence[str]) -> tuple[list[Path], list[Path | None]]:
@@ -171,8 +179,8 @@ def _describe_missing(folder: Path, name: str) -> str:
     inner, unread = PurePath(name), set[str]()
     for place in {folder, folder if inner.is_absolute() or ".." in inner.parts else folder / inner.parent}:
         with suppress(OSError, ValueError):
-            unread |= {each for each in os.listdir(place) if PurePath(each).stem == inner.stem}
-    unread = {each for each in unread if PurePath(each).suffix.lower() not in IMAGE_SUFFIXES}
+            unread |= {file for file in os.listdir(place) if PurePath(file).stem == inner.stem}
+    unread = {file for file in unread if PurePath(file).suffix.lower() not in IMAGE_SUFFIXES}
     shown = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner
     if not unread:
         return f"{shown}: no such file"
@@ -263,10 +271,10 @@ def read_photos(
     """Read the chosen photo of each camera, turned, and resized to the size of most photos.
 
     Photos of SHARP are resized to the size of their camera. SceneError if a photo cannot be read, or if its aspect
-    ratio is not that of most.
+    ratio differs from most photos.
     """
-    paths = tuple(None if each is None else proposal.pool[each.photo] for each in chosen)
-    turns = tuple(0 if each is None else each.orientation for each in chosen)
+    paths = tuple(None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen)
+    turns = tuple(0 if assignment is None else assignment.orientation for assignment in chosen)
     size = ScenePhotos((), paths, turns).file_size
     if size is None:
         return ScenePhotos()
@@ -283,8 +291,8 @@ def read_photos(
 def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, str] | None:
     """Leave out the views whose photos do not have the aspect ratio of most photos.
 
-    Returns the cameras and the photos of all other views, and a note on those left out. None if that is not possible,
-    because there are no photos, all have one aspect ratio, or a single view would be left.
+    Returns the cameras and the photos of all other views, and a note on the views that are left out. None if that is
+    not possible, because there are no photos, all have one aspect ratio, or a single view would remain.
     """
     paths = [None if photo is None else proposal.pool[photo] for photo in proposal.named]
     if not any(paths):
@@ -293,7 +301,8 @@ def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[Camer
     sizes = [size if path is None else image_size(path) for path, size in zip(paths, stored_sizes, strict=True)]
     photo_sizes = Counter(size for size, path in zip(sizes, paths, strict=True) if path is not None)
     (width, height), _ = photo_sizes.most_common(1)[0]
-    has_shape = [min(size) <= 1 or same_shape(size, (width, height)) for size in sizes]  # of 1 pixel: unknown
+    # a size of 1 pixel means that the size is unknown
+    has_shape = [min(size) <= 1 or same_shape(size, (width, height)) for size in sizes]
     used = [view for view, fits in enumerate(has_shape) if fits]
     unused = [view for view, fits in enumerate(has_shape) if not fits]
     if not unused or len(used) == 1:
@@ -381,23 +390,23 @@ def assign_to_views(
 
     assigned = assign_photos(show, candidates, named, exact=proposal.exact, stored=stored)
     proposed, chosen = proposal.choice, proposal.choice
-    for view, each in zip(views, assigned, strict=True):
-        chosen[cameras[view]] = each
+    for view, assignment in zip(views, assigned, strict=True):
+        chosen[cameras[view]] = assignment
+    named_views = {view: photo for view, photo in zip(views, named, strict=True) if photo is not None}
     changed = {
         view
-        for view, photo, each in zip(views, named, assigned, strict=True)
-        if photo is not None and (each is None or each.photo != photo)
+        for view, assignment in zip(views, assigned, strict=True)
+        if view in named_views and (assignment is None or assignment.photo != named_views[view])
     }
     if changed and read and images is not None:
-        with_photo = [view for view, photo in zip(views, named, strict=True) if photo is not None]
-        on_rays = find_on_rays(canonicalise(scene)[0], with_photo, [images[view] for view in with_photo])
-        for view in changed & {view for view, fits in zip(with_photo, on_rays, strict=True) if fits}:
+        on_rays = find_on_rays(canonicalise(scene)[0], list(named_views), [images[view] for view in named_views])
+        for view in changed & set(compress(named_views, on_rays)):
             chosen[cameras[view]] = proposed[cameras[view]]
-    return [None if camera in guessed else each for camera, each in enumerate(chosen)]
+    return [None if camera in guessed else assignment for camera, assignment in enumerate(chosen)]
 
 
 def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
-    """List the views without Gaussians whose cameras were estimated, so that these are guesses; else empty."""
+    """List the views without Gaussians if cameras were estimated, since the cameras of these views are guesses."""
     if camera_file.source != ESTIMATED or scene.pixels is None:
         return []
     return np.flatnonzero(~scene.pixels.shown.any((1, 2))).tolist()
@@ -417,14 +426,14 @@ def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
 
 
 def shows_better(scene: Scene, other: Scene) -> bool:
-    """Return whether the Gaussians of ``scene`` match its photos better than those of ``other`` match theirs."""
+    """Return whether the photos of ``scene`` match its Gaussians better than the photos of ``other`` match its own."""
     if len(scene) != len(other):
         return False
     scores = list[np.ndarray]()
-    for each in (scene, other):
-        shown, images = show_views(each, SIDE), each.images
+    for scored in (scene, other):
+        shown, images = show_views(scored, SIDE), scored.images
         assert images is not None
-        scores.append(np.concatenate([correlate_parts(shown, view, images[view]) for view in range(len(each))]))
+        scores.append(np.concatenate([correlate_parts(shown, view, images[view]) for view in range(len(scored))]))
     return stands_out(scores[0] - scores[1])
 
 
@@ -434,11 +443,11 @@ def name_by_photos(
     """Name estimated cameras by the photos of their views; set their ``photo_map`` to the fit of the photos."""
     if camera_file.source != ESTIMATED:
         return camera_file
-    files = [None if each is None else proposal.pool[each.photo] for each in chosen]
+    files = [None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen]
     names = [
         name if file is None else _inside(file, proposal) for name, file in zip(camera_file.names, files, strict=True)
     ]
-    turns = [0 if each is None else each.orientation for each in chosen]
+    turns = [0 if assignment is None else assignment.orientation for assignment in chosen]
     size = ScenePhotos((), tuple(files), tuple(turns)).file_size
     named = replace(camera_file, names=tuple(names))
     return named if fit is None or size is None else fit.cameras(named, size)
@@ -456,28 +465,28 @@ def describe_assignment(
     """Describe where the assignment of photos differs from their names; return notes, and notes on missing photos."""
     count, notes = len(chosen), list[str]()
     changes: dict[str, list[str]] = {"turned": [], "mirrored": []}
-    for each in chosen:
-        if each is not None and each.orientation != (tag := proposal.tags[each.photo]):
-            kind = "turned" if is_mirrored(each.orientation) == is_mirrored(tag) else "mirrored"
-            changes[kind].append(_inside(proposal.pool[each.photo], proposal))
+    for assignment in chosen:
+        if assignment is not None and assignment.orientation != (tag := proposal.tags[assignment.photo]):
+            kind = "turned" if is_mirrored(assignment.orientation) == is_mirrored(tag) else "mirrored"
+            changes[kind].append(_inside(proposal.pool[assignment.photo], proposal))
     for kind, files in changes.items():
         if files:
             names = list_some(files)
             notes.append(f"{len(files)} of {count} photos are {kind} relative to their orientation tags: {names}")
     moved = [
-        f"{camera_file.names[view]}: {_inside(proposal.pool[each.photo], proposal)}"
-        for view, each in enumerate(chosen)
-        if each is not None and each.photo != proposal.named[view]
+        f"{camera_file.names[view]}: {_inside(proposal.pool[assignment.photo], proposal)}"
+        for view, assignment in enumerate(chosen)
+        if assignment is not None and assignment.photo != proposal.named[view]
     ]
     if moved:
         names = "names" if proposal.exact else "their order"
         notes.append(f"photos are matched with views by their content, not by {names}: {list_some(moved)}")
     notes += _describe_spare(proposal, chosen)
-    without = [view for view, each in enumerate(chosen) if each is None]
-    if not without:
+    missing = [view for view, assignment in enumerate(chosen) if assignment is None]
+    if not missing:
         return notes, []
-    reasons = [_explain(proposal, view, camera_file.names[view]) for view in without]
-    return notes, [f"photos of {len(without)} of {count} views are left out: {list_some(reasons, '; ')}"]
+    reasons = [_explain(proposal, view, camera_file.names[view]) for view in missing]
+    return notes, [f"photos of {len(missing)} of {count} views are left out: {list_some(reasons, '; ')}"]
 
 
 def _explain(proposal: Proposal, view: int, name: str) -> str:
@@ -492,8 +501,8 @@ def _explain(proposal: Proposal, view: int, name: str) -> str:
 
 
 def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None]) -> list[str]:
-    """Note photos without a camera in the folders of the used photos, if they are fewer than these."""
-    used = [proposal.pool[each.photo] for each in chosen if each is not None]
+    """Note photos without a camera in the folders of the used photos, if they are fewer than the used photos."""
+    used = [proposal.pool[assignment.photo] for assignment in chosen if assignment is not None]
     named = [proposal.pool[photo] for photo in proposal.named if photo is not None]
     folders, stems = {path.parent for path in used}, {path.stem for path in (*used, *named)}
     spare = [path for path in proposal.pool if path.parent in folders and path.stem not in stems]

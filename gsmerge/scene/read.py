@@ -289,22 +289,22 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO
 
 
 def _is_usable(load: Loaded, fewer: SceneFiles, files: SceneFiles, cause: SceneError) -> bool:
-    """Return whether a scene that was read from ``fewer`` files than were found replaces the one that failed.
+    """Return whether a scene that was read from ``fewer`` files replaces the scene that could not be read.
 
     Photos that the caller named must be in it. If only photos are left out, either they caused the error, or the rows
-    must have pixels: without photos, cameras of another scene may see these Gaussians, too.
+    must have pixels, since without photos cameras of another scene may see these Gaussians as well.
     """
     if "images" in files.named and files.images is not None and load.scene.images is None:
         return False
     if fewer.cameras != files.cameras or fewer.masks != files.masks:
         return True
-    is_of_photo = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES
-    is_of_folder = files.images != files.cameras and cause.path == str(files.images)
-    return load.scene.has_own_pixels or is_of_photo or is_of_folder
+    photo_failed = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES
+    folder_failed = files.images != files.cameras and cause.path == str(files.images)
+    return load.scene.has_own_pixels or photo_failed or folder_failed
 
 
 def _note_left_out(load: Loaded, files: SceneFiles, cause: SceneError) -> Loaded:
-    """Add a note to a scene that was read without some of the found ``files``: which are left out, and why."""
+    """Add a note to a scene that was read without some ``files``; it says which files are left out, and why."""
     names = [str(files.cameras)] if load.files.cameras != files.cameras else []
     if load.files.masks != files.masks:
         names.append(f"the masks in {files.masks}")
@@ -361,7 +361,7 @@ def _prefer_resized(
 def _assign_of_one_shape(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
 ) -> Loaded:
-    """Combine as :func:`_assign`; if that fails, leave out the views whose shape is not that of most."""
+    """Combine as :func:`_assign`; if that fails, leave out views whose photos differ in shape from most photos."""
     try:
         return _assign(ply, files, camera_file, proposal, hints)
     except SceneError:
@@ -375,7 +375,7 @@ def _assign_of_one_shape(
 def _assign(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
 ) -> Loaded:
-    """Combine Gaussians and cameras with the photos that names propose, or with those that show the views.
+    """Combine Gaussians and cameras with the photos that names propose, or with other photos that show the views.
 
     Notes name photos that cannot be read, and views without a photo. SceneError if no photo shows any view.
     """
@@ -414,17 +414,13 @@ def _combine(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, photos: ScenePhotos, hints: ReadHints
 ) -> Loaded:
     """Combine Gaussians, cameras and their photos; SceneError if any of them cannot be used."""
-    exporter = find_exporter(hints.exporter)
-    default_order = camera_file.order if exporter is None else exporter.order
-    if default_order == "auto" and RESULT_COMMENT in ply.info.comments:
-        default_order = "none"  # results of gsmerge have no pixels
-    order = default_order if hints.order == "auto" else hints.order
+    order = _choose_order(ply, camera_file, hints)
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
     notes += [camera_file.focal] if camera_file.focal else []
-    whole, (pictures, bar_notes) = pictures, cut_bars(pictures, camera_file)
-    limited, size_notes = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
-
+    without_bars, bar_notes = cut_bars(pictures, camera_file)
+    had_bars = without_bars is not pictures
+    limited, size_notes = limit_photo_size(without_bars, len(ply.gaussians), hints.max_side, unaligned=order == "none")
     depths, frames = partial(read_depths, Path(camera_file.path)), partial(read_dataparser, files.ply, files.cameras)
     if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians
         problem = "expected one Gaussian per pixel, found the Gaussians of a state"
@@ -440,13 +436,22 @@ def _combine(
         notes += size_notes
     size = photo_size(limited)
     unused = [f"--{name}" for name in ("masks", "protect") if getattr(files, name) is not None]
-    if unused and not (size and pictures is whole):
+    if unused and (had_bars or not size):
         reason = "the photos have bars, which are cut off" if size else "there are no photos"
         notes.append(f"the pictures of {' and '.join(unused)} are not used, since {reason}")
-    if pictures is not whole:  # photos with bars have neither larger files nor masks
+    if had_bars:  # photos with bars have neither larger files nor masks
         return _make_load(ply, files, hints, result, notes, absent=photos.absent)
-    large, masks, more = find_larger_and_masks(files, camera_file, photos, size, result.transform, result.cameras)
-    return _make_load(ply, files, hints, result, [*notes, *more], large, masks, photos.absent)
+    large, masks, mask_notes = find_larger_and_masks(files, camera_file, photos, size, result.transform, result.cameras)
+    return _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
+
+
+def _choose_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
+    """Choose the order of the rows: by the hints, by the named exporter, or by the format of the cameras."""
+    exporter = find_exporter(hints.exporter)
+    if hints.order != "auto":
+        return hints.order
+    order = camera_file.order if exporter is None else exporter.order
+    return "none" if order == "auto" and RESULT_COMMENT in ply.info.comments else order  # results have no pixels
 
 
 def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
@@ -485,28 +490,15 @@ def _make_load(
     ``absent``: indices of the cameras without a photo.
     """
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
-    camera_names = () if camera_file is None else camera_file.names
-    gaussians, pixels = take_gaussians(ply, result)
-    num_faint = int(ply.valid.sum()) - len(gaussians)
-    more = [f"{num_faint:,} Gaussian(s) that nothing draws, fainter than 1/255, set aside"] if num_faint else []
-    cameras, images = result.cameras, result.images
-    if views != list(range(len(cameras))):
-        cameras, images = cameras[views], images[views] if len(images) else images
-    gaussians = color_from_photos(gaussians, pixels, images, files)
-    large = None if large is None else large[views]
-    masks, described = check_masks(masks[views], files)
-    more += described
-    photos = images if len(images) else None
-    names = tuple(camera_names[view] for view in views)
-    scene = Scene(gaussians, cameras, photos, pixels, names, large, masks.counts, masks.importance)
+    scene, more = _make_scene(ply, files, result, large, masks)
     frame = None if result.recovery is None else result.recovery.best.frame
     source = "" if camera_file is None else camera_file.source
     exporters, alignment = choose_exporters(hints.exporter, ply.info, layout, frame, source), None
     if layout is None or frame is None:
         scene = read_rotations(scene, hints.quats)
         if camera_file is not None and hints.exporter != "auto":
-            tried = f"only those of the given exporter {hints.exporter} were tried; --hint exporter=auto tries all"
-            more.append(f"the rows are the pixels of no views in any known order: {tried}")
+            remedy = f"only those of the given exporter {hints.exporter} were tried; --hint exporter=auto tries all"
+            more.append(f"the rows are the pixels of no views in any known order: {remedy}")
     else:
         assert camera_file is not None, "pixels belong to cameras"
         scene, depth_notes = use_depths(scene, camera_file, layout, frame.scale)
@@ -523,7 +515,7 @@ def _make_load(
         info=ply.info,
         files=files,
         cameras=camera_file,
-        views=SceneViews(result.cameras, result.images, camera_names, tuple(views)),
+        views=SceneViews(result.cameras, result.images, _camera_names(result), tuple(views)),
         exporters=exporters,
         notes=(*files.notes, *file_notes(ply.info), *notes, *more),
         alignment=alignment,
@@ -531,6 +523,34 @@ def _make_load(
         problem=result.problem,
         moves=result.moves,
     )
+
+
+def _make_scene(
+    ply: GaussianFile, files: SceneFiles, result: AlignmentResult, large: LargePhotos | None, masks: Masks
+) -> tuple[Scene, list[str]]:
+    """Make the scene of the visible Gaussians and the views to which rows belong; also return notes.
+
+    ``large`` and ``masks`` belong to all views of the camera file.
+    """
+    views, camera_names = list(result.views), _camera_names(result)
+    gaussians, pixels = take_gaussians(ply, result)
+    num_faint = int(ply.valid.sum()) - len(gaussians)
+    notes = [f"{num_faint:,} Gaussian(s) that nothing draws, fainter than 1/255, set aside"] if num_faint else []
+    cameras, images = result.cameras, result.images
+    if views != list(range(len(cameras))):
+        cameras, images = cameras[views], images[views] if len(images) else images
+    gaussians = color_from_photos(gaussians, pixels, images, files)
+    large = None if large is None else large[views]
+    masks, mask_notes = check_masks(masks[views], files)
+    photos = images if len(images) else None
+    names = tuple(camera_names[view] for view in views)
+    scene = Scene(gaussians, cameras, photos, pixels, names, large, masks.counts, masks.importance)
+    return scene, [*notes, *mask_notes]
+
+
+def _camera_names(result: AlignmentResult) -> tuple[str, ...]:
+    """Return the names of all views of the camera file; empty without cameras."""
+    return () if result.camera_file is None else result.camera_file.names
 
 
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:

@@ -97,7 +97,7 @@ def set_rotations(
 ) -> tuple[Scene, list[str]]:
     """Convert rotations as the hint says, as the named exporter stores them, or so that they fit the surface.
 
-    Also returns a note if the last of these changed them.
+    Also returns a note if the fit to the surface changed them.
     """
     turn = frame.rotation if frame.kind in TURNED else None
     if hints.quats != "auto":

@@ -28,7 +28,7 @@ from gsmerge.scene.masks import NO_MASKS, Masks, read_masks
 from gsmerge.scene.photos import ScenePhotos, stored_photos
 from gsmerge.types import Cameras, LargePhotos
 
-_MAX_BYTES = 2 << 30  # of all photos as floats while it is unknown whether the Gaussians belong to pixels
+_MAX_BYTES = 2 << 30  # size of all photos as floats, up to which photos are not resized unless rows have no pixels
 _FLOAT_PIXEL = 12  # bytes of a pixel as three floats
 _BAR_SPREAD = 8  # largest range of a bar's colours, of 255
 _ROUNDING = 1e-6  # pixels
@@ -99,28 +99,29 @@ def find_larger_and_masks(
         return np.ascontiguousarray(picture[window.rows, window.columns])
 
     def read(view: int) -> np.ndarray:
-        one = slice(view, view + 1)
-        return cut(view, decode_views(paths[one], photos.turns[one], stored)[0] if paths else photos.pictures[view])
+        if not paths:
+            return cut(view, photos.pictures[view])
+        return cut(view, decode_views([paths[view]], [photos.turns[view]], stored)[0])
 
     large = None
     if window.is_larger:
-        width, height = (part.stop - part.start for part in (window.columns, window.rows))
+        width, height = (pixels.stop - pixels.start for pixels in (window.columns, window.rows))
         large = LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
     return large, *read_masks(files, camera_file.names, photos, stored, cut, cameras)
 
 
 @dataclass(frozen=True)
 class _Window:
-    """The part of a photo's file that a view shows."""
+    """The window of a photo's file that a view shows."""
 
     rows: slice
     columns: slice
-    to_file: np.ndarray  # [3,3] from pixels of the view to those of this part
-    is_larger: bool  # whether this part has more pixels than the view on both sides
+    to_file: np.ndarray  # [3,3] maps pixels of the view to pixels of the window
+    is_larger: bool  # whether the window has more pixels than the view on both sides
 
 
 def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
-    """Find the part of files of the size ``stored`` that the views show; see :func:`find_larger_and_masks`."""
+    """Find the window that the views show in files of the size ``stored``; see :func:`find_larger_and_masks`."""
     fitted = transform or resize_to(size, size)
     scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)  # from pixels of the file to the grid
     corner, grid = np.array([fitted.left, fitted.top]), np.array([fitted.width, fitted.height])
@@ -160,8 +161,9 @@ def limit_photo_size(
 ) -> tuple[PhotoArrays, list[str]]:
     """Resize photos that are too large for memory to at most ``max_side`` pixels per side; return them and notes.
 
-    Photos keep their size if their pixels may be the Gaussians in the file's ``rows``, of which there are at least half
-    as many as pixels. ``unaligned``: the rows are known to have no pixels, so photos of any total size are resized.
+    Photos keep their size if they fit into memory, or if the file has at least half as many ``rows`` as the photos have
+    pixels, because its Gaussians may then be these pixels. ``unaligned``: the rows are known to have no pixels, so
+    photos of any total size are resized.
     """
     size = photo_size(photos)
     if size is None:
@@ -176,8 +178,8 @@ def limit_photo_size(
 def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tuple[Cameras, np.ndarray, list[str]]:
     """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; return them and a note.
 
-    The size is that of :func:`gsmerge.measure.sizes.shrink_views`. The pixels are not: photos of a scene are resized
-    as files are, photos to compare as their renders are.
+    The size is the same as from :func:`gsmerge.measure.sizes.shrink_views`, but the pixels differ. Here photos of a
+    scene are resized as files are; there photos are resized as the renders that are compared with them.
     """
     transform, notes = _limit((cameras.width, cameras.height), max_side)
     if transform is not None:

@@ -25,8 +25,8 @@ class JoinedScene:
     used: tuple[int, ...]  # numbers of the given scenes that are joined
     names: tuple[str, ...]  # of the given scenes, for messages
     notes: tuple[str, ...]
-    # for each given scene: its path and whether it was joined; if so, the number of keypoints that it was registered
-    # by, the angle of its rotation in degrees, its scale and the shift of its origin
+    # for each given scene: its path and whether it was joined; if so, the number of keypoints by which it was
+    # registered, the angle of its rotation in degrees, its scale and the shift of its origin
     facts: tuple[dict[str, Any], ...]
 
 
@@ -69,14 +69,14 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
     size = first.cameras.width, first.cameras.height
     degree = first.gaussians.sh_degree
     for scene, path in zip(scenes, paths, strict=True):
-        other = scene.cameras.width, scene.cameras.height
+        scene_size = scene.cameras.width, scene.cameras.height
         sh_degree = scene.gaussians.sh_degree
         if not scene.has_own_pixels:
             problem = "expected one Gaussian per pixel and a camera, to be joined, found none"
             raise SceneError(path, problem, "compact it by itself; name a result with -o")
-        if other != size:
+        if scene_size != size:
             problem = f"expected views of {size[0]} x {size[1]} as in {paths[0].name}"
-            problem += f", found {other[0]} x {other[1]}"
+            problem += f", found {scene_size[0]} x {scene_size[1]}"
             raise SceneError(path, problem, "export all at one size")
         if sh_degree != degree:
             problem = f"expected harmonics of degree {degree} as in {paths[0].name}, found {sh_degree}"
@@ -147,19 +147,21 @@ def _concat_filled(scenes: Sequence[Scene]) -> np.ndarray | None:
     """Concatenate the masks ``[n]`` of Gaussians that fill holes; None if no Gaussian does."""
     if all(scene.filled is None for scene in scenes):
         return None
-    each = [np.zeros(len(scene.gaussians), bool) if scene.filled is None else scene.filled for scene in scenes]
-    return np.concatenate(each)
+    masks = [np.zeros(len(scene.gaussians), bool) if scene.filled is None else scene.filled for scene in scenes]
+    return np.concatenate(masks)
 
 
 def _concat_values(
     scenes: Sequence[Scene], values: Sequence[np.ndarray | None], *, usual: bool | np.float32
 ) -> np.ndarray | None:
     """Concatenate values ``[v,h,w]`` of pixels; a scene without values gets ``usual``. None if no scene has values."""
-    if all(each is None for each in values):
+    if all(scene_values is None for scene_values in values):
         return None
-    shapes = ((len(scene), scene.cameras.height, scene.cameras.width) for scene in scenes)
-    filled = [np.full(shape, usual) if each is None else each for shape, each in zip(shapes, values, strict=True)]
-    return np.concatenate(filled)
+    arrays = []
+    for scene, scene_values in zip(scenes, values, strict=True):
+        shape = len(scene), scene.cameras.height, scene.cameras.width
+        arrays.append(np.full(shape, usual) if scene_values is None else scene_values)
+    return np.concatenate(arrays)
 
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:
@@ -167,11 +169,11 @@ def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:
     sources = [source for source in photos if source is not None]
     if len(sources) < len(photos) or len({(source.width, source.height) for source in sources}) > 1:
         return None
-    readers = [(source, number) for source in sources for number in source.ids]
+    source_views = [(source, source_view) for source in sources for source_view in source.ids]
 
     def read(view: int) -> np.ndarray:
-        source, number = readers[view]
-        return source.read(number)
+        source, source_view = source_views[view]
+        return source.read(source_view)
 
     Ks = np.concatenate([source.Ks for source in sources])
-    return LargePhotos(Ks, sources[0].width, sources[0].height, tuple(range(len(readers))), read)
+    return LargePhotos(Ks, sources[0].width, sources[0].height, tuple(range(len(source_views))), read)

@@ -15,14 +15,14 @@ from gsmerge.raster.photos import row_pictures
 from gsmerge.types import Scene
 
 SIDE = 1600  # longest side of a photo in which keypoints are searched, pixels
-MIN_SIDE = 8  # least side of it, pixels
+MIN_SIDE = 8  # least side of such a photo, pixels
 KEYPOINTS = 4000  # most keypoints of a photo
 CONTRAST = 0.02  # least contrast of a keypoint; OpenCV's default finds too few on plain walls
 GREY = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
-RATIO = 0.8  # largest distance of the best match over that of the second best (Lowe 2004)
+RATIO = 0.8  # largest distance of the best match, divided by the distance of the second best (Lowe 2004)
 OPAQUE = 0.5  # the surface of a pixel is its nearest Gaussian with at least this share of its largest opacity
 SAME_DEPTH = 0.15  # largest relative difference of depths around a keypoint on one surface
-PIXEL_SPREAD = 0.003  # standard deviation of a keypoint, over the diagonal of the picture
+PIXEL_SPREAD = 0.003  # standard deviation of a keypoint, divided by the diagonal of the picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class KeypointMatches:
 
 
 def find_keypoints(scene: Scene) -> list[Photo]:
-    """Find the keypoints of every camera of a scene of pixels that lie on a single surface.
+    """Find the keypoints in the photo of every camera of a scene of pixels; leave out those at edges of surfaces.
 
     Views from the same camera are layers of one photo.
     """
@@ -153,14 +153,14 @@ def _surface(scene: Scene, layers: Sequence[int], viewmat: np.ndarray) -> np.nda
 
 
 def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median depth in the 3 x 3 pixels around each of ``pixels [n,2]``, and True if they are one surface."""
+    """Return the median depth of 3 x 3 pixels around each of ``pixels [n,2]``, and whether these show one surface."""
     padded = np.pad(depths, 1, mode="edge")
     height, width = depths.shape
     x = np.floor(pixels[:, 0]).astype(int).clip(0, width - 1)
     y = np.floor(pixels[:, 1]).astype(int).clip(0, height - 1)
-    around = np.array([padded[y + down, x + right] for down in range(3) for right in range(3)])
-    is_surface = np.isfinite(around).all(0) & (around.max(0) < around.min(0) * (1 + SAME_DEPTH))
-    return lower_median(around), is_surface
+    window = np.array([padded[y + down, x + right] for down in range(3) for right in range(3)])
+    is_surface = np.isfinite(window).all(0) & (window.max(0) < window.min(0) * (1 + SAME_DEPTH))
+    return lower_median(window), is_surface
 
 
 def match_photos(
@@ -177,11 +177,11 @@ def match_photos(
 
 def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:
     """Collect the keypoints at the given rows of each photo."""
-    chosen = list(zip(photos, rows, strict=True))
+    photo_rows = list(zip(photos, rows, strict=True))
     counts = [len(ids) for ids in rows]
     return End(
-        points=np.concatenate([photo.points[ids] for photo, ids in chosen]),
-        pixels=np.concatenate([photo.pixels[ids] for photo, ids in chosen]),
+        points=np.concatenate([photo.points[ids] for photo, ids in photo_rows]),
+        pixels=np.concatenate([photo.pixels[ids] for photo, ids in photo_rows]),
         viewmats=np.repeat([photo.viewmat for photo in photos], counts, 0),
         Ks=np.repeat([photo.K for photo in photos], counts, 0),
     )

@@ -1,9 +1,9 @@
 """Register scenes of one place: find the similarities between their frames from photos and depths.
 
 Matched keypoints of two photos are points of both scenes, at the depths of their Gaussians. Three matches determine a
-similarity (Umeyama 1991). Of similarities of random triples, the one is chosen that agrees with most matches. Then all
-scenes are moved at once by Gauss-Newton steps, until points project to their keypoints in the other photos. Single
-depths may be wrong, so a point may move along its ray within the standard deviation of depths.
+similarity (Umeyama 1991). Similarities are fitted to random triples, and the similarity that agrees with most matches
+is chosen. Then all scenes are moved at once by Gauss-Newton steps, until points project to their keypoints in the other
+photos. Single depths may be wrong, so a point may move along its ray within the standard deviation of depths.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from gsmerge.types import Scene
 
 SAMPLE_TRIPLES = 2000  # random triples of matches
 TRIALS = 60  # best similarities of triples that are tested in the photos
-CLOSE = 0.25  # distance of matched points, over their depth, up to which a match supports a triple
+CLOSE = 0.25  # distance of matched points, divided by their depth, up to which a match supports a triple
 DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
-MIN_DEPTH_SPREAD = 0.01  # least measured value of it
+MIN_DEPTH_SPREAD = 0.01  # least measured standard deviation of the logarithm of a depth
 MIN_PIXELS = 0.2  # least measured standard deviation of a keypoint, pixels
-NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
-NORMAL_2D = 1 / 1.1774  # the same for the length of a vector with two normal components
+NORMAL = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
+NORMAL_2D = 1 / 1.1774  # standard deviation of two normal components, divided by the median length of their vector
 AGREE = 9.0  # largest squared residual of a match that agrees; residuals are in standard deviations
 LOOSE = (100.0, 10.0, 2.0, 2.0)  # multiples of AGREE in each round; the first are large because chains of scenes drift
 BEHIND = 1e3  # replaces the logarithm of the depth ratio of points behind the camera
@@ -41,12 +41,12 @@ DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain
 SIZE = 7  # parameters of a step: rotation, shift, logarithm of the scale
 
 Similarities = Sequence[Similarity | None]
-_Fit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]  # with their cost, its curvature and its slope
+_Fit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]  # similarities; their cost, its curvature and slope
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Similarity from each scene's frame to that of the first scene of the largest connected set."""
+    """Similarities from each scene's frame to the frame of the first scene of the largest connected set."""
 
     similarities: tuple[Similarity | None, ...]  # of each scene; None if it is not connected
     matches: tuple[int, ...]  # number of agreeing matches of each scene
@@ -120,7 +120,7 @@ def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
 
 
 def _between(similarities: Similarities, scenes: Sequence[int]) -> Similarity:
-    """Return the similarity from the frame of the first of two placed scenes to the second's."""
+    """Return the similarity from the frame of the first of two placed scenes to the frame of the second."""
     first, second = (similarities[scene] for scene in scenes)
     assert first is not None
     assert second is not None
@@ -142,8 +142,8 @@ class _Residuals:
 def _residuals(similarity: Similarity, end: End, other: End, pixels: float, spread: float) -> _Residuals:
     """Compute the errors between projected points of one end and the keypoints of the other, in standard deviations.
 
-    ``similarity`` maps from the frame of ``end`` to that of ``other``. ``pixels`` is the standard deviation of a
-    keypoint, and ``spread`` that of the logarithm of a depth.
+    ``similarity`` maps from the frame of ``end`` to the frame of ``other``. ``pixels`` is the standard deviation of a
+    keypoint, and ``spread`` the standard deviation of the logarithm of a depth.
     """
     rotmats = other.viewmats[:, :3, :3]
     moved = similarity.move_points(end.points)
@@ -172,7 +172,7 @@ def _residuals(similarity: Similarity, end: End, other: End, pixels: float, spre
 
 
 def _squares(similarities: Similarities, matches: KeypointMatches, spread: float) -> np.ndarray:
-    """Return the squared residual ``[m]`` of each match: the larger one of both directions."""
+    """Return the squared residual ``[m]`` of each match, in the direction in which it is larger."""
     both = [(residuals.values**2).sum(1) for residuals in _both_residuals(similarities, matches, spread)]
     return np.asarray(np.maximum(*both))
 
@@ -192,7 +192,8 @@ def _measure_spreads(
 ) -> tuple[list[KeypointMatches], float]:
     """Measure standard deviations robustly.
 
-    Returns the matches with the measured standard deviation of keypoints, and that of the logarithms of depths.
+    Returns the matches with the measured standard deviation of keypoints, and the standard deviation of the logarithms
+    of depths.
     """
     values = [_both_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
     lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]

@@ -53,7 +53,10 @@ def invert_similarity(similarity: Similarity) -> Similarity:
 
 
 def round_similarity(similarity: Similarity, unit: float) -> Similarity:
-    """Round a similarity so that rounding errors of keypoints do not change results; ``unit`` is that of the shift."""
+    """Round a similarity so that rounding errors of keypoints do not change results.
+
+    ``unit`` is the unit of the shift.
+    """
     quat = normalize(rotmat_to_quat(similarity.rotation[None]).round(DIGITS))
     shift = unit * (similarity.shift / unit).round(DIGITS)
     return Similarity(quat_to_rotmat(quat)[0], round(similarity.scale, DIGITS), shift, kind="other")
