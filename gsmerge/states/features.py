@@ -14,7 +14,7 @@ import numpy as np
 
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import prepare
+from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.facts.views import concat_cameras, in_float64, resize_cameras
 from gsmerge.frame import Frame
 from gsmerge.kernels.gaussians.cluster import connected_components
@@ -65,10 +65,10 @@ class FeatureState:
 
     merged: FeatureGaussians  # g, canonical, after merging; later batches are matched with these
     refined: FeatureGaussians  # g, canonical, after the refiner; the heads decode these
-    views: np.ndarray  # [g] int64, the view that each group's frame belongs to
-    num_members: np.ndarray  # [g] int64, Gaussians that became the group
-    saliency: np.ndarray  # [g] float64, mean corner response of the group's pixels, which chooses a mixed K
-    group: np.ndarray  # [g,n] float32, the numbers that describe each group
+    views: np.ndarray  # [g] int64, the view whose frame the group uses
+    num_members: np.ndarray  # [g] int64, number of Gaussians that were pooled into the group
+    saliency: np.ndarray  # [g] float64, mean corner response of the group's pixels; a mixed K depends on it
+    group: np.ndarray  # [g,n] float32, the networks' inputs about each group
     samples: ViewSamples  # of all views
     cameras: Cameras  # of all views, canonical, at the size of the first batch's views
     unseen: Gaussians  # canonical Gaussians that no view sees
@@ -94,33 +94,33 @@ class _JoinContext(NetworkContext):
 
     samples: ViewSamples  # of all views
     part_views: np.ndarray  # [p] int64, the view of each part
-    part_members: np.ndarray  # [p] int64, number of Gaussians that became the part
+    part_members: np.ndarray  # [p] int64, number of Gaussians that were pooled into the part
     part_weights: np.ndarray  # [p] sum of the opacities of these Gaussians
 
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
         """Compute the networks' inputs for Feature Gaussians, from the samples of all views."""
         views, num_members = self.trace(features)
         height, width = self.samples.opacities.shape[1:]
-        nothing = np.zeros((0, 0), np.float32)  # the statistics do not read these columns
-        shown = Members(
-            means=self.samples.means.reshape(-1, 3), quats=nothing, scales=nothing,
-            opacities=self.samples.opacities.reshape(-1), sh0=self.samples.sh0.reshape(-1, 1, 3), shN=nothing,
-            footprints=nothing, pixels=nothing, fronts=Pixels.of_grid(np.ones(self.samples.opacities.shape)).fronts,
+        unused = np.zeros((0, 0), np.float32)  # the statistics do not read these columns
+        samples = Members(
+            means=self.samples.means.reshape(-1, 3), quats=unused, scales=unused,
+            opacities=self.samples.opacities.reshape(-1), sh0=self.samples.sh0.reshape(-1, 1, 3), shN=unused,
+            footprints=unused, pixels=unused, fronts=Pixels.of_grid(np.ones(self.samples.opacities.shape)).fronts,
         )  # fmt: skip
-        grid = resize_cameras(self.cameras, width, height)
-        stats = cross_view_stats(features.means, features.sh0, views, shown, grid)
+        grid_cameras = resize_cameras(self.cameras, width, height)
+        stats = cross_view_stats(features.means, features.sh0, views, samples, grid_cameras)
         return describe_features(features, views, num_members, stats, self.cameras)
 
     def trace(self, features: FeatureGaussians) -> tuple[np.ndarray, np.ndarray]:
         """Find the view ``[g]`` with most of the weight of each Feature Gaussian, and its number of members ``[g]``."""
-        starts, rows = features.starts, features.members
-        owners = np.repeat(np.arange(len(features)), np.diff(starts))
-        keys, places = np.unique(owners * len(self.cameras) + self.part_views[rows], return_inverse=True)
-        of_keys, sums = keys // len(self.cameras), np.bincount(places, self.part_weights[rows])
-        order = np.lexsort((keys, -sums, of_keys))
-        _, first = np.unique(of_keys[order], return_index=True)
+        num_views, rows = len(self.cameras), features.members
+        owners = np.repeat(np.arange(len(features)), np.diff(features.starts))  # the Feature Gaussian of each part
+        pairs, pair_ids = np.unique(owners * num_views + self.part_views[rows], return_inverse=True)
+        pair_owners, pair_weights = pairs // num_views, np.bincount(pair_ids, self.part_weights[rows])
+        order = np.lexsort((pairs, -pair_weights, pair_owners))  # by owner, the heaviest view first
+        _, heaviest = np.unique(pair_owners[order], return_index=True)
         num_members = np.bincount(owners, self.part_members[rows], len(features))
-        return keys[order[first]] % len(self.cameras), num_members.astype(np.int64)
+        return pairs[order[heaviest]] % num_views, num_members.astype(np.int64)
 
 
 def extend_features(
@@ -132,6 +132,47 @@ def extend_features(
     Raises UsageError if the settings ask for a budget, a fit or networks other than those of the state, or if the
     harmonics have another degree.
     """
+    _check_options(options)
+    options = options.with_settings(piece_settings(CompactOptions))
+    with use_threads(options.threads), record_run(progress) as record:
+        prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame)
+        prepared_scene, world = prepared.scene, _check_world(state, prepared.scene, extend_options)
+        plan = make_plan(prepared, options, None if state is None else _own_checkpoint(state, options))
+        weights = plan.networks
+        if weights is None or not weights.options.encoder or not weights.options.makes_children:
+            raise UsageError(
+                f"recipe paper: expected networks with an encoder and absolute outputs, {options.checkpoint} lacks them"
+            )
+        cameras = in_float64(prepared_scene.cameras)
+        segmentation = segment_scene(prepared_scene, plan.superpixels, None)
+        members = assign(prepared_scene, segmentation.groups, by_contribution=plan.by_contribution)
+        context = NetworkContext(weights, members, cameras, plan.seed)
+        pooled = encode(prepared_scene, members, segmentation.groups)
+        features = correct(pooled, members, cameras, context, weaken=False)
+        samples = sample_views(members, cameras, state)
+        corners = scene_saliency(prepared_scene.images)
+        if state is None:
+            merged = merge(features, match(features, plan.match), context)
+            saliency = group_saliency(merged, members, corners)
+            extended = _refine(merged, context, saliency, samples, prepared.frame, plan.unseen)
+        else:
+            _check_degree(state, scene)
+            saliency = group_saliency(features, members, corners)
+            extended = _join(state, features, saliency, context, samples, plan.match)
+            extended = replace(extended, unseen=Gaussians.concat([state.unseen, plan.unseen]))
+    numbers = {"num_views": len(prepared_scene), "num_input": scene.num_gaussians, "num_new": len(features)}
+    notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == NOT_KNOWN else [])]
+    report = BatchReport(
+        **numbers, num_gaussians=len(extended), num_kept=0, pictures=prepared.reference.name, views={},
+        sh_degree=scene.gaussians.sh_degree, seconds=record.seconds,
+        choices=record.choices | plan.network_facts | {"world": world}, notes=tuple(notes), options=options.to_dict(),
+    )  # fmt: skip
+    names = _view_names(state, prepared)
+    return replace(extended, checkpoint=options.checkpoint, names=names), report
+
+
+def _check_options(options: CompactOptions) -> None:
+    """Raise UsageError for settings that Feature Gaussians in batches cannot follow: a budget, a fit and others."""
     for name in options.compact_only:
         raise UsageError(f"{name}: not possible for Feature Gaussians in batches; use compact on the whole scene")
     if options.budget.budget is not None:
@@ -141,46 +182,20 @@ def extend_features(
         )
     if options.fit.fit != "none":
         raise UsageError(f"fit {options.fit.fit}: expected none with recipe paper")
-    options = options.with_settings(piece_settings(CompactOptions))
-    with use_threads(options.threads), record_run(progress) as record:
-        prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame)
-        pictured, world = prepared.scene, _check_world(state, prepared.scene, extend_options)
-        plan = make_plan(prepared, options, None if state is None else _own_checkpoint(state, options))
-        weights = plan.networks
-        if weights is None or not weights.options.encoder or not weights.options.makes_children:
-            raise UsageError(
-                f"recipe paper: expected networks with an encoder and absolute outputs, {options.checkpoint} lacks them"
-            )
-        cameras = in_float64(pictured.cameras)
-        segmentation = segment_scene(pictured, plan.superpixels, None)
-        members = assign(pictured, segmentation.groups, by_contribution=plan.by_contribution)
-        context = NetworkContext(weights, members, cameras, plan.seed)
-        pooled = encode(pictured, members, segmentation.groups)
-        features = correct(pooled, members, cameras, context, weaken=False)
-        samples = sample_views(members, cameras, state)
-        corners = scene_saliency(pictured.images)
-        if state is None:
-            merged = merge(features, match(features, plan.match), context)
-            saliency = group_saliency(merged, members, corners)
-            extended = _refine(merged, context, saliency, samples, prepared.frame, plan.unseen)
-        else:
-            degree, expected = scene.gaussians.sh_degree, state.unseen.sh_degree
-            if degree != expected:
-                raise UsageError(f"expected harmonics of degree {expected}, as in the state, got {degree}")
-            saliency = group_saliency(features, members, corners)
-            extended = _join(state, features, saliency, context, samples, plan.match)
-            extended = replace(extended, unseen=Gaussians.concat([state.unseen, plan.unseen]))
-    numbers = {"num_views": len(pictured), "num_input": scene.num_gaussians, "num_new": len(features)}
-    notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == NOT_KNOWN else [])]
-    report = BatchReport(
-        **numbers, num_gaussians=len(extended), num_kept=0, pictures=prepared.reference.name, views={},
-        sh_degree=scene.gaussians.sh_degree, seconds=record.seconds,
-        choices=record.choices | plan.network_facts | {"world": world}, notes=tuple(notes), options=options.to_dict(),
-    )  # fmt: skip
-    names = prepared.input_scene.names
-    views = tuple(names[prepared.repeated.index(view)] for view in range(len(pictured)))
-    names = views if state is None else number_names(state.names, views)
-    return replace(extended, checkpoint=options.checkpoint, names=names), report
+
+
+def _check_degree(state: FeatureState, scene: Scene) -> None:
+    """Raise UsageError if the harmonics of a scene and of a state have different degrees."""
+    degree, expected = scene.gaussians.sh_degree, state.unseen.sh_degree
+    if degree != expected:
+        raise UsageError(f"expected harmonics of degree {expected}, as in the state, got {degree}")
+
+
+def _view_names(state: FeatureState | None, prepared: Prepared) -> tuple[str, ...]:
+    """Return the names of all views of a state and a batch."""
+    input_names = prepared.input_scene.names
+    batch_names = tuple(input_names[prepared.repeated.index(view)] for view in range(len(prepared.scene)))
+    return batch_names if state is None else number_names(state.names, batch_names)
 
 
 def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
@@ -205,8 +220,8 @@ def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
 
 def sample_views(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
     """Sample the foremost Gaussian at the centre of each cell of a grid; with a state, use its grid."""
-    shape = -(-cameras.height // SAMPLE_STEP), -(-cameras.width // SAMPLE_STEP)
-    height, width = shape if state is None else state.samples.opacities.shape[1:]
+    new_shape = -(-cameras.height // SAMPLE_STEP), -(-cameras.width // SAMPLE_STEP)
+    height, width = new_shape if state is None else state.samples.opacities.shape[1:]
     rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
     columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)
     pixels = (rows[:, None] * cameras.width + columns).reshape(-1)
@@ -258,34 +273,43 @@ def _join(
     samples = ViewSamples.concat([state.samples, samples])
     rows = np.arange(len(parts))
     parts = replace(parts, starts=np.arange(len(parts) + 1), members=rows.astype(np.int32))
-    sizes = np.concatenate([state.num_members, np.diff(features.starts)])
-    joined = _JoinContext(
+    num_members = np.concatenate([state.num_members, np.diff(features.starts)])
+    join_context = _JoinContext(
         networks=context.networks, members=members, cameras=cameras, seed=context.seed, samples=samples,
-        part_views=np.concatenate([state.views, views]), part_members=sizes, part_weights=np.asarray(parts.weights),
+        part_views=np.concatenate([state.views, views]), part_members=num_members, part_weights=np.asarray(parts.weights),
     )  # fmt: skip
-    merged = merge(parts, _match_parts(parts, len(state), options), joined)
+    merged = merge(parts, _match_parts(parts, len(state), options), join_context)
+    part_saliency = np.concatenate([state.saliency, saliency])
+    merged_saliency = _mean_of_parts(merged, part_saliency, num_members.astype(np.float64))
+    return _refine(merged, join_context, merged_saliency, samples, state.frame, state.unseen)
+
+
+def _mean_of_parts(merged: FeatureGaussians, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the weighted mean ``[g]`` of the parts of each Feature Gaussian; values and weights are ``[p]``."""
     owners = np.repeat(np.arange(len(merged)), np.diff(merged.starts))
-    weights = sizes[merged.members].astype(np.float64)
-    values = np.concatenate([state.saliency, saliency])[merged.members]
-    mean = np.bincount(owners, weights * values, len(merged)) / np.bincount(owners, weights, len(merged))
-    return _refine(merged, joined, mean, samples, state.frame, state.unseen)
+    weights, values = weights[merged.members], values[merged.members]
+    return np.bincount(owners, weights * values, len(merged)) / np.bincount(owners, weights, len(merged))
 
 
 def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -> Matches:
     """Match the Feature Gaussians of a batch with each other, as in a scene, and with those of the state.
 
-    A cluster joins the clusters of both matchings that share a part. For the second matching the state counts as one
-    view and the batch as another, so that each part is compared with its nearest neighbours on the other side.
+    Clusters of the two matchings are joined if they share a part. In the matching with the state, the state counts as
+    one view and the batch as another, so that each part is compared with its nearest neighbours on the other side.
     """
     rows = np.arange(len(parts))
     across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options).clusters
-    alone = np.where(rows < num_old, -1, parts.views)
-    within = match(replace(parts, views=alone, extinctions=np.where(rows < num_old, 0, parts.extinctions)), options)
-    leaders = [
-        np.unique(clusters, return_index=True, return_inverse=True)[1:] for clusters in (across, within.clusters)
-    ]
-    neighbors = np.stack([first[places] for first, places in leaders], 1)
+    batch_views = np.where(rows < num_old, -1, parts.views)
+    batch_extinctions = np.where(rows < num_old, 0, parts.extinctions)
+    within = match(replace(parts, views=batch_views, extinctions=batch_extinctions), options)
+    neighbors = np.stack([_first_members(across), _first_members(within.clusters)], 1)
     return Matches(*connected_components(neighbors, np.ones(neighbors.shape), 0.5))
+
+
+def _first_members(clusters: np.ndarray) -> np.ndarray:
+    """Return for each part the first part ``[p]`` with the same cluster in ``clusters [p]``."""
+    _, first_rows, cluster_ids = np.unique(clusters, return_index=True, return_inverse=True)
+    return first_rows[cluster_ids]
 
 
 def _without_members(features: FeatureGaussians) -> FeatureGaussians:
@@ -294,22 +318,22 @@ def _without_members(features: FeatureGaussians) -> FeatureGaussians:
 
 
 def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
-    """Decode a state into ``k`` Gaussians per group, or a number mixed by saliency, in the world frame.
+    """Decode a state into ``k`` Gaussians per group, or into a number that depends on saliency, in the world frame.
 
-    Raises UsageError if the networks' heads make fewer Gaussians, or for a rule that needs the members of the groups.
+    Raises UsageError if the networks' heads make fewer Gaussians, or if ``k_rule`` needs the members of the groups.
     """
-    most = state.networks.options.max_children
+    max_children = state.networks.options.max_children
     if options.k == MIXED and options.k_rule == "distortion":
         raise UsageError("k_rule distortion: expected saliency, since Feature Gaussians do not keep their members")
-    if options.max_k > most:
-        raise UsageError(f"k: expected mixed or 1 to {most}, got {options.k}")
+    if options.max_k > max_children:
+        raise UsageError(f"k: expected mixed or 1 to {max_children}, got {options.k}")
     counts = np.full(len(state), options.max_k)
     if options.k == MIXED:
         counts = counts_by_saliency(state.saliency, options)
     children, parents = repeat(state.refined, counts)
     described = make_group_features(state.refined, state.views, state.group, state.cameras)
-    nothing = gaussian_members(children[:0], np.zeros(0, np.float32))
-    context = NetworkContext(state.networks, nothing, state.cameras)
+    no_members = gaussian_members(children[:0], np.zeros(0, np.float32))
+    context = NetworkContext(state.networks, no_members, state.cameras)
     gaussians = decode_gaussians(children, parents, described, context)
     gaussians = gaussians[gaussians.opacities >= options.min_opacity]
     return state.frame.leave(Gaussians.concat([gaussians, state.unseen]))
@@ -321,9 +345,9 @@ def feature_arrays(state: FeatureState) -> dict[str, np.ndarray]:
     docs/reference/formats.md describes each array with its shape and unit.
     """
     features, unit = state.refined, state.frame.unit
-    ones, cameras = state.frame.leave(feature_to_gaussians(features)), state.frame.leave_cameras(state.cameras)
+    gaussians, cameras = state.frame.leave(feature_to_gaussians(features)), state.frame.leave_cameras(state.cameras)
     return {
-        **{name: np.asarray(column) for name, column in vars(ones).items()},
+        **{name: np.asarray(column) for name, column in vars(gaussians).items()},
         "covars": features.covars.astype(np.float64) * unit**2,
         "weights": features.weights,
         "masses": features.masses.astype(np.float64) * unit**3,

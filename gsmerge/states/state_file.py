@@ -25,12 +25,14 @@ from gsmerge.io.formats.gsm import (
 )
 from gsmerge.networks.checkpoint import build_networks
 from gsmerge.networks.options import CORRECTED, GROUP
+from gsmerge.networks.weights import NetworkWeights
 from gsmerge.scene.read import load_scene
 from gsmerge.states.features import FeatureState, ViewSamples
-from gsmerge.types import FeatureGaussians, Gaussians, Scene, StrPath
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, StrPath
 
 COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
 LARGEST = 1e37  # absolute value of any number; float32 ends at 3e38
+_MAX_MEMBERS = (1 << 40) - 1  # of a group; larger numbers are damaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +87,7 @@ def load_state(path: StrPath) -> State:
     if file.header["kind"] == FEATURES:
         return State(about, features=_read_features(file))
     scene = load_scene(path).scene
-    if len(scene.gaussians) == len(file.arrays["means"]):  # keep the bits: load_scene takes scales through logarithms
+    if len(scene.gaussians) == len(file.arrays["means"]):  # keep the bits, since load_scene rounds scales
         scene = replace(scene, gaussians=Gaussians(*(file.arrays[f.name] for f in fields(Gaussians))))
     return State(about, scene)
 
@@ -97,24 +99,17 @@ def holds_features(path: Path) -> bool:
 
 def _read_features(file: GsmFile) -> FeatureState:
     """Read Feature Gaussians, and check type, shape and range of every array."""
-    networks = {name.removeprefix("networks."): a for name, a in file.arrays.items() if name.startswith("networks.")}
-    options, unit = file.header.get("networks"), file.header.get("unit")
-    if not isinstance(options, dict):
-        raise file.error(f"expected networks in the header, found {options!r:.40}")
-    weights = build_networks(file.path, options, networks)
+    weights = _read_networks(file)
+    unit = file.header.get("unit")
     if not isinstance(unit, float) or not 0 < unit < MAX_NUMBER:
         raise file.error(f"unit: expected a length above 0 and below {MAX_NUMBER:g}, found {unit!r:.40}")
-    cameras = stored_cameras(file)
-    size = cameras.width, cameras.height
-    for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
-        check_camera(file.path, str(view), viewmat, K)
-        check_size(file.path, str(view), K, size)
-    g, num_views, latent = len(file.array("views", np.int64, None)), len(cameras), weights.options.latent
+    cameras = _read_cameras(file)
+    g, num_views = len(file.array("views", np.int64, None)), len(cameras)
     num_higher = file.array("merged.shN", np.float32, g, None, 3).shape[1]
     if num_higher not in NUM_HIGHER:
         raise file.error(f"merged.shN: expected {NUM_HIGHER} harmonics, found {num_higher}")
     shapes: dict[str, tuple[int, ...]] = {
-        "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (num_higher, 3), "latents": (latent,),
+        "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (num_higher, 3), "latents": (weights.options.latent,),
     }  # fmt: skip
     columns = {name: _numbers(file, f"merged.{name}", g, *shapes.get(name, ())) for name in COLUMNS}
     merged = FeatureGaussians(
@@ -124,28 +119,56 @@ def _read_features(file: GsmFile) -> FeatureState:
         members=np.zeros(0, np.int32),
     )
     corrected = {name: _numbers(file, f"refined.{name}", g, *shapes.get(name, ())) for name in CORRECTED}
-    height, width = file.array("samples.opacities", np.float32, num_views, None, None).shape[1:]
-    if 0 in (height, width):
-        raise file.error("samples.opacities: expected pixels of every view, found none")
-    grids = {"means": (3,), "opacities": (), "sh0": (3,)}
-    samples = [_numbers(file, f"samples.{name}", num_views, height, width, *more) for name, more in grids.items()]
-    n = len(file.array("unseen.means", np.float32, None, 3))
-    parts = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (num_higher, 3)}
     return FeatureState(
         merged=merged,
         refined=replace(merged, **corrected),
+        samples=_read_samples(file, num_views),
+        unseen=_read_unseen(file, num_higher),
         views=_whole_numbers(file, "views", g, 0, num_views),
-        num_members=_whole_numbers(file, "num_members", g, 1, 1 << 40),
+        num_members=_whole_numbers(file, "num_members", g, 1, _MAX_MEMBERS + 1),
         saliency=file.finite("saliency", np.float64, g),
         group=_numbers(file, "group", g, GROUP),
-        samples=ViewSamples(*samples),
         cameras=cameras,
-        unseen=Gaussians(*(_numbers(file, f"unseen.{name}", n, *shape) for name, shape in parts.items())),
         frame=Frame(file.finite("origin", np.float64, 3), unit),
         networks=weights,
         checkpoint=str(file.header.get("checkpoint")),
         names=stored_names(file, num_views),
     )
+
+
+def _read_networks(file: GsmFile) -> NetworkWeights:
+    """Read the networks of a state; SceneError if their options or arrays are damaged."""
+    prefix, options = "networks.", file.header.get("networks")
+    if not isinstance(options, dict):
+        raise file.error(f"expected networks in the header, found {options!r:.40}")
+    arrays = {name.removeprefix(prefix): array for name, array in file.arrays.items() if name.startswith(prefix)}
+    return build_networks(file.path, options, arrays)
+
+
+def _read_cameras(file: GsmFile) -> Cameras:
+    """Read the cameras of a state; SceneError if a pose, intrinsics or the size are impossible."""
+    cameras = stored_cameras(file)
+    for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
+        check_camera(file.path, str(view), viewmat, K)
+        check_size(file.path, str(view), K, (cameras.width, cameras.height))
+    return cameras
+
+
+def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
+    """Read the samples of all views."""
+    height, width = file.array("samples.opacities", np.float32, num_views, None, None).shape[1:]
+    if 0 in (height, width):
+        raise file.error("samples.opacities: expected pixels of every view, found none")
+    shapes = {"means": (3,), "opacities": (), "sh0": (3,)}
+    grid = num_views, height, width
+    return ViewSamples(*(_numbers(file, f"samples.{name}", *grid, *shape) for name, shape in shapes.items()))
+
+
+def _read_unseen(file: GsmFile, num_higher: int) -> Gaussians:
+    """Read the Gaussians that no view sees."""
+    n = len(file.array("unseen.means", np.float32, None, 3))
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (num_higher, 3)}
+    return Gaussians(*(_numbers(file, f"unseen.{name}", n, *shape) for name, shape in shapes.items()))
 
 
 def _numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
@@ -156,9 +179,9 @@ def _numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
     return array
 
 
-def _whole_numbers(file: GsmFile, name: str, count: int, least: int, end: int) -> np.ndarray:
-    """Return an array ``[count]`` of whole numbers from ``least`` to below ``end``; SceneError for other numbers."""
+def _whole_numbers(file: GsmFile, name: str, count: int, start: int, end: int) -> np.ndarray:
+    """Return an array ``[count]`` of whole numbers from ``start`` to below ``end``; SceneError for other numbers."""
     array = file.array(name, np.int64, count)
-    if count and not least <= int(array.min()) <= int(array.max()) < end:
-        raise file.error(f"{name}: expected numbers from {least} to {end - 1}, found others")
+    if count and not start <= int(array.min()) <= int(array.max()) < end:
+        raise file.error(f"{name}: expected numbers from {start} to {end - 1}, found others")
     return array

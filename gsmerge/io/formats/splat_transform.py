@@ -51,15 +51,13 @@ def run_program(*words: object) -> None:
     program = find_program()
     command = [program, "-q", "-w", "-g", "cpu", *map(str, words)]
     try:
-        process = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=TIME_LIMIT, check=False
-        )
+        ended = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=TIME_LIMIT, check=False)
     except subprocess.TimeoutExpired as error:
         raise GsmergeError(f"{program}: expected it to end within {TIME_LIMIT} seconds, it was stopped") from error
-    if process.returncode or not Path(str(words[-1])).exists():
-        lines = (process.stderr or process.stdout).decode(errors="replace").strip().splitlines() or ["without output"]
+    if ended.returncode or not Path(str(words[-1])).exists():
+        lines = (ended.stderr or ended.stdout).decode(errors="replace").strip().splitlines() or ["without output"]
         reason = next((line for line in lines if "Error: " in line), lines[-1]).rpartition("Error: ")[2]
-        problem = f"expected {Path(str(words[-1])).name}, it ended with code {process.returncode}"
+        problem = f"expected {Path(str(words[-1])).name}, it ended with code {ended.returncode}"
         raise GsmergeError(f"{program}: {problem}: {' '.join(reason.split())[:MAX_OUTPUT]}")
 
 

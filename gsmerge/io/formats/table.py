@@ -236,7 +236,7 @@ def is_frame(path: Path) -> bool:
 
 
 def may_hold_gaussians(path: Path) -> bool:
-    """Return whether a file has an ending for Gaussians; for endings with other uses, whether it holds Gaussians."""
+    """Return whether a file may hold Gaussians: by its ending, and by its content if the ending has other uses."""
     return path.suffix.lower() in SCENE_SUFFIXES and find_format(path).holds(path)
 
 
