@@ -44,7 +44,8 @@ from gsmerge.stages.prune import split_unseen
 from gsmerge.types import Cameras, Decoded, Gaussians, Scene
 
 T = TypeVar("T")
-# Most superpixels of a block, relative to one piece. Blocks take more where views of other blocks see the same surfaces
+# Most superpixels of a block, relative to compaction in one piece. A block takes more if views of other blocks see the
+# same surfaces
 MOST_DENSITY = 2.0
 SURPLUS = 1.03  # Gaussians of all blocks, relative to an exact number; the faintest surplus is dropped
 
@@ -67,11 +68,12 @@ def compact_in_blocks(
     """Compact a scene in blocks of views.
 
     First the views of each block are merged, and each block keeps the Gaussians that belong to it. So all blocks
-    together start from one set of Gaussians. Then each block fits all Gaussians that its views see, including those of
-    its neighbours, and keeps its own: where two blocks meet, both fit the same Gaussians to the same photos.
+    together start from one set of Gaussians. Then each block fits all Gaussians that its views see, including Gaussians
+    of its neighbours, and keeps its own Gaussians. At the border of two blocks, both fit the same Gaussians to the same
+    photos.
     """
     device, scene = scene.gaussians.device, scene.numpy()
-    count, most = len(blocks), choices.limits.count
+    count, limit = len(blocks), choices.limits.count
     with stage("partition"):
         factors = count_factors(blocks, covisibility).tolist()
         frame, options = scene_frame(scene), with_choices(options, choices)
@@ -83,7 +85,7 @@ def compact_in_blocks(
 
         def pieces() -> Iterator[tuple[Any, ...]]:
             for block, factor in zip(blocks, factors, strict=True):
-                piece_options = block_options(options, scene, block, factor, most)
+                piece_options = block_options(options, scene, block, factor, limit)
                 piece = subset(scene, block.views)
                 free_scene(scene)
                 yield piece, block, shared, piece_options, frame
@@ -91,30 +93,32 @@ def compact_in_blocks(
         expect_parts(block_costs(scene, choices, blocks))
         starts = [start for start, _ in adopt_records(work.run("merge", start_block, count, pieces()))]
         with stage("join"):
-            joined = Gaussians.concat([start.gaussians for start in starts])
-            owners = np.repeat(np.arange(count), [len(start.gaussians) for start in starts])
+            joined, owners = join_parts([start.gaussians for start in starts])
             growth = sum(start.count for start in starts) / max(1, len(joined))
-            if most is not None and options.budget.is_filled:
-                # a block drops new Gaussians that belong to other blocks: they all need some more to reach the number
-                growth = max(growth, SURPLUS * most / max(1, len(joined)))
-        everything = work.share((joined, owners))
-        fitted = list(adopt_records(work.run("fit", fit_block, count, each_start(starts, everything, growth))))
-        joined = Gaussians.concat([gaussians for gaussians, _ in fitted])
-        owners = np.repeat(np.arange(count), [len(gaussians) for gaussians, _ in fitted])
+            if limit is not None and options.budget.is_filled:
+                # blocks drop new Gaussians that belong to other blocks, so each needs a surplus to reach the number
+                growth = max(growth, SURPLUS * limit / max(1, len(joined)))
+        shared_start = work.share((joined, owners))
+        fitted = list(adopt_records(work.run("fit", fit_block, count, each_start(starts, shared_start, growth))))
+        joined, owners = join_parts([gaussians for gaussians, _ in fitted])
         joined = fit_seams(joined, owners, starts, options.seed)
         result = finish_joined(joined, scene.cameras, frame, options, choices)
-        everything = work.share(result)
-        scored = work.run("score", score_block, count, each_start(starts, everything))
+        scored = work.run("score", score_block, count, each_start(starts, work.share(result)))
         scores = [score for score, _ in adopt_records(scored)]
     facts = [
         {
             "views": len(start.block.own), "shared_views": len(start.block.shared), "num_start": len(start.gaussians),
-            "psnr_input_views": score.psnr, "fit": chosen.get("fit"),
+            "psnr_input_views": score.psnr, "fit": block_choices.get("fit"),
         }
-        for start, (_, chosen), score in zip(starts, fitted, scores, strict=True)
+        for start, (_, block_choices), score in zip(starts, fitted, scores, strict=True)
     ]  # fmt: skip
     choose(blocks=facts)
     return CompactResult(result, join_reports(scene, result, starts, scores, options), scene.cameras).to(device)
+
+
+def join_parts(parts: Sequence[Gaussians]) -> tuple[Gaussians, np.ndarray]:
+    """Join the Gaussians of all blocks; also return the number ``[n]`` of the block that owns each."""
+    return Gaussians.concat(parts), np.repeat(np.arange(len(parts)), [len(gaussians) for gaussians in parts])
 
 
 def block_costs(scene: Scene, choices: SceneChoices, blocks: Sequence[Block]) -> list[Part]:
@@ -177,24 +181,24 @@ def finish_joined(
     joined: Gaussians, cameras: Cameras, frame: Frame, options: CompactOptions, choices: SceneChoices
 ) -> Gaussians:
     """Prune the canonical Gaussians of all blocks, move them into the world, and drop those beyond the budget."""
-    most = choices.limits.count
+    limit = choices.limits.count
     if choices.fit.min_contribution > 0:
-        joined = prune_joined(joined, frame.enter_cameras(cameras), options, most)
+        joined = prune_joined(joined, frame.enter_cameras(cameras), options, limit)
     result = frame.leave(joined)
-    if most is not None and most < len(result):
-        result = faintest_dropped(result, most)
-    if most is not None and options.budget.is_filled and len(result) < most:
-        note(f"budget: {most:,} Gaussians were asked for, {len(result):,} remain of those of all blocks")
-    if (asked := file_size(options.budget)) and asked.packed:
-        page = asked.num_bytes, asked.file, cameras
+    if limit is not None and limit < len(result):
+        result = faintest_dropped(result, limit)
+    if limit is not None and options.budget.is_filled and len(result) < limit:
+        note(f"budget: {limit:,} Gaussians were asked for, {len(result):,} remain of those of all blocks")
+    if (size := file_size(options.budget)) and size.packed:
+        page = size.num_bytes, size.file, cameras
         result = drop_to_bytes(result, *page, measure_rest(result, *page))
     return result
 
 
-def prune_joined(joined: Gaussians, cameras: Cameras, options: CompactOptions, most: int | None) -> Gaussians:
-    """Drop the Gaussians that none of the ``cameras`` shows, except for those that fill a budget of ``most``."""
+def prune_joined(joined: Gaussians, cameras: Cameras, options: CompactOptions, limit: int | None) -> Gaussians:
+    """Drop the Gaussians that none of the ``cameras`` shows, except Gaussians that fill a budget of ``limit``."""
     seen, unseen = split_unseen(joined, cameras)
-    room = len(unseen) if most is None else most - len(seen)
+    room = len(unseen) if limit is None else limit - len(seen)
     unseen = unseen[: max(0, room) if options.budget.is_filled else 0]
     choose(pruned=len(joined) - len(seen) - len(unseen))
     return Gaussians.concat([seen, unseen])
@@ -213,21 +217,21 @@ def with_choices(options: CompactOptions, choices: SceneChoices) -> CompactOptio
 
 
 def block_options(
-    options: CompactOptions, scene: Scene, block: Block, factor: float, most: int | None
+    options: CompactOptions, scene: Scene, block: Block, factor: float, limit: int | None
 ) -> CompactOptions:
-    """Return the options of a block: those of the scene, with ``factor`` times the block's share of the Gaussians.
+    """Return the options of a block: the scene's options, with ``factor`` times the block's share of the Gaussians.
 
     Cameras and exposures stay fixed. The block also gets its share of all steps and of the first steps, which draw a
-    quarter of the pixels, so each view is fitted as often as in one piece. ``most``: Gaussians of all blocks together;
-    None: as many as ``superpixels`` and K give.
+    quarter of the pixels, so each view is fitted as often as in one piece. ``limit`` is the number of Gaussians of all
+    blocks together; None: ``superpixels`` and K decide.
     """
     settings: dict[str, Any] = {**piece_settings(CompactOptions), "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part
     superpixels = options.segment.superpixels
-    if most is not None:
-        settings["budget"] = max(1, round(SURPLUS * factor * most * len(block.views) / len(scene)))
+    if limit is not None:
+        settings["budget"] = max(1, round(SURPLUS * factor * limit * len(block.views) / len(scene)))
     elif isinstance(superpixels, str) and superpixels.endswith("%"):
         share = min(1.0, min(factor, MOST_DENSITY) * parse_share(superpixels))
         settings["superpixels"] = share_text(round(share, 6))

@@ -55,7 +55,8 @@ if TYPE_CHECKING:
 
     from gsmerge.settings.keywords import CompactKeywords
 
-# A count has to remain after clean-up: the scene is built at most so often, first with so many times the count
+# The requested count has to remain after clean-up. So the scene is built with SURPLUS times this count, at most
+# MAX_BUILDS times
 MAX_BUILDS, SURPLUS = 3, 1.05
 
 
@@ -187,7 +188,7 @@ class CleanedBuild:
     """Gaussians that were built for a count and cleaned up."""
 
     count: int | None  # Gaussians that were built; None: as many as `superpixels` and K give
-    fitted: Fitted  # What remains after clean-up
+    fitted: Fitted  # The fit, with the Gaussians that remain after clean-up
     dropped: dict[str, int]  # Numbers of dropped Gaussians by reason
     record: Record  # Seconds, choices and notes
 
@@ -202,7 +203,7 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
         return build(prepared, plan, count)
     from gsmerge.stages.clean import faintest_dropped
 
-    most = len(prepared.scene.gaussians)
+    max_count = len(prepared.scene.gaussians)
 
     def build_once(built_count: int | None) -> CleanedBuild:
         with record_part() as record:
@@ -212,14 +213,14 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
         return CleanedBuild(built_count, replace(fitted, gaussians=gaussians), dropped, record)
 
     def choose_next(built: Sequence[CleanedBuild]) -> int | None:
-        last, remaining = built[-1].count, len(built[-1].fitted.gaussians)
-        if count is None or last in (None, most) or remaining >= count or len(built) == MAX_BUILDS:
+        last_count, remaining = built[-1].count, len(built[-1].fitted.gaussians)
+        if count is None or last_count in (None, max_count) or remaining >= count or len(built) == MAX_BUILDS:
             return None
-        return min(most, math.ceil(SURPLUS * last * count / max(1, remaining)))
+        return min(max_count, math.ceil(SURPLUS * last_count * count / max(1, remaining)))
 
-    first = None if count is None else min(most, math.ceil(SURPLUS * count))
-    built = meet(build_once, build_once(first), choose_next)
-    best = max(built, key=lambda each: len(each.fitted.gaussians))
+    first_count = None if count is None else min(max_count, math.ceil(SURPLUS * count))
+    built = meet(build_once, build_once(first_count), choose_next)
+    best = max(built, key=lambda cleaned: len(cleaned.fitted.gaussians))
     gaussians, dropped = best.fitted.gaussians, best.dropped
     if count is not None and len(gaussians) > count:
         gaussians, dropped = faintest_dropped(gaussians, count), dropped | {"surplus": len(gaussians) - count}
@@ -229,10 +230,10 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
 
 
 def _clean(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gaussians, dict[str, int]]:
-    """Clean up fitted Gaussians; return those that remain, and the numbers of dropped ones by reason."""
+    """Clean up fitted Gaussians; return the remaining Gaussians, and the number of dropped Gaussians by reason."""
     from gsmerge.stages.clean import clean
 
-    # the few placed cameras that results are scored on do not show all of the scene: without cameras, clean places more
+    # the few cameras placed for scores do not show all of the scene; without cameras, `clean` places more
     cameras = None if prepared.reference.placed else fitted.cameras
     rows, dropped = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
     return fitted.gaussians[rows], dropped

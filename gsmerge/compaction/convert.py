@@ -44,8 +44,8 @@ class ConvertOptions:
 
     inputs: Sequence[Path]  # Several inputs are joined in their order
     output: Path  # Its name chooses the format
-    cameras: StrPath | None = None  # In the frame of the first input; None: those of a result, inside or beside it
-    images: StrPath | None = None  # Photos of these cameras, which show where the sky is
+    cameras: StrPath | None = None  # In the frame of the first input; None: the cameras inside or beside a result
+    images: StrPath | None = None  # Photos of these cameras, to find the sky
     opacity: OpacityChoice = "auto"
     clean: CleanOptions = field(default_factory=CleanOptions)
     placement: PlacementOptions = field(default_factory=PlacementOptions)
@@ -61,7 +61,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     Returns the document of ``gsmerge convert``. Raises SceneError if a file cannot be read or written, or if no
     Gaussian remains; UsageError for an ending that cannot be written, and for dropping the sky without photos.
     """
-    chosen = output_format(options.output, levels=True, cameras=True)
+    format_ = output_format(options.output, levels=True, cameras=True)
     with use_threads():
         files, steps = list[GaussianFile](), len(options.inputs) + 1
         for path in options.inputs:
@@ -70,11 +70,8 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         gaussians = join_gaussians([file.gaussians[file.valid] for file in files])
         stored, unread = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
-        if cameras is None and chosen.cameras == "needed":
-            about = chosen.about.partition(":")[0]
-            problem = f"expected a result's cameras inside or beside it for {about}, found none"
-            camera_file = find_scene_files(options.inputs[0]).cameras if options.cameras != NONE else None
-            raise SceneError(options.inputs[0], problem, f"name them with --cameras {camera_file or 'FILE'}")
+        if cameras is None and format_.cameras == "needed":
+            raise _cameras_missing(options, format_)
         count = len(gaussians)
         rows, left_out = _clean(gaussians, options, stored)
         gaussians = gaussians[rows]
@@ -93,7 +90,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     columns = columns[rows]
     named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
-    notes += [*unread, *describe_extra_columns(columns, missing, chosen, moves=options.placement.moves)]
+    notes += [*unread, *describe_extra_columns(columns, missing, format_, moves=options.placement.moves)]
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, left_out["unseen"], count, None if stored is None else stored.path)
     grey = [path for path in options.inputs if find_format(path) is DEPTHS and not holds_images(path)]
@@ -101,49 +98,60 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     names = () if stored is None else stored.names
     photos = name_photos(_photo_folder(options, stored), names)
     notes += output_notes(options.output, gaussians.sh_degree, photos) + rounding_notes(options.output, gaussians)
-    comments, mixed = _join_comments(infos, chosen, moves=options.placement.moves)
-    notes += mixed
+    comments, comment_notes = _join_comments(infos, format_, moves=options.placement.moves)
+    notes += comment_notes
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
-    num_bytes, beside = _write(options, chosen, gaussians, columns, moved, photos, names, comments)
-    facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": chosen.ending}
-    read = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
-    named_cameras = None if stored is None else str(stored.path)
+    num_bytes, camera_path = _write(options, format_, gaussians, columns, moved, photos, names, comments)
+    facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}
+    inputs = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
+    input_cameras = None if stored is None else str(stored.path)
     old = viewer_cameras_path(options.output)
-    if beside is None and not chosen.cameras and old.is_file():
+    if camera_path is None and not format_.cameras and old.is_file():
         notes.append(f"{old} is of an earlier file of that name, not of this one: delete it")
-    document = document_head() | {"inputs": read, "cameras": named_cameras, "left_out": left_out, "output": facts}
-    return document | {"viewer_cameras": beside, "notes": notes}
+    document = document_head() | {"inputs": inputs, "cameras": input_cameras, "left_out": left_out, "output": facts}
+    return document | {"viewer_cameras": camera_path, "notes": notes}
 
 
-def _join_comments(infos: Sequence[FileInfo], chosen: Format, *, moves: bool) -> tuple[list[str], list[str]]:
+def _cameras_missing(options: ConvertOptions, format_: Format) -> SceneError:
+    """Return the error for an output format that needs cameras, if none are known."""
+    title = format_.about.partition(":")[0]
+    problem = f"expected a result's cameras inside or beside it for {title}, found none"
+    camera_file = find_scene_files(options.inputs[0]).cameras if options.cameras != NONE else None
+    return SceneError(options.inputs[0], problem, f"name them with --cameras {camera_file or 'FILE'}")
+
+
+def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -> tuple[list[str], list[str]]:
     """Return the header comments that all files share, and notes on the comments that are lost.
 
     ``moves``: the scene is moved, so comments on its frame are no longer true.
     """
-    each = [[comment for comment in kept_comments(info) if not (moves and is_of_frame(comment))] for info in infos]
-    every = list(dict.fromkeys(chain(*each)))
-    shared = [comment for comment in every if all(comment in comments for comments in each)]
-    unshared = [comment for comment in every if comment not in shared]
+    file_comments = [
+        [comment for comment in kept_comments(info) if not (moves and is_of_frame(comment))] for info in infos
+    ]
+    all_comments = list(dict.fromkeys(chain(*file_comments)))
+    shared = [comment for comment in all_comments if all(comment in comments for comments in file_comments)]
+    unshared = [comment for comment in all_comments if comment not in shared]
     notes = [f"not all files have the mark {comment!r}, so the joined file has not" for comment in unshared]
-    lost = [] if chosen.marks is None else [comment for comment in shared if comment not in chosen.marks]
-    return shared, [*notes, *(f"{chosen.ending} cannot store the mark {comment!r}" for comment in lost)]
+    lost = [] if format_.marks is None else [comment for comment in shared if comment not in format_.marks]
+    return shared, [*notes, *(f"{format_.ending} cannot store the mark {comment!r}" for comment in lost)]
 
 
 def conversion_line(document: dict[str, Any]) -> str:
     """Describe a conversion in one line of text."""
     before, after = sum(entry["num_gaussians"] for entry in document["inputs"]), document["output"]
-    of_all = "" if after["num_gaussians"] == before and not document["left_out"] else f" of {before:,}"
+    total = "" if after["num_gaussians"] == before and not document["left_out"] else f" of {before:,}"
     reasons = describe_counts(document["left_out"], placed=document["cameras"] is None)
-    why = f" (left out: {reasons})" if reasons else ""
-    beside = document["viewer_cameras"]
-    cameras = f"; cameras in {Path(beside).name}" if beside else ""
-    return f"{after['path']}: {after['num_gaussians']:,}{of_all} Gaussians{why}, {human_bytes(after['bytes'])}{cameras}"
+    left_out = f" (left out: {reasons})" if reasons else ""
+    camera_path = document["viewer_cameras"]
+    cameras = f"; cameras in {Path(camera_path).name}" if camera_path else ""
+    count, size = f"{after['num_gaussians']:,}{total} Gaussians{left_out}", human_bytes(after["bytes"])
+    return f"{after['path']}: {count}, {size}{cameras}"
 
 
 def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: StrPath | None) -> list[str]:
-    """Return a note on the views for ``--drop unseen``: if they were placed, or see less than half of the Gaussians."""
+    """Return a note for ``--drop unseen`` if its views were placed, or see less than half of the Gaussians."""
     if cameras is None:
         beside = None if options.cameras == NONE else find_scene_files(options.inputs[0]).cameras
         remedy = "" if options.cameras == NONE else f"; name them with --cameras {beside or 'FILE'}"
@@ -156,21 +164,21 @@ def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: Str
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     """Join Gaussians of the same world frame; missing harmonics become zeros."""
-    most = max(part.shN.shape[1] for part in parts)
-    return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, most) for part in parts])
+    num_higher = max(gaussians.shN.shape[1] for gaussians in parts)
+    return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, num_higher) for part in parts])
 
 
 def _read_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]]:
     """Read the cameras; also return notes.
 
-    Cameras that were found beside the first input, and not named, are left out with a note if they cannot be read.
+    If a camera file beside the first input was not named and cannot be read, it is left out with a note.
     """
-    named, first = options.cameras, options.inputs[0]
-    path = result_cameras(first) if named is None else named_path(named)
+    named, first_input = options.cameras, options.inputs[0]
+    path = result_cameras(first_input) if named is None else named_path(named)
     try:
         return None if path is None else read_cameras(path), []
     except SceneError as error:
-        if named is not None or path == first:
+        if named is not None or path == first_input:
             raise
         return None, [f"{path} is left out: {error.problem}; name other cameras with --cameras, or pass none"]
 
@@ -185,7 +193,7 @@ def _photo_folder(options: ConvertOptions, stored: CameraFile | None) -> Path | 
 def _clean(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
 ) -> tuple[np.ndarray, dict[str, int]]:
-    """Crop the Gaussians and drop unwanted ones; return the rows that remain, and counts of those left out."""
+    """Crop the Gaussians and drop unwanted ones; return the remaining rows, and the number of dropped Gaussians by reason."""
     drops = options.clean.drops
     if not {"sky", "unseen"} & set(drops) or len(gaussians) == 0:
         return clean(gaussians, options.clean, None, None, lambda g: g)
@@ -206,7 +214,7 @@ def _clean(
 
 def _write(
     options: ConvertOptions,
-    chosen: Format,
+    format_: Format,
     gaussians: Gaussians,
     columns: np.ndarray,
     cameras: Cameras,
@@ -215,16 +223,16 @@ def _write(
     comments: Sequence[str],
 ) -> tuple[int, str | None]:
     """Write the Gaussians, and the cameras beside them; return the number of bytes and the path of the cameras."""
-    out, beside = options.output, None
+    out, camera_path = options.output, None
     with atomic_outputs(overwrite=options.overwrite) as add:
         title = scene_title(options.inputs[0])
         contents = Contents(
             [gaussians], comments, cameras, photos, title, options.normals, options.site, extra_columns=columns
         )
-        written = chosen.write(add, out, add(out), contents)
-        if len(cameras) and not chosen.cameras:
-            beside = viewer_cameras_path(out)
-            add_views(add, beside, cameras, names, overwrite=options.overwrite)
+        written = format_.write(add, out, add(out), contents)
+        if len(cameras) and not format_.cameras:
+            camera_path = viewer_cameras_path(out)
+            add_views(add, camera_path, cameras, names, overwrite=options.overwrite)
         num_bytes = sum(path.stat().st_size for path in written[out])
-    chosen.finish(out)
-    return num_bytes, None if beside is None else str(beside)
+    format_.finish(out)
+    return num_bytes, None if camera_path is None else str(camera_path)

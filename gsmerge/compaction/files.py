@@ -35,9 +35,9 @@ from gsmerge.stages.clean import BOX_QUANTILES
 from gsmerge.types import Scene
 
 # Sum of opacity times area of a scene's Gaussians, for each view, as a share of the squared diagonal of their box. If
-# merging leaves only Gaussians that are too transparent to be kept, the sum after merging is at most a tenth of this
+# merging leaves only Gaussians that are too transparent to be kept, the sum is at most a tenth of this bound
 COVERED = 0.006
-SAMPLE_GAUSSIANS = 200_000  # Gaussians by which that sum is estimated
+SAMPLE_GAUSSIANS = 200_000  # this sum is estimated from at least this many Gaussians, if there are as many
 
 
 @dataclass(frozen=True)
@@ -73,18 +73,18 @@ def compact_files(
     read or the result cannot be written; UsageError if the settings need something that the scene does not have.
     """
     start, out, settings = perf_counter(), outputs.result, sized(settings, outputs)
-    chosen = output_format(out, levels=True, cameras=True)
+    format_ = output_format(out, levels=True, cameras=True)
     with atomic_outputs(overwrite=outputs.overwrite) as add:
-        first = add(out)
+        temporary = add(out)
         load = read_input(files, opacity=opacity, hints=hints)
         on_read(load)
         check_cameras(load.scene, out)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras if len(load.scene) else None
-        shared = cameras_path if cameras_path is not None and cameras_path.exists() else None
-        if shared is not None and not outputs.overwrite and named_cameras(shared, names) is None:
-            raise other_cameras(shared)  # before the long work
+        if cameras_path is not None and cameras_path.exists() and not outputs.overwrite:
+            if named_cameras(cameras_path, names) is None:
+                raise other_cameras(cameras_path)  # before the long work
         read = perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DoubtWarning)  # the report has them
@@ -100,9 +100,9 @@ def compact_files(
         notes = output_notes(out, result.gaussians.sh_degree, photos) + rounding_notes(out, result.gaussians)
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
         contents = Contents(levels, comments, cameras, photos, title, normals=outputs.normals, apart=outputs.site)
-        written = chosen.write(add, out, first, contents)
+        written = format_.write(add, out, temporary, contents)
         if cameras_path is not None:
-            add_views(add, cameras_path, result.cameras[views], names, overwrite=outputs.overwrite)
+            add_views(add, cameras_path, cameras, names, overwrite=outputs.overwrite)
         left_out = [load.left_out, *(note for note in result.report.notes if STRAY_PHOTOS in note)]
         recognised = load.recognised | {"left_out": "; ".join(filter(None, left_out)) or None}
         document = report_document(
@@ -113,7 +113,7 @@ def compact_files(
             recognised=recognised, notes=[*load.notes, *notes], hashed=hashed,
             written_at=written, cameras_path=cameras_path,
         )  # fmt: skip
-    chosen.finish(out)
+    format_.finish(out)
     return document
 
 
@@ -155,7 +155,7 @@ def _padded(result: CompactResult) -> CompactResult:
 
 
 def _views_once(scene: Scene) -> list[int]:
-    """Return the views without further layers; a layer has the name and camera of an earlier view."""
+    """Return the views without repeated layers; a repeated layer has the name and camera of an earlier view."""
     cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
     keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
     return [view for view, key in enumerate(keys) if key not in keys[:view]]

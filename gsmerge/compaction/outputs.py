@@ -19,15 +19,16 @@ from gsmerge.io.formats.table import FOLDERS, Contents, NamedPhotos
 from gsmerge.io.image_names import match_images
 from gsmerge.types import Cameras, Gaussians
 
-# Cameras are the same up to this difference of their positions, relative to the farthest one, and of their Ks,
-# relative; and up to a hundred times as many pixels
+# Cameras are the same up to this difference of their viewmats, relative to the largest translation. Their Ks may differ
+# by this share, or by a hundred times this number of pixels
 SAME = 1e-5
 
 
 def add_views(add: AddOutput, path: Path, cameras: Cameras, names: Sequence[str], *, overwrite: bool) -> None:
     """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has other cameras.
 
-    A file that has these cameras already, to within rounding, stays unchanged: results in several formats share it.
+    If the file has these cameras already, to within rounding, it stays unchanged, because results in several formats
+    share it.
     """
     if overwrite or not path.exists():
         add(path).write_bytes(viewer_cameras(cameras, names).encode())
@@ -86,15 +87,15 @@ def write_result(
     """
     row = FOLDERS.get(path.name)
     out = path if row is None else path / row.place / row.ending
-    chosen = output_format(out, levels=True, cameras=True)
-    if not len(cameras) and chosen.cameras == "needed":
+    format_ = output_format(out, levels=True, cameras=True)
+    if not len(cameras) and format_.cameras == "needed":
         raise UsageError(f"{out}: expected a scene with cameras, got none")
     comments = [RESULT_COMMENT, *([] if new_views is None else [new_views_comment(new_views)])]
-    written = [level.numpy() for level in (levels if chosen.levels else levels[:1])]
-    contents = Contents(written, comments, cameras, name_photos(None, names), out.stem)
+    stored_levels = [level.numpy() for level in (levels if format_.levels else levels[:1])]
+    contents = Contents(stored_levels, comments, cameras, name_photos(None, names), out.stem)
     with atomic_outputs(overwrite=overwrite) as add:
-        chosen.write(add, out, add(out), contents)
-        if len(cameras) and not chosen.cameras:
+        format_.write(add, out, add(out), contents)
+        if len(cameras) and not format_.cameras:
             add_views(add, viewer_cameras_path(out), cameras, names, overwrite=overwrite)
-    chosen.finish(out)
+    format_.finish(out)
     return out

@@ -32,17 +32,21 @@ from gsmerge.stages.segment import knee_count
 
 # dB of PSNR per doubling of the count, assumed until two counts were tried: against photos, and against renders
 SLOPE, RENDERS_SLOPE = 1.0, 3.0
-CLOSE = 1.15  # ratio up to which two counts are the same
-NEAR_DB = 0.6  # dB above a target for renders at which a count is near enough: at their slope as far as CLOSE
-# The same for photos that decide the default count; it is less than FIDELITY_LOSS, since all of the input lose nothing
+CLOSE = 1.15  # two counts are the same up to this ratio
+NEAR_DB = 0.6  # a count is near enough at this many dB above a target for renders, which is CLOSE at their slope
+# The same bound for photos that decide the default count. It is less than FIDELITY_LOSS, because the whole input has no
+# loss at all
 PHOTOS_NEAR_DB = 0.2
-MAX_RUNS = 6  # builds of a search
-# The same for photos that are left out. Builds, in addition to the one that is written; dB per doubling, the mean below
-# the usual count of eleven captures; dB above a target at which a count is near enough, half of that
-MAX_TRIED, LEFT_OUT_SLOPE, LEFT_OUT_NEAR_DB = 3, 0.3, 0.15
-MAX_FACTOR = 4  # times the usual count is the most that a quality target against photos may take
-FAR_DB = 6.0  # dB above a target from which on a count says little about the slope there: all of the input lose nothing
-COMPACT_SHARE = 0.5  # share of the input's Gaussians from which on a scene is compact already
+MAX_RUNS = 6  # most builds of a search
+# Bounds of a search by left-out photos. Its slope is the mean of eleven captures below the usual count; a count is near
+# enough at half of a doubling
+MAX_TRIED = 3  # most builds, in addition to the build of the result
+LEFT_OUT_SLOPE, LEFT_OUT_NEAR_DB = 0.3, 0.15  # dB per doubling of the count; dB above a target
+MAX_FACTOR = 4  # a quality target against photos may take at most this many times the usual count
+FAR_DB = (
+    6.0  # PSNR is cut at this many dB above a target: larger values, as of the whole input, say little of the slope
+)
+COMPACT_SHARE = 0.5  # a scene is compact already if the result needs more than this share of its Gaussians
 
 T = TypeVar("T")
 
@@ -60,7 +64,7 @@ def meet(build: Callable[[int], T], first: T, choose_next: Callable[[list[T]], i
 
 @dataclass(frozen=True)
 class SearchFacts:
-    """What a search adds to the report of a run."""
+    """Facts that a search adds to the report of a run."""
 
     seconds: dict[str, float]  # Wall time by stage, of all candidates
     choices: dict[str, Any]
@@ -142,8 +146,8 @@ class CountSearch:
             return self.candidates[0]
         tried, target = self.tried, self.plan.target_psnr
         reached = [count for count, psnr in tried.items() if psnr >= target]
-        chosen = min(reached) if reached else max(tried, key=lambda count: tried[count])
-        return next(candidate for candidate in self.candidates if candidate.count == chosen)
+        best_count = min(reached) if reached else max(tried, key=lambda count: tried[count])
+        return next(candidate for candidate in self.candidates if candidate.count == best_count)
 
     @property
     def met(self) -> bool:
@@ -151,7 +155,7 @@ class CountSearch:
         return self.plan.target_psnr is not None and max(self.tried.values()) >= self.plan.target_psnr
 
     def facts(self, result: Candidate) -> SearchFacts:
-        """Return what the search adds to the report; ``result`` is what was made of the best candidate."""
+        """Return the facts for the report; ``result`` is the final candidate, made from the best one."""
         names = dict.fromkeys(name for run in self.candidates for name in run.record.seconds)
         seconds = {name: sum(run.record.seconds.get(name, 0.0) for run in self.candidates) for name in names}
         target = self.plan.target_psnr
@@ -193,7 +197,8 @@ class CountSearch:
 
 def psnr_by_count(candidates: Sequence[Candidate]) -> dict[int, float]:
     """Return the deciding PSNR (dB) of each candidate by its count, in the order of the candidates."""
-    return {each.count: each.deciding_psnr or 0.0 for each in candidates if each.count is not None}
+    with_count = (candidate for candidate in candidates if candidate.count is not None)
+    return {candidate.count: candidate.deciding_psnr or 0.0 for candidate in with_count}
 
 
 def add_target(plan: Plan, prepared: Prepared) -> Plan:

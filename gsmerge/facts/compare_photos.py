@@ -1,8 +1,9 @@
 """Scene -> the scene with photos that look like its Gaussians, without photos that do not show it.
 
-Photos with red and blue in the wrong order, or with another tone (linear light, exposure, gamma: a curve for each
-channel), are corrected. Photos that do not show their views are left out. If a pixel of a photo still differs from the
-Gaussians of this pixel, at any depth, something covers the scene there, and the Gaussians' colours are used instead.
+Photos with red and blue in the wrong order are corrected. So are photos with another tone (linear light, exposure or
+gamma), by a curve for each channel. Photos that do not show their views are left out. If a pixel of a photo still
+differs from the Gaussians of this pixel, at any depth, something covers the scene there. Then the Gaussians' colours
+are used instead.
 """
 
 from __future__ import annotations
@@ -45,32 +46,33 @@ from gsmerge.types import PicturedScene
 # Signed differences of single pixels are averaged over 5 x 5 pixels. Then a blur of 1.5 pixels, as by models, makes
 # 0.5 % of the pixels differ by a step.
 WINDOW = np.full(5, 1 / 5, np.float32)
-TONE_SAMPLE = 1 << 16  # about so many pixels and Gaussians are compared by their colours
+TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
+MIDDLE_GREY = 128  # level of 255 at which notes report the change of tone
 STRAY_PHOTOS = "photos do not show what the Gaussians show"  # part of the note on photos that are not used
 
 
 def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedScene, tuple[int, ...]]:
     """Correct the photos of a canonical scene, and replace photos, or parts of them, that do not show it.
 
-    Returns the scene and the views whose photos show it. There are none if most photos do not show it, or if they have
-    another look. With ``look`` "photos" all photos count unchanged, with "scene" none counts. The record gets notes and
-    the choices ``photos_changed`` and ``photos_left_out``.
+    Returns the scene and the views whose photos show it. There are no such views if most photos do not show the scene,
+    or if the photos have another look. With ``look`` "photos" all photos count unchanged, with "scene" none counts. The
+    record gets notes and the choices ``photos_changed`` and ``photos_left_out``.
     """
-    given = scene.photo_views
-    if look != "auto" or not given:
-        return scene, tuple(given) if look != "scene" else ()
+    photo_views = scene.photo_views
+    if look != "auto" or not photo_views:
+        return scene, tuple(photo_views) if look != "scene" else ()
     pairs = pair_photos(scene, scene.images)
-    is_bgr = find_orders(pairs, given)
+    is_bgr = find_orders(pairs, photo_views)
     pairs = pairs.with_photos(np.where(is_bgr[:, None, None, None], pairs.photos[..., ::-1], pairs.photos))
     images = [photo[..., ::-1] if swapped else photo for photo, swapped in zip(scene.images, is_bgr, strict=True)]
-    matching = find_matching_views(scene, given, images, pairs.shown)
-    if _has_other_look(scene, pairs, matching or given, images):
+    matching = find_matching_views(scene, photo_views, images, pairs.shown)
+    if _has_other_look(scene, pairs, matching or photo_views, images):
         problem = "the scene has another look than its photos, so it keeps its own colours"
         note(f"{problem}; --set look=photos gives it the look of the photos")
         return scene, ()
-    stray = [view for view in given if view not in matching]
-    if stray and not _leave_out(scene, stray, given):
+    stray = [view for view in photo_views if view not in matching]
+    if stray and not _leave_out(scene, stray, photo_views):
         return scene, ()
     _note_orders(scene, is_bgr, matching)
     tones = find_tones(pairs, matching)
@@ -91,8 +93,9 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
 def find_orders(pairs: Pairs, views: Sequence[int]) -> np.ndarray:
     """Find the photos ``[v]`` bool of some views in which red and blue are exchanged, whatever their tones are.
 
-    The evidence comes from colours as they are and from colours after tone curves. The first may be misled by a change
-    of tone; the second says little about covered photos, to which curves fit in either order.
+    The evidence comes from stored colours and from colours after tone curves. A change of tone may mislead the
+    comparison of stored colours. Colours after tone curves say little about covered photos, because curves fit them in
+    either order.
     """
     swapped, is_bgr = pairs.with_photos(np.ascontiguousarray(pairs.photos[..., ::-1])), np.zeros(len(pairs), bool)
     changes = [(cut_blocks(pairs), cut_blocks(swapped))]
@@ -111,11 +114,11 @@ def find_orders(pairs: Pairs, views: Sequence[int]) -> np.ndarray:
 
 
 def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
-    """Find the tone curves ``[3,256]`` from photos to their Gaussians; None for a photo whose tone is right.
+    """Find the tone curves ``[3,256]`` from photos to their Gaussians; None for a photo with the right tone.
 
-    Drawings have one curve for all photos. If no photo changes by a step, no curve counts, because models have a tone
-    of their own. A curve also has to work in the other direction, from Gaussians to photos; otherwise the cause is
-    noise, which flattens the colours of the Gaussians.
+    Drawings have one curve for all photos. If no photo changes by at least a step, no curve counts, because models have
+    a tone of their own. A curve also has to work in the other direction, from Gaussians to photos. Otherwise the cause
+    is noise, which flattens the colours of the Gaussians.
     """
     curves, is_clear = list[np.ndarray | None]([None] * len(pairs)), False
     stored, groups = cut_blocks(pairs), _group(pairs, views)
@@ -125,7 +128,7 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
         before = stored.errors(group)
         if explains(before, toned.errors(group)) and stands_out(before - back.errors(group)):
             is_clear |= bool(np.nanmedian(stored.distances(toned.photos, group)) > STEP)
-            colors, targets = (each[group].reshape(-1, 3) for each in (pairs.photos, pairs.shown.pictures))
+            colors, targets = (images[group].reshape(-1, 3) for images in (pairs.photos, pairs.shown.pictures))
             curve = fit_tones(colors, targets, pairs.shown.weights[group].reshape(-1))
             for view in group:
                 curves[view] = curve
@@ -135,8 +138,8 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
 def have_other_tones(scene: PicturedScene, photos: Sequence[np.ndarray], views: Sequence[int]) -> bool:
     """Return whether the base colours of all Gaussians have another tone than the ``photos`` of some views.
 
-    If depth is wrong, the tone of a drawing may be that of the Gaussians in front. The base colours come from the
-    photos, whatever hides a Gaussian in drawings, so they show whether the tone really differs.
+    If depth is wrong, wrong Gaussians in front may set the tone of a drawing. The base colours of all Gaussians come
+    from the photos, even if other Gaussians hide them in drawings. So they show whether the tone really differs.
     """
     solid = np.flatnonzero(scene.gaussians.opacities > FAINT)
     step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
@@ -151,7 +154,10 @@ def have_other_tones(scene: PicturedScene, photos: Sequence[np.ndarray], views: 
 
 
 def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
-    """Group views that share a tone curve: all views if their pictures are drawings, which show tones less exactly."""
+    """Group the views by tone curve: one group if their pictures are drawings, because these show tones less exactly.
+
+    Otherwise each view is a group of its own.
+    """
     return [list(views)] if pairs.shown.drawn else [[view] for view in views]
 
 
@@ -161,7 +167,7 @@ def find_matching_views(
     """Find the views whose ``photos [h,w,3]`` show them; see :mod:`gsmerge.evidence.assign`.
 
     There are none if all photos together fit no better than wrong pairs. Layers of one camera share one photo.
-    ``shown``: small pictures of what the Gaussians show in all views; drawings are used again.
+    ``shown`` are small pictures of the Gaussians in all views; if they are drawings, they are reused.
     """
     kinds = camera_kinds(scene.cameras)
     ids = sorted({kinds[view]: view for view in reversed(views)}.values())
@@ -171,53 +177,53 @@ def find_matching_views(
         return (shown.shrink(side) if shown.drawn and side <= SIDE else show_views(scene, side))[ids]
 
     assigner = Assigner(show, candidates)
-    chosen, _ = assigner.confirm(range(len(ids)), exact=True)
-    sure, on_rays = np.array([each is not None for each in chosen]), np.zeros(len(ids), bool)
-    if not sure.all():
+    confirmed_photos, _ = assigner.confirm(range(len(ids)), exact=True)
+    is_confirmed, on_rays = np.array([photo is not None for photo in confirmed_photos]), np.zeros(len(ids), bool)
+    if not is_confirmed.all():
         on_rays = find_on_rays(scene, ids, [photos[view] for view in ids])
-    if not (assigner.match_together(chosen) or on_rays.any()):
+    if not (assigner.match_together(confirmed_photos) or on_rays.any()):
         return []
-    sure |= on_rays
-    decided = zip(ids, sure, assigner.has_contrast, strict=True)
-    matching = {kinds[view] for view, is_sure, has_contrast in decided if is_sure or not has_contrast}
+    # views without contrast cannot be compared, so they count as matching
+    is_matching = is_confirmed | on_rays | ~np.asarray(assigner.has_contrast, bool)
+    matching = {kinds[view] for view, matches in zip(ids, is_matching, strict=True) if matches}
     return [view for view in views if kinds[view] in matching]
 
 
 def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int], photos: Sequence[np.ndarray]) -> bool:
-    """Return whether a linear map of colours, but no tone curve, takes photos to their Gaussians, or the other way.
+    """Return whether a linear map, but no tone curve, explains the difference between photos and Gaussians.
 
-    The other way finds grey photos, which follow from coloured Gaussians. Photos of another scene are excluded: one
-    colour explains them as well as a map, or they do not show their views even after the map.
+    It may map photos to Gaussians, or Gaussians to photos, which are grey then. Photos of another scene are excluded:
+    one colour explains them as well as a map, or they do not show their views even after the map.
     """
-    part = pairs[views]
-    if _is_mapped(part):
-        blocks = cut_blocks(part)
+    view_pairs = pairs[views]
+    if _is_mapped(view_pairs):
+        blocks = cut_blocks(view_pairs)
         solid = blocks.solid
         matrix = fit_map(blocks.photos[solid], blocks.pictures[solid], np.ones(solid.sum()))
         mapped = [map_colors(matrix, photo).clip(0, 1) for photo in photos]
         return bool(find_matching_views(scene, views, mapped, pairs.shown))
-    return _is_mapped(part.exchange()) and bool(find_matching_views(scene, views, photos, pairs.shown))
+    return _is_mapped(view_pairs.exchange()) and bool(find_matching_views(scene, views, photos, pairs.shown))
 
 
 def _is_mapped(pairs: Pairs) -> bool:
-    """Return whether a linear map of the photos' colours comes nearer to the pictures than tones and one colour."""
+    """Return whether a linear map of the photos' colours explains the pictures better than tones or one colour do."""
     stored = cut_blocks(pairs)
     if not is_visible(stored.errors()):
         return False
     toned, mapped = tone_blocks(pairs, _group(pairs, range(len(pairs)))), map_blocks(stored)
     simpler = toned, plain_blocks(stored)
-    return is_visible(toned.errors()) and all(explains(each.errors(), mapped.errors()) for each in simpler)
+    return is_visible(toned.errors()) and all(explains(blocks.errors(), mapped.errors()) for blocks in simpler)
 
 
-def _leave_out(scene: PicturedScene, stray: Sequence[int], given: Sequence[int]) -> bool:
-    """Note which of the given photos do not show the scene; return whether the other photos are used."""
+def _leave_out(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence[int]) -> bool:
+    """Note which photos do not show the scene; return whether the other photos are used."""
     names = [scene.names[view] for view in stray]
     choose(photos_left_out=names)
-    are_few, listed = 2 * len(stray) <= len(given), list_some(names)
+    are_few, listed = 2 * len(stray) <= len(photo_views), list_some(names)
     result = f" and are not used: {listed}"
     if not are_few:
         result = f", so no photo is used: {listed}; check their names and order"
-    note(f"{len(stray)} of {len(given)} {STRAY_PHOTOS}{result}")
+    note(f"{len(stray)} of {len(photo_views)} {STRAY_PHOTOS}{result}")
     return are_few
 
 
@@ -235,9 +241,11 @@ def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Seq
     toned = {view: changes[view].tones for view in views if changes[view].tones is not None}
     if not toned:
         return
-    middle = [float(curve[:, 128].mean()) / (128 / 255) for curve in toned.values() if curve is not None]
-    least, most = min(middle), max(middle)
-    factor = f"{least:.2f}" if most - least < 0.01 else f"{least:.2f} to {most:.2f}"
+    factors = [
+        float(curve[:, MIDDLE_GREY].mean()) / (MIDDLE_GREY / 255) for curve in toned.values() if curve is not None
+    ]
+    low, high = min(factors), max(factors)
+    factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
     note(
         f"{len(toned)} of {len(views)} photos have another tone than their Gaussians (exposure, gamma or linear"
         f" light), which is corrected; middle grey times {factor}: {list_some([scene.names[view] for view in toned])}"
@@ -249,10 +257,11 @@ def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int])
     with_hidden = [view for view in views if hidden[view].any()]
     if not with_hidden:
         return
-    most = 100 * max(float(hidden[view].mean()) for view in with_hidden)
+    max_percent = 100 * max(float(hidden[view].mean()) for view in with_hidden)
     note(
-        f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians (up to {most:.0f} % of a photo;"
-        " perhaps a mask, a mark, a finger, another look or camera): the Gaussians' colours are used there, with"
+        f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians"
+        f" (up to {max_percent:.0f} % of a photo; perhaps a mask, a mark, a finger, another look or camera):"
+        " the Gaussians' colours are used there, with"
         f" --set look=scene everywhere: {list_some([scene.names[view] for view in with_hidden])}"
     )
 
@@ -295,8 +304,8 @@ def _change_photos(
 ) -> PicturedScene:
     """Change photos at both sizes; use the Gaussians' colours at ``hidden [v,h,w]`` pixels, and in all other views.
 
-    ``views`` are those whose photos show the scene. The Gaussians' colours are ``pictures [v,h,w,3]``; None: drawings.
-    In views without a photo these colours count as a photo.
+    The photos of ``views`` show the scene. The Gaussians' colours are ``pictures [v,h,w,3]``; None: drawings. In views
+    without a photo these colours count as a photo.
     """
     other_views = sorted({*range(len(scene))} - {*views})
     hidden[other_views] = True

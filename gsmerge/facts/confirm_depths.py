@@ -1,8 +1,9 @@
-"""Scene with pixels -> how much of its depth other views confirm, which predicts whether a fit can succeed.
+"""Scene with pixels -> the share of its depth that other views confirm, which predicts whether a fit can succeed.
 
-Each pixel's Gaussian is looked up in the other views, and the Gaussian that is found there is projected back. The depth
-of the pixel is confirmed if the two agree, contradicted if more views see through it than confirm it, and alone if no
-other view sees the place. Pixels that other views see only where they have no Gaussian, as beyond a crop, do not count.
+Each pixel's Gaussian is projected into the other views. The Gaussian in front there is projected back. If the two
+agree, the depth of the pixel is confirmed. It is contradicted if more views see through it than confirm it, and alone
+if its position is outside of all other views. A pixel does not count if other views have no Gaussian at its position,
+as beyond a crop.
 """
 
 from __future__ import annotations
@@ -18,27 +19,29 @@ from gsmerge.kernels.elementary import log
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
-from gsmerge.types import Scene
+from gsmerge.types import Cameras, Scene
 
 SAMPLE_PIXELS = 1200  # sampled pixels of a view
-NEIGHBORS = 16  # nearest other views in which they are looked up
-# Distance up to which a pixel is found again: as a share of the longer side, and at least so many pixels
+NEIGHBORS = 16  # nearest other views in which the sampled pixels are looked up
+# Largest distance from a pixel at which its point, projected back, agrees with it: REACH as a share of the longer side,
+# but at least PIXELS
 REACH, PIXELS = 1 / 120, 1.5
 SAME = 0.05  # difference of the logarithms of two depths of one surface
 TINY = 1e-9  # least depth, canonical units
-# Share of confirmed pixels below which a result is poor: of 15 captures all poor ones, and no sound one, are below. The
-# reason is that too few views see the pixels if the share of alone pixels is above LONELY
+# A result is poor if the share of confirmed pixels is below POOR: this separates the poor results of 15 captures from
+# the sound ones. If the share of alone pixels is above LONELY, the reason is that too few views see the pixels
 POOR, LONELY = 0.5, 0.2
 CERTAIN, ENOUGH = 2.0, 30  # standard errors that chance may cause; samples from which on the error is about normal
-# Parts of pictures, as ranges of columns and of rows in thirds; a part is poor if most of its pixels are
+# Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if more than the share MOSTLY of its
+# pixels is poor
 THIRDS = {
     "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
     "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
 }  # fmt: skip
 MOSTLY = 0.5
-# Useful number of Gaussians per pixel: MOST if the share of confirmed pixels is at least SOUND, falling to the usual
-# share, FEWEST, at a share of WRONG. A fit learns photos by heart with more Gaussians (docs/guide/how-many.md). MOST is
-# the largest number at which no capture with so much confirmed depth lost .1 dB in photos that were not used.
+# Useful number of Gaussians per pixel. It is MOST if the share of confirmed pixels is at least SOUND, and falls to the
+# usual share, FEWEST, at a share of WRONG. With more Gaussians a fit memorises the photos (docs/guide/how-many.md).
+# MOST is the largest number at which no capture with as much confirmed depth lost .1 dB in photos that were not used.
 MOST, FEWEST, SOUND, WRONG = 0.07, parse_share(SHARE), 0.75, 0.6
 
 
@@ -48,7 +51,7 @@ class Agreement:
 
     confirmed: float  # At least one view confirms the depth, and no more views see through it
     contradicted: float  # More views see through it than confirm it
-    alone: float  # No other view sees the place
+    alone: float  # No other view sees the position
     num_pixels: int = field(default=SAMPLE_PIXELS, compare=False)  # Number of sampled pixels that count
     # Part of the pictures in which most pixels are contradicted, or alone, as "left third of 4 of 7 views"; empty: none
     contradicted_part: str = field(default="", compare=False)
@@ -62,8 +65,8 @@ class Agreement:
     @property
     def share(self) -> float:
         """Useful number of Gaussians per pixel; more would not show new views better."""
-        part = (self.confirmed - WRONG) / (SOUND - WRONG)
-        return FEWEST + (MOST - FEWEST) * min(1.0, max(0.0, part))
+        soundness = (self.confirmed - WRONG) / (SOUND - WRONG)
+        return FEWEST + (MOST - FEWEST) * min(1.0, max(0.0, soundness))
 
     @property
     def doubt(self) -> str | None:
@@ -86,10 +89,10 @@ class Agreement:
 
 
 def confirm_depths(scene: Scene) -> Agreement | None:
-    """Measure how far the views of a scene confirm each other's depth.
+    """Measure the shares of depth that the views of a scene confirm, contradict, or do not see.
 
-    None with fewer than two views, or if no pixel counts. None also if views have no Gaussians of their own, because a
-    Gaussian that several views share would confirm itself.
+    Returns None with fewer than two views, or if no pixel counts. Returns None also if views have no Gaussians of their
+    own, because a Gaussian that several views share would confirm itself.
     """
     pixels = scene.pixels
     if len(scene) < 2 or pixels is None or not pixels.own or not pixels.shown.any():
@@ -107,65 +110,71 @@ def confirm_depths(scene: Scene) -> Agreement | None:
 
 
 def _count_view(scene: Scene, view: int) -> np.ndarray:
-    """Count sampled pixels of a view, ``[part,4]``: all that count, the confirmed, the contradicted, those alone.
+    """Count sampled pixels of a view by kind, ``[part,4]``: all counted pixels, confirmed, contradicted, alone.
 
-    The first part is the whole picture; the others are those of ``THIRDS``.
+    The first part is the whole picture; the other parts are ``THIRDS``.
     """
     width, height = scene.cameras.width, scene.cameras.height
     rows = np.flatnonzero(scene.get_pixels().fronts[view].reshape(-1) >= 0)
     rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), SAMPLE_PIXELS))]
-    num_same, num_through, is_alone, counts = _look_up(scene, view, rows)
+    num_same, num_through, is_alone, is_counted = _look_up(scene, view, rows)
     kinds = (num_same > 0) & (num_same >= num_through), num_through > num_same, is_alone
-    thirds = np.stack([3 * (rows % width) // width, 3 * (rows // width) // height])
-    within = [
-        np.logical_and(*((third >= low) & (third < high) for third, (low, high) in zip(thirds, part, strict=True)))
-        for part in THIRDS.values()
-    ]
-    parts = [part & counts for part in (np.ones(len(rows), bool), *within)]
+    column, row = 3 * (rows % width) // width, 3 * (rows // width) // height  # in thirds of the picture
+    parts = [is_counted]
+    for (left, right), (top, bottom) in THIRDS.values():
+        parts.append(is_counted & (column >= left) & (column < right) & (row >= top) & (row < bottom))
     return np.array([[part.sum(), *((part & kind).sum() for kind in kinds)] for part in parts])
 
 
 def _look_up(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Look up n pixels ``rows`` of a view in the nearest other views.
 
-    Returns, each ``[n]``: how many views confirm the depth of a pixel, how many see through it, whether no view sees
-    the place, and whether the pixel counts.
+    Returns four arrays ``[n]``: the number of views that confirm the depth of a pixel, the number of views that see
+    through it, whether no view sees its position, and whether the pixel counts.
     """
     means, cameras = scene.gaussians.means, scene.cameras
-    width, height = cameras.width, cameras.height
     fronts = scene.get_pixels().fronts.reshape(len(scene), -1)
-    pixels = np.stack([rows % width, rows // width], 1) + 0.5
     points = means[fronts[view, rows]].astype(np.float64)
-    others = nearest_views(cameras.centres, view)[:NEIGHBORS]
-    places, depths = project(points, cameras[others])
-    x, y = places[..., 0], places[..., 1]
-    inside = (depths > TINY) & (x > 0) & (y > 0) & (x < width) & (y < height)
-    number, ids = np.nonzero(inside)  # an index into the other views, and one into the pixels that this view sees
-    column, row = x[number, ids].astype(np.int64), y[number, ids].astype(np.int64)
-    other = others[number]
-    front = fronts[other, row * width + column]
+    neighbors = nearest_views(cameras.centres, view)[:NEIGHBORS]
+    pixels, depths = project(points, cameras[neighbors])
+    x, y = pixels[..., 0], pixels[..., 1]
+    inside = (depths > TINY) & (x > 0) & (y > 0) & (x < cameras.width) & (y < cameras.height)
+    # pairs of a neighbour and a point inside its picture, first all pairs, then those with a Gaussian in the pixel
+    neighbor_ids, ids = np.nonzero(inside)
+    column, row = x[neighbor_ids, ids].astype(np.int64), y[neighbor_ids, ids].astype(np.int64)
+    front = fronts[neighbors[neighbor_ids], row * cameras.width + column]
     has_front = front >= 0
-    number, ids, other = number[has_front], ids[has_front], other[has_front]
+    neighbor_ids, ids = neighbor_ids[has_front], ids[has_front]
     is_alone = np.asarray(~inside.any(0))
-    counts = is_alone.copy()
-    counts[ids] = True
-    surface = means.take(front[has_front], 0).astype(np.float64)  # what the other view shows there
-    (back,), (back_depths,) = project(surface, cameras[[view]])
-    right, down = (back - pixels[ids]).T
-    reach = max(PIXELS, REACH * max(width, height))
-    distance = np.where(back_depths > TINY, np.sqrt(right * right + down * down), np.inf) / reach
-    behind = log(depths[number, ids] / np.maximum(camera_depths(surface, cameras.viewmats[other]), TINY))
+    is_counted = is_alone.copy()
+    is_counted[ids] = True
+    surface = means.take(front[has_front], 0).astype(np.float64)  # the points that the neighbours show there
+    distance = _distance_back(surface, rows[ids], cameras[[view]])
+    surface_depths = camera_depths(surface, cameras.viewmats[neighbors[neighbor_ids]])
+    behind = log(depths[neighbor_ids, ids] / np.maximum(surface_depths, TINY))  # above 0: the point is hidden
     agrees = (distance < 1) & (np.abs(behind) < SAME)
     sees_through = ~agrees & ((behind < -2 * SAME) | ((behind < 0) & (distance > 2)))
-    num_same, num_through = (np.bincount(ids[each], minlength=len(rows)) for each in (agrees, sees_through))
-    return num_same, num_through, is_alone, counts
+    num_same, num_through = (np.bincount(ids[mask], minlength=len(rows)) for mask in (agrees, sees_through))
+    return num_same, num_through, is_alone, is_counted
+
+
+def _distance_back(points: np.ndarray, rows: np.ndarray, camera: Cameras) -> np.ndarray:
+    """Project points ``[m,3]`` into a camera; return their distances ``[m]`` from the pixels ``rows [m]``.
+
+    The unit is the distance up to which a point agrees with its pixel; behind the camera it is infinite.
+    """
+    pixels = np.stack([rows % camera.width, rows // camera.width], 1) + 0.5
+    (projected,), (depths,) = project(points, camera)
+    right, down = (projected - pixels).T
+    reach = max(PIXELS, REACH * max(camera.width, camera.height))
+    return np.where(depths > TINY, np.sqrt(right * right + down * down), np.inf) / reach
 
 
 def _is_from_one_point(scene: Scene) -> bool:
-    """Return whether the cameras' largest distance moves things in the middle of the depth by less than ``PIXELS``."""
+    """Return whether the cameras' largest distance shifts points at the scene's depth by less than ``PIXELS``."""
     cameras = scene.cameras
-    apart = np.linalg.norm(np.ptp(cameras.centres, axis=0))
-    return bool(apart * cameras.Ks[:, 0, 0].max() < PIXELS * scene_depth(scene))
+    baseline = np.linalg.norm(np.ptp(cameras.centres, axis=0))
+    return bool(baseline * cameras.Ks[:, 0, 0].max() < PIXELS * scene_depth(scene))
 
 
 def _worst_part(poor: np.ndarray, pixels: np.ndarray) -> str:

@@ -67,8 +67,8 @@ def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:
     gaussians = replace(canonical.gaussians, sh0=rgb_to_sh0(colors), shN=np.zeros((len(rows), 0, 3), np.float32))
 
     def shows_rows(image: np.ndarray) -> np.ndarray:
-        of_mask, of_all = image[..., 0], image[..., 1]
-        return np.asarray(of_mask > MOSTLY * np.maximum(of_all, usual_opacity(of_all)))
+        mask_opacity, opacity = image[..., 0], image[..., 1]
+        return np.asarray(mask_opacity > MOSTLY * np.maximum(opacity, usual_opacity(opacity)))
 
     with use_threads() as threads:
         return np.stack(list(render_in_batches(gaussians, canonical.cameras, at_once=threads, convert=shows_rows)))

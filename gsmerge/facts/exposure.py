@@ -5,11 +5,11 @@ several tones. Pixels of a view are looked up in other views that have Gaussians
 each channel is the ratio of the pair of views. The gains of all views follow from all pairs by least squares, with a
 geometric mean of one.
 
-Gains are removed if that brings the colours of the same surfaces clearly nearer, and if nothing predicts the gain of a
-new view, so that the mean of all is the best guess. Photos stay unchanged in two cases in which it can be predicted. A
-camera that meters light makes bright places darker, in new photos, too; then photos of larger gains are not brighter.
-And exposure may drift along a video; then neighbours have nearly the same gain. In both cases the mean would be farther
-from new photos, by 1.5 dB in a video of a kitchen.
+Gains are removed under two conditions. The colours of the same surfaces have to come clearly nearer. And nothing may
+predict the gain of a new view, so that the mean of all gains is the best guess. The gain can be predicted in two cases,
+in which photos stay unchanged. First, a camera that meters light makes bright places darker, in new photos, too; then
+photos with larger gains are not brighter. Second, exposure may drift along a video; then neighbours have nearly the
+same gain. In both cases the mean would be farther from new photos, by 1.5 dB in a video of a kitchen.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Exposure
 from gsmerge.types import Cameras, PicturedScene, Scene
 
-SAMPLE_PIXELS = 2000  # pixels of a view that are looked up in the others
+SAMPLE_PIXELS = 2000  # pixels of a view that are looked up in the other views
 SAME_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LOW, HIGH = 0.05, 0.95  # colours in between are neither noise nor clipped
-MIN_PAIRS = 60  # least number of pixels that two views share; so many of each pair are compared again
+MIN_PAIRS = 60  # least number of pixels that two views share; this many pixels of each pair are compared again
 # The following four bounds were chosen on the plain exports of 15 captures. Root mean square of the logarithmic gains:
 # above the bound in nine of ten draws of random gains of 0.8 to 1.25 for five photos, and in six unchanged captures
 DIFFERENT = 0.06
@@ -47,10 +47,11 @@ FOLLOWS, OPPOSED = 0.5, -0.6
 # Distance of a gain from the mean gain of its two nearest views, relative to that of random gains: 0.71 to 1.22 with
 # gains of 0.5 to 2; 0.19 to 0.57 if exposure drifts and compensation loses 1.7 dB or more; 0.67 for four views in a row
 UNEXPECTED = 0.69
-COARSE = 4  # every so many pixels per side are used to measure the brightness of a photo
+COARSE = 4  # the brightness of a photo is measured on every COARSE-th pixel of every COARSE-th row
+MAX_WEIGHTED_PIXELS = 1000  # pixels up to which the weight of a pair of views grows
 BRIGHT = 1.15  # gain from which on clipped pixels no longer count
 NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
-NEAREST, FARTHER = 6, 2  # views that a view is compared with: the nearest ones, and some at equal steps of rank
+NEAREST, FARTHER = 6, 2  # a view is compared with the nearest views, and with further views at equal steps of rank
 
 
 @dataclass(frozen=True)
@@ -67,9 +68,9 @@ class _Pair:
 def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> PicturedScene:
     """Divide each view's photo and its pixels' Gaussians by the exposure gain of the view, if that is needed.
 
-    ``views`` are those whose photos show the scene; each has Gaussians of its own. Clipped pixels of brighter photos no
-    longer count if another photo shows their surface unclipped. The record gets a note, and the choice ``exposure``:
-    the gain of each view in red, green and blue. If photos differ and are left unchanged, a note says why.
+    The photos of ``views`` show the scene; each view has Gaussians of its own. Clipped pixels of brighter photos no
+    longer count if another photo shows their surface unclipped. The record gets a note, and the choice ``exposure``,
+    which is the gain of each view in red, green and blue. If photos differ but stay unchanged, a note says why.
     """
     if exposure == "fixed" or len(views) < 2:
         return scene
@@ -122,7 +123,7 @@ def share_left(pairs: Sequence[_Pair], gains: np.ndarray) -> float:
 
 
 def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
-    """Return whether the gains come from metering, that is, offset the brightness of the place that each photo shows.
+    """Return whether the gains come from metering: whether they offset the brightness of the surfaces in each photo.
 
     With fixed exposure, photos with larger gains are brighter; metering makes all photos equally bright.
     """
@@ -186,8 +187,8 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
         view, pairs = views[row], list[_Pair]()
         rows = sample[pixels.valid[view, sample]]
         for other in (views[column] for column in partners[row]):
-            both, places = pixels.look_up(view, rows, other)
-            here, there = photos[view, rows[both]], photos[other, places]
+            found, other_rows = pixels.look_up(view, rows, other)
+            here, there = photos[view, rows[found]], photos[other, other_rows]
             clear = ((here > LOW) & (here < HIGH) & (there > LOW) & (there < HIGH)).all(1)
             if clear.sum() >= MIN_PAIRS:
                 ratios = log(there[clear].astype(np.float64) / here[clear])
@@ -198,7 +199,7 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
 
 
 def choose_partners(distances: np.ndarray) -> np.ndarray:
-    """Choose the views ``[v,p]``, ascending, that each view is compared with: all others or, of many, a selection.
+    """Choose the views ``[v,p]``, ascending, that each view is compared with: all others, or some if there are many.
 
     The nearest views share the most surfaces. Views at equal steps of rank connect groups of cameras.
     """
@@ -215,7 +216,7 @@ def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:
         return None
     matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
     for pair in pairs:
-        ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, 1000))
+        ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, MAX_WEIGHTED_PIXELS))
         matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])
         right[ends] += weight * np.array([-pair.ratios, pair.ratios])
     matrix[np.diag_indices(num_views)] += 1e-6  # views without pairs get a gain of one
@@ -226,7 +227,7 @@ def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:
 def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
     """Return a mask ``[v,h,w]`` of clipped pixels of brighter photos whose surface another photo shows unclipped.
 
-    A surface that is clipped in all photos, such as a sky, is not marked, because it would be masked in all of them.
+    A surface that is clipped in all photos, such as a sky, is not marked, because no photo would show it then.
     """
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT)).any(-1)
     pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
@@ -235,8 +236,8 @@ def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
     def confirm(view: int) -> np.ndarray:
         rows, is_shown = np.flatnonzero(flat[view] & pixels.valid[view]), np.zeros_like(flat[view])
         for other in order[view]:
-            both, places = pixels.look_up(view, rows, other)
-            is_shown[rows[both[~flat[other, places]]]] = True
+            found, other_rows = pixels.look_up(view, rows, other)
+            is_shown[rows[found[~flat[other, other_rows]]]] = True
             rows = rows[~is_shown[rows]]
         return is_shown
 
@@ -256,8 +257,10 @@ def _divide(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
         images[view] = (scene.images[view] * factors[view]).clip(0, 1)
 
     parallel_map(divide, range(len(scene)))
-    g, each = scene.gaussians, factors[scene.get_pixels().homes // scene.pixels_per_view][:, None]
-    gaussians = replace(g, sh0=rgb_to_sh0(sh0_to_rgb(g.sh0) * each).astype(np.float32), shN=g.shN * each)
+    views = scene.get_pixels().homes // scene.pixels_per_view
+    g, row_factors = scene.gaussians, factors[views][:, None]
+    sh0 = rgb_to_sh0(sh0_to_rgb(g.sh0) * row_factors).astype(np.float32)
+    gaussians = replace(g, sh0=sh0, shN=g.shN * row_factors)
     large = scene.large_photos
     large = None if large is None else change_large(large, changes)
     counting = scene.masks if masks.all() else masks

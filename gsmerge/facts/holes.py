@@ -1,8 +1,9 @@
 """Fill the holes of an export: add Gaussians at pixels that no Gaussian covers.
 
-Exporters drop borders, far regions and faint rows, and voxels have gaps. Each view is drawn from its own camera. A
-pixel that is empty then gets a Gaussian of its picture's colour. Its depth is that of the surface beside it, or a depth
-beyond the view's farthest surface: the one at which the pictures of the nearest other views agree best.
+Exporters drop borders, far regions and faint rows, and voxels have gaps. Each view is drawn from its own camera. Each
+empty pixel of the drawing gets a Gaussian with the colour of the picture. The candidate depths are the depth of the
+surface beside the pixel, and depths beyond the view's farthest surface. The depth is chosen at which the pictures of
+the nearest other views agree best.
 """
 
 from __future__ import annotations
@@ -24,24 +25,24 @@ from gsmerge.raster.composite import blend_depths
 from gsmerge.raster.images import tile_views
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Gaussians, PicturedScene, fill_pixels
+from gsmerge.types import Cameras, Gaussians, PicturedScene, fill_pixels
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
-# Shares of the usual opacity of a view, which is low if the export has few rows. Below NOTHING a pixel shows nothing;
-# below SPARSE, on average around a pixel, there is nothing around it
+# Shares of the usual opacity of a view, which is low if the export has few rows. A pixel shows nothing if its opacity
+# is below NOTHING. There is nothing around a pixel if the mean opacity around it is below SPARSE
 NOTHING, SPARSE = 0.5, 0.25
-# Parts that stay empty hold squares of this share of the picture's longer side, cover at least this share of the
-# picture, and are reduced by a rim of so many pixels
+# Parts that stay empty hold squares with sides of the share LARGE of the picture's longer side, cover at least the
+# share PART of the picture, and are reduced by a rim of RIM pixels
 LARGE, PART, RIM = 1 / 12, 0.12, 2
 GAP = 1 / 53  # beside large empty parts, only gaps narrower than this share of the longer side are filled
 MOST = 0.5  # share of empty pixels from which on the scene may be only a part of what the photos show
-FACTORS = 2.0 ** np.linspace(0, 3, 13)  # depths that are tried, relative to that of a view's farthest surface
+FACTORS = 2.0 ** np.linspace(0, 3, 13)  # candidate depths, relative to the depth of a view's farthest surface
 FARTHEST = 0.99  # quantile of the depths that counts as the farthest
 FARTHER = 0.001  # least gain in the difference of colours (sRGB) for each step to a farther depth
-OTHERS = 3  # nearest views that a picture is compared with
+NEIGHBORS = 3  # nearest views that a picture is compared with
 BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
-LEAST = 1e-3  # least weight in that window of the pixels that other views see
+LEAST = 1e-3  # least weight in this window of pixels that other views see
 SIZE, OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
 BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
 
@@ -49,11 +50,11 @@ BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
 def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = False) -> PicturedScene:
     """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers, except in large empty parts.
 
-    ``shown [v,h,w]``: pixels whose picture shows what is there. The new Gaussians come after the others. None is added
-    if most of the pixels are empty, because the scene may be only a part of what the photos show. Large connected parts
-    of a view without Gaussians stay empty, because the scene may have been cut out, or its model may have left out the
-    sky; with ``everywhere`` they are filled, too. In a cropped scene, everything that it does not cover stays empty.
-    Notes say what was filled and what stays empty.
+    ``shown [v,h,w]`` marks pixels with a usable picture. The new Gaussians come after the others. None is added if most
+    of the pixels are empty, because photos may show more than the scene. Large connected parts of a view without
+    Gaussians stay empty, because the scene may have been cut out, or its model may have left out the sky. With
+    ``everywhere`` these parts are filled, too. In a cropped scene, all pixels without Gaussians stay empty. Notes say
+    what was filled and what stays empty.
     """
     fronts, is_cropped = scene.get_pixels().fronts, scene.region is not None
     free, bare = shown & (fronts < 0), (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)
@@ -75,8 +76,8 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
         bare[view] = ~covered & ~empty[view]
         holes[view] = free[view] & bare[view]
         if empty[view].any():  # the edges of a scene that was cut out are no holes
-            around = np.ones((gap, gap), np.uint8)
-            holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, around) > 0
+            window = np.ones((gap, gap), np.uint8)
+            holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, window) > 0
         if covered.any() and holes[view].any():
             beside = fill_gaps(depths[..., None], covered)[..., 0][holes[view]]
             edges[view] = _Edges(beside, float(np.quantile(depths[covered], FARTHEST)))
@@ -120,20 +121,20 @@ def _fill_views(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Ed
     views = sorted(edges)
     added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), views))
     holes[[view for view in range(len(scene)) if view not in edges]] = False
-    places = np.flatnonzero(holes)
+    pixels = np.flatnonzero(holes)
     if scene.region is not None:
         inside = lies_inside(scene.region, added.means)
-        added, places = added[inside], places[inside]
-    if len(places):
+        added, pixels = added[inside], pixels[inside]
+    if len(pixels):
         note(f"{len(added):,} pixels that no Gaussian covers enough get Gaussians with the colours of their pictures")
-    return fill_pixels(scene, added, places)
+    return fill_pixels(scene, added, pixels)
 
 
 def large_parts(empty: np.ndarray) -> np.ndarray:
     """Return the connected parts of a mask ``[h,w]`` that hold a large square, reduced by a rim of some pixels.
 
     There are none if the squares cover little of the picture. Gaps, and borders that exporters leave out, are narrower
-    than the squares; the farthest tenth of the pixels, which Depth Anything 3 leaves out, is less.
+    than the squares. Depth Anything 3 leaves out the farthest tenth of the pixels, which is less than the share PART.
     """
     if empty.mean() < PART:
         return np.zeros_like(empty)
@@ -148,9 +149,9 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
 
 
 def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
-    """Make pictures black, and do not score them, at pixels that stay ``empty [v,h,w]``.
+    """Make pictures black and exclude them from scores, at pixels that stay ``empty [v,h,w]``.
 
-    If photos counted there, a note says that they do not any more.
+    If photos counted at these pixels, a note says that they no longer count.
     """
     if not empty.any() or empty.all():
         return scene
@@ -177,8 +178,8 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
     pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
     rays = matmul(matmul(pixels, invert(cameras.Ks[view]).T), cameras.viewmats[view, :3, :3])  # to depth 1
     beside, beyond = edges.beside.astype(np.float64), edges.farthest * FACTORS[:, None]
-    tried = np.concatenate([beside[None], np.maximum(beyond, beside)])
-    depth = _choose_depths(scene, view, holes, rays, tried)
+    candidates = np.concatenate([beside[None], np.maximum(beyond, beside)])
+    depth = _choose_depths(scene, view, holes, rays, candidates)
     eye, size = cameras.centres[view], SIZE / cameras.Ks[view, 0, 0]
     return make_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
 
@@ -207,21 +208,26 @@ def _choose_depths(
 
     Differences of colours are averaged over neighbouring ``holes [h,w]``. The first depth is chosen in doubt.
     """
-    cameras, centres = scene.cameras, scene.cameras.centres
-    others = [other for other in nearest_views(centres, view) if (centres[other] != centres[view]).any()][:OTHERS]
-    moves = []  # each other picture, with the ray of each hole in it, in homogeneous pixels: start + depth * along
-    for other in others:
-        K, (rotation, translation) = cameras.Ks[other], np.split(cameras.viewmats[other, :3], [3], 1)
-        start = matmul(K, matmul(rotation, centres[view]) + translation[:, 0])
-        along = np.ascontiguousarray(matmul(matmul(rays, rotation.T), K.T).T)
-        moves.append((scene.images[other], along, start))
+    centres = scene.cameras.centres
+    neighbors = [i for i in nearest_views(centres, view) if (centres[i] != centres[view]).any()][:NEIGHBORS]
+    neighbor_rays = [_rays_in(scene.cameras, neighbor, centres[view], rays) for neighbor in neighbors]
     colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
-    chosen, least = depths[0], np.full(len(rays), np.inf, np.float32)
+    best_depths, best_costs = depths[0], np.full(len(rays), np.inf, np.float32)
     for step, depth in enumerate(depths):
         sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and their number
-        for picture, along, start in moves:
-            add_differences(picture, along, start, depth, colors, pixels, sums)
+        for neighbor, (start, along) in zip(neighbors, neighbor_rays, strict=True):
+            add_differences(scene.images[neighbor], along, start, depth, colors, pixels, sums)
         total, number = blur(sums, BLUR).reshape(-1, 2)[pixels].T
         cost = np.where(number > LEAST, total / np.maximum(number, LEAST), np.inf) + FARTHER * step
-        chosen, least = np.where(cost < least, depth, chosen), np.minimum(cost, least)
-    return chosen
+        best_depths, best_costs = np.where(cost < best_costs, depth, best_depths), np.minimum(cost, best_costs)
+    return best_depths
+
+
+def _rays_in(cameras: Cameras, view: int, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Project rays ``[n,3]`` from ``eye`` into a view; return start ``[3]`` and directions ``[3,n]``.
+
+    A ray at a depth is at the homogeneous pixel start + depth * direction.
+    """
+    K, (rotation, translation) = cameras.Ks[view], np.split(cameras.viewmats[view, :3], [3], 1)
+    start = matmul(K, matmul(rotation, eye) + translation[:, 0])
+    return start, np.ascontiguousarray(matmul(matmul(rays, rotation.T), K.T).T)

@@ -1,7 +1,7 @@
 """Scene -> the scene with cameras, and their pixels' Gaussians, moved to where the photos agree.
 
-Poses that a network predicts are wrong by some pixels, and its Gaussians have the same error, so every view agrees with
-itself but not with the others. The pixels of a view, at their depths, are looked up in the photos of its neighbours.
+Poses that a network predicts are wrong by some pixels. Its Gaussians have the same error, so every view agrees with
+itself but not with other views. The pixels of a view, at their depths, are projected into the photos of its neighbours.
 All poses are moved at once until the greys agree. This is direct image alignment (Engel et al., "Direct Sparse
 Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos first. Scenes with right poses stay unchanged
 bit for bit, after one step at the smallest size.
@@ -24,26 +24,27 @@ from gsmerge.types import PicturedScene
 
 SIDES = (60, 120, 240)  # longer side of the photos in pixels, one size after the other
 MIN_SIDE = 24  # least number of pixels of the shorter side at the first size; smaller photos say too little
-OVERLAP_PIXELS = 400  # pixels of a view by which its neighbours are chosen
-BORDER = 2  # pixels at the borders in which nothing is looked up
-SAMPLE_PIXELS = 1500  # pixels of a view that are looked up, those at which the photo changes most
-FIRST_PIXELS, FIRST_STEPS = 600, 2  # the same, and the most steps, at the first size, which also right poses cost
-NEIGHBOURS = 4  # views in which a view is looked up
+OVERLAP_PIXELS = 400  # the neighbours of a view are chosen by about this many of its pixels
+BORDER = 2  # width in pixels of the border that is not compared
+SAMPLE_PIXELS = 1500  # compared pixels of a view, those with the largest gradients
+# Compared pixels of a view, and most steps, at the first size. They are fewer, because right poses need them as well
+FIRST_PIXELS, FIRST_STEPS = 600, 2
+NEIGHBOURS = 4  # other views with which a view is compared
 MIN_OVERLAP = 0.2  # share of a view's pixels that a neighbour must see
 STEPS = 6  # most Gauss-Newton steps at each size
 DAMPING = 1e-3  # damping of the steps, relative to the curvature
-EARLY_PX = 1.0  # motion in pixels after the first step up to which poses are considered right
+EARLY_PX = 1.0  # poses are considered right if the first step moves all views by less than this, in pixels
 TOGETHER = 16  # pairs per task
-ENOUGH = 1e-4  # a step of less, in radians and canonical units, is the last
+ENOUGH = 1e-4  # a smaller step, in radians and canonical units, is the last
 BLUR = 0.7  # blur of the photos, standard deviation in pixels
 # Prior error of a pose, radians and canonical units, and the weight of this prior
 PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
-LIMIT_PX = 1.5  # motion in pixels of the views from which on poses count as wrong
-# Poses are moved only if that also removes a share of the disagreement: LEAST_GAIN of some view at every size, and at
-# the largest size VIEW_GAIN of some view or MEAN_GAIN of all. Wrong depth moves right views, too, and removes up to
-# 0.14 of one view and 0.06 of all at the largest size; the track of a depth camera removes 0.28 and 0.18. Views that
-# are half a degree off gain at least 0.22 of all, a single view 0.32 of itself (14 captures). Views with gains in
-# between are not moved, because other photos of the scene have poses in the given frame
+LIMIT_PX = 1.5  # a pose counts as wrong if it moves by more than this, in pixels of the views
+# Poses are moved only if this removes a share of the disagreement: LEAST_GAIN of some view at every size, and at the
+# largest size VIEW_GAIN of some view or MEAN_GAIN of all views. Wrong depth moves right views, too. At the largest size
+# it removes up to 0.14 of one view and 0.06 of all; the track of a depth camera removes 0.28 and 0.18. If all views are
+# half a degree off, they gain at least 0.22 of all; a single wrong view gains 0.32 of itself (14 captures). Views with
+# gains in between are not moved, because other photos of the scene have poses in the given frame
 LEAST_GAIN, VIEW_GAIN, MEAN_GAIN = 0.1, 0.3, 0.2
 
 
@@ -71,15 +72,14 @@ class _Evidence:
     curvatures: np.ndarray  # [p,6,6]
     slopes: np.ndarray  # [p,6]
     costs: np.ndarray  # [p] mean disagreement of the pixels
-    flows: np.ndarray  # [p] median distance from the places at which the given poses show them, pixels of the views
+    flows: np.ndarray  # [p] median shift of the pixels relative to the given poses, in pixels of the views
 
 
 def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = False) -> PicturedScene | None:
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
-    ``views`` are the views whose photos show the scene; other views are not moved. With ``always`` even small errors
-    are corrected. The median motion of the views is subtracted. Returns None if no pose is wrong, or if the photos
-    cannot decide.
+    The photos of ``views`` show the scene; other views are not moved. With ``always`` even small errors are corrected.
+    The median motion of the views is subtracted. Returns None if no pose is wrong, or if the photos cannot decide.
     """
     start = scene.cameras.viewmats.astype(np.float64)
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
@@ -90,10 +90,10 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
     viewmats = start
     for side in sides:
         check = side == sides[0] != sides[-1] and not always
-        level = _level_of(scene, pairs, largest / side, FIRST_PIXELS if check else SAMPLE_PIXELS)
-        viewmats, first, last = _descend(level, viewmats, check=check)
-        before = first if side == sides[0] else _compare(level, start)
-        if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, before, last, end=side == sides[-1])):
+        level = _make_level(scene, pairs, largest / side, FIRST_PIXELS if check else SAMPLE_PIXELS)
+        viewmats, initial, final = _descend(level, viewmats, check=check)
+        before = initial if side == sides[0] else _compare(level, start)
+        if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, before, final, end=side == sides[-1])):
             return None
     moved = np.unique(pairs)  # all other views keep their poses
     viewmats[moved] = without_common_motion(start[moved], viewmats[moved], np.median)
@@ -101,27 +101,28 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
 
 
 def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
-    """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours that see most of it."""
+    """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours of the largest overlap."""
     cameras, fronts = scene.cameras, scene.get_pixels().fronts.reshape(len(scene), -1)
     step = max(1, scene.pixels_per_view // OVERLAP_PIXELS)
-    pairs, chosen = set(), set(views)
+    pairs, candidates = set(), set(views)
     for view in views:
         rows = fronts[view, ::step]
-        xyz = scene.gaussians.means[rows[rows >= 0]]
-        pixels, z = project(xyz, cameras)
+        points = scene.gaussians.means[rows[rows >= 0]]
+        pixels, z = project(points, cameras)
         x, y = pixels[..., 0], pixels[..., 1]
         inside = (z > NEAR_PLANE) & (x > 0) & (y > 0) & (x < cameras.width) & (y < cameras.height)
-        seen = inside.mean(1) if len(xyz) else np.zeros(len(z))
-        overlap = seen * matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3]).clip(0)
-        ranked = [int(other) for other in np.argsort(-overlap, kind="stable") if other != view and other in chosen]
-        for other in ranked[:NEIGHBOURS]:
-            if overlap[other] > MIN_OVERLAP:
-                pairs |= {(view, other), (other, view)}
+        seen_shares = inside.mean(1) if len(points) else np.zeros(len(z))
+        cosines = matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3])  # of the viewing directions
+        overlap = seen_shares * cosines.clip(0)
+        ranked = [int(i) for i in np.argsort(-overlap, kind="stable") if i != view and i in candidates]
+        for neighbour in ranked[:NEIGHBOURS]:
+            if overlap[neighbour] > MIN_OVERLAP:
+                pairs |= {(view, neighbour), (neighbour, view)}
     return np.array(sorted(pairs), np.int64)
 
 
-def _level_of(scene: PicturedScene, pairs: np.ndarray, level: float, samples: int) -> _Level:
-    """Shrink the photos by ``level``, and sample the pixels at which each of them changes most."""
+def _make_level(scene: PicturedScene, pairs: np.ndarray, level: float, samples: int) -> _Level:
+    """Shrink the photos by ``level``, and sample the pixels of each photo with the largest gradients."""
     photos = photos_of(scene.images, scene.cameras, level)
     shape = photos.height, photos.width
     rows, columns = ((np.arange(n) + 0.5) / n for n in shape)
@@ -137,12 +138,12 @@ def _level_of(scene: PicturedScene, pairs: np.ndarray, level: float, samples: in
         depth = camera_depths(means[rows], scene.cameras.viewmats[view])
         depth = np.where((rows >= 0) & (depth > NEAR_PLANE), depth, np.nan)
         score = np.where(np.isfinite(depth), np.sqrt(right * right + down * down) * spread, 0).ravel()
-        chosen = np.argsort(-score, kind="stable")[:samples]
-        chosen = chosen[score[chosen] > 0]
-        y, x = np.divmod(chosen, photos.width)
+        ids = np.argsort(-score, kind="stable")[:samples]
+        ids = ids[score[ids] > 0]
+        y, x = np.divmod(ids, photos.width)
         pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
-        points = matmul(pixels, invert(photos.Ks[view]).T) * depth.ravel()[chosen, None]
-        return np.stack([grey, right, down], -1), points, grey.ravel()[chosen], depth
+        points = matmul(pixels, invert(photos.Ks[view]).T) * depth.ravel()[ids, None]
+        return np.stack([grey, right, down], -1), points, grey.ravel()[ids], depth
 
     pictures, points, greys, depths = zip(*parallel_map(sample_view, range(len(scene))), strict=True)
     return _Level(
@@ -155,44 +156,51 @@ def _level_of(scene: PicturedScene, pairs: np.ndarray, level: float, samples: in
 def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, _Evidence, _Evidence]:
     """Improve poses by Gauss-Newton steps at one size; return the poses, and the evidence before and after.
 
-    ``check``: take few steps, and only one if it moves no view far.
+    ``check``: take few steps, and only one step if it moves no view far.
     """
-    prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
-    first = now = _compare(level, viewmats)
-    most = FIRST_STEPS if check else STEPS
-    for step in range(most + 1):
-        now = _compare(level, viewmats) if step else first
-        if step == most or (check and step == 1 and _flows(level, now).max() < EARLY_PX):
+    initial = evidence = _compare(level, viewmats)
+    max_steps = FIRST_STEPS if check else STEPS
+    for step in range(max_steps + 1):
+        evidence = _compare(level, viewmats) if step else initial
+        if step == max_steps or (check and step == 1 and _flows(level, evidence).max() < EARLY_PX):
             break
-        curvature, slope = np.diag(prior), prior * motion_vectors(level.start, viewmats).ravel()
-        for (a, b), pair_curvature, pair_slope in zip(level.pairs.tolist(), now.curvatures, now.slopes, strict=True):
-            rows, columns = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
-            for row, column, sign in ((rows, rows, 1), (columns, columns, 1), (rows, columns, -1), (columns, rows, -1)):
-                curvature[row, column] += sign * pair_curvature
-            slope[rows] -= pair_slope
-            slope[columns] += pair_slope
-        curvature[np.diag_indices(len(curvature))] *= 1 + DAMPING
-        change = -solve(curvature, slope).reshape(-1, 6)
+        change = _solve_step(level, viewmats, evidence)
         viewmats = matmul(viewmats, motion_matrices(change))
         if np.abs(change).max() < ENOUGH:
             break
-    return viewmats, first, now
+    return viewmats, initial, evidence
+
+
+def _solve_step(level: _Level, viewmats: np.ndarray, evidence: _Evidence) -> np.ndarray:
+    """Solve the normal equations of all pairs and of the prior; return the motion ``[v,6]`` of each view."""
+    prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
+    curvature, slope = np.diag(prior), prior * motion_vectors(level.start, viewmats).ravel()
+    pairs = zip(level.pairs.tolist(), evidence.curvatures, evidence.slopes, strict=True)
+    for (a, b), pair_curvature, pair_slope in pairs:
+        rows, columns = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
+        for row, column, sign in ((rows, rows, 1), (columns, columns, 1), (rows, columns, -1), (columns, rows, -1)):
+            curvature[row, column] += sign * pair_curvature
+        slope[rows] -= pair_slope
+        slope[columns] += pair_slope
+    curvature[np.diag_indices(len(curvature))] *= 1 + DAMPING
+    return -solve(curvature, slope).reshape(-1, 6)
 
 
 def _compare(level: _Level, viewmats: np.ndarray) -> _Evidence:
     """Compare the pixels of the first view of each pair with the photo of the second view, for the given poses."""
-    count, most = len(level.pairs), int(np.diff(level.starts).max())
-    now = _Evidence(np.empty((count, 6, 6)), np.empty((count, 6)), np.empty(count), np.empty(count))
+    count, max_points = len(level.pairs), int(np.diff(level.starts).max())
+    evidence = _Evidence(np.empty((count, 6, 6)), np.empty((count, 6)), np.empty(count), np.empty(count))
 
-    def compare_some(first: int) -> None:
+    def compare_pairs(begin: int) -> None:
+        # fills the rows of the evidence; the two arrays before it are scratch
         compare_views(
             level.points, level.greys, level.starts, level.pairs, viewmats, level.start, level.Ks, level.pictures,
-            level.depths, NEAR_PLANE, BORDER, level.scale, first, min(first + TOGETHER, count),
-            np.empty((COLUMNS, most)), np.empty(most, np.int64), *vars(now).values(),
+            level.depths, NEAR_PLANE, BORDER, level.scale, begin, min(begin + TOGETHER, count),
+            np.empty((COLUMNS, max_points)), np.empty(max_points, np.int64), *vars(evidence).values(),
         )  # fmt: skip
 
-    parallel_map(compare_some, range(0, count, TOGETHER))
-    return now
+    parallel_map(compare_pairs, range(0, count, TOGETHER))
+    return evidence
 
 
 def _flows(level: _Level, evidence: _Evidence) -> np.ndarray:
@@ -201,11 +209,11 @@ def _flows(level: _Level, evidence: _Evidence) -> np.ndarray:
     return np.array([np.median(view_flows) if len(view_flows) else 0.0 for view_flows in flows])
 
 
-def _any_wrong(level: _Level, before: _Evidence, last: _Evidence, *, end: bool) -> bool:
-    """Return whether a view moved far and now agrees better with the others; at the ``end``, much better."""
-    is_far = _flows(level, last) > LIMIT_PX
+def _any_wrong(level: _Level, before: _Evidence, after: _Evidence, *, end: bool) -> bool:
+    """Return whether a view moved far and now agrees better with the other views; at the ``end``, much better."""
+    is_far = _flows(level, after) > LIMIT_PX
     costs_before, costs = (
-        np.bincount(level.pairs.ravel(), evidence.costs.repeat(2), len(is_far)) for evidence in (before, last)
+        np.bincount(level.pairs.ravel(), evidence.costs.repeat(2), len(is_far)) for evidence in (before, after)
     )
     gains = 1 - costs / np.maximum(costs_before, 1e-9)
     mean_gain = 1 - costs.sum() / max(costs_before.sum(), 1e-9)

@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.evidence.colors import map_tones
 from gsmerge.types import LargePhotos
 
-CLIPPED = 0.985  # level from which on a pixel may be clipped
+CLIPPED = 0.985  # a pixel may be clipped from this level on
 
 
 @dataclass(frozen=True, eq=False)

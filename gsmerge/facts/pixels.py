@@ -1,7 +1,7 @@
 """Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel, by projection of centres.
 
-Each view is divided into cells wider than the distance of its Gaussians. Gaussians behind the front of a cell are
-hidden, and a pixel without a centre of its own shows the front of its cell.
+Each view is divided into cells that are wider than the distances between neighbouring Gaussians. Gaussians behind the
+front of a cell are hidden. A pixel without a centre in it shows the front of its cell.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT
 
-# Cells are wide enough if this share of them has a centre, among cells surrounded by cells with one. Of captures in
-# voxels, six with a share of .97 or more give the same result as drawing; two with .93 and .95 lose 1.5 and 5 dB
+# Only cells whose neighbours all have a centre are examined. Cells are wide enough if this share of them has a centre.
+# Of captures in voxels, six with a share of .97 or more give the same result as drawing; two with .93 and .95 lose 1.5
+# and 5 dB
 COVERED = 0.96
 REACH = 4.0  # width of a Gaussian that shows nearly all of it, in standard deviations
-SAMPLE = 10_000  # Gaussians by which the median size is estimated
-SAME_DEPTH = 1.05  # depth, relative to that of a cell's front, up to which a centre is on the same surface
+SAMPLE = 10_000  # the median size is estimated from at least this many Gaussians, if there are as many
+SAME_DEPTH = 1.05  # a centre is on the surface of its cell up to this multiple of the depth of the cell's front
 
 
 def with_pixels(scene: SceneT) -> SceneT:
@@ -33,25 +34,25 @@ def with_pixels(scene: SceneT) -> SceneT:
 def find_pixels(scene: Scene) -> Pixels:
     """Find the pixel of each Gaussian of a canonical scene, and the front of each pixel.
 
-    In each view, a Gaussian has a weight of opacity x transmittance x area in pixels. Its pixel is that of its centre
-    in the view with the largest weight, the first of equal ones; -1 if no view sees the Gaussian. The front of a pixel
-    is the Gaussian with the largest opacity x transmittance among those with their centre in the pixel or, if there are
-    none, in its cell; -1 if there are none either.
+    In each view, a Gaussian has a weight of opacity x transmittance x area in pixels. The pixel of a Gaussian contains
+    its centre in the view with the largest weight, or in the first of these views. It is -1 if no view sees the
+    Gaussian. The front of a pixel is the Gaussian with the largest opacity x transmittance and a centre in the pixel.
+    If no centre is in the pixel, the front comes from its cell; it is -1 if the cell is empty.
     """
     g, cameras, count = scene.gaussians, scene.cameras, len(scene)
     means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
     fronts = np.empty((count, cameras.height, cameras.width), np.int32)
-    most, homes = np.zeros(len(g), np.float32), np.full(len(g), -1, np.int64)
+    best_weights, homes = np.zeros(len(g), np.float32), np.full(len(g), -1, np.int64)
 
     def weigh(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return _weigh_view(means, scales, opacities, viewmats[view], Ks[view], fronts[view])
 
     weighed = in_turn(weigh, range(count)) if len(g) <= ONE_AT_A_TIME else map(weigh, range(count))
-    for view, (ids, places, weights) in enumerate(weighed):
-        is_better = weights > most[ids]
+    for view, (ids, pixels, weights) in enumerate(weighed):
+        is_better = weights > best_weights[ids]
         ids = ids[is_better]
-        most[ids], homes[ids] = weights[is_better], view * scene.pixels_per_view + places[is_better]
+        best_weights[ids], homes[ids] = weights[is_better], view * scene.pixels_per_view + pixels[is_better]
     return Pixels(homes, fronts, own=False)
 
 
@@ -71,22 +72,23 @@ def _weigh_view(
     shown.reshape(-1)[pixels[inside]] = True
     level = choose_level(shown, REACH * float(np.sqrt(np.median(np.abs(areas[:: max(1, len(areas) // SAMPLE)])))))
     order, (cells, shape) = order_by_depth(depths), _cells_of(pixels, fronts.shape, level)
-    first = np.empty(shape, np.int32)
-    weights = weigh_centres(order, ids, cells, areas, opacities, first)
-    nearest = depths[np.searchsorted(ids, first.reshape(-1)).clip(max=len(ids) - 1)]
-    surface = SAME_DEPTH * np.where(first.reshape(-1) >= 0, nearest, np.inf)
-    weigh_centres(order[(depths <= surface[cells])[order]], ids, pixels, areas, opacities, fronts)
-    in_cell, _ = _cells_of(np.arange(fronts.size, dtype=np.int32), fronts.shape, level)
-    np.copyto(fronts, first.reshape(-1)[in_cell].reshape(fronts.shape), where=fronts < 0)
+    cell_fronts = np.empty(shape, np.int32)
+    weights = weigh_centres(order, ids, cells, areas, opacities, cell_fronts)  # fills `cell_fronts`
+    cell_fronts = cell_fronts.reshape(-1)
+    front_depths = depths[np.searchsorted(ids, cell_fronts).clip(max=len(ids) - 1)]
+    max_depths = SAME_DEPTH * np.where(cell_fronts >= 0, front_depths, np.inf)
+    weigh_centres(order[(depths <= max_depths[cells])[order]], ids, pixels, areas, opacities, fronts)  # fills `fronts`
+    pixel_cells, _ = _cells_of(np.arange(fronts.size, dtype=np.int32), fronts.shape, level)
+    np.copyto(fronts, cell_fronts[pixel_cells].reshape(fronts.shape), where=fronts < 0)
     return ids, pixels, weights
 
 
 def choose_level(shown: np.ndarray, widest: float) -> int:
     """Choose the level of cells, which are 2**level pixels wide, from the mask ``shown [h,w]`` of pixels with a centre.
 
-    The smallest cells are found of which nearly all have a centre, among cells surrounded by cells with one. The result
-    is one level above these, so that hidden surfaces do not show through at a missing centre. It is 1 if there are none
-    up to ``widest`` pixels.
+    Cells are wide enough if nearly all of them have a centre; only cells whose neighbours all have a centre are
+    examined. The result is one level above the smallest cells that are wide enough, so that hidden surfaces do not show
+    through at a missing centre. It is 1 if no cells of up to ``widest`` pixels are wide enough.
     """
     fine, level = shown, 0
     while 2**level <= max(widest, 1.0):

@@ -19,30 +19,32 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 NUM_VIEWS = 24  # most cameras that are placed
-MAX_SCORED, SCORED_SIZE = 8, 512  # views that results are scored on, and their pixels per side, at most
+MAX_SCORED, SCORED_SIZE = 8, 512  # most views for scores, and their most pixels per side
 FITTED = 16  # views of each kind for a fit without cameras, and half as many on a walk
-FITTED_LONG, LONG = 48, 600  # the same for a long fit, and the steps from which on a fit is long
-FEWER = 3  # every third candidate is tried for views that results are only scored on
-SAMPLE_GAUSSIANS = 40_000  # Gaussians in the pictures by which candidates are chosen
+FITTED_LONG, LONG = 48, 600  # views of each kind for a long fit; a fit is long from LONG steps on
+FEWER = 3  # for views that are used only for scores, every third candidate is tried
+SAMPLE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most this many Gaussians
 EXTENT = (0.05, 0.95)  # quantiles of the positions along each axis between which the scene is assumed to lie
 AROUND = 40  # candidate cameras around the scene
 ABOVE = -0.25  # height of the ring of viewpoints, in its radii; y points down
 FAR_RADII, NEAR_RADII = 2.0, 1.2  # distances of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # positions of cameras inside, along each axis, as a share of half the extent
-WALKED = 0.6  # length of a walk to both sides of the median, as a share of the longest half axis
+WALKED = 0.6  # length of a walk to each side of the median, as a share of the longest half axis
 GOLDEN = np.pi * (1 + math.sqrt(5))  # angle between successive directions that spreads them evenly
 DIRECTIONS = 8  # directions of a camera inside
 FIELD = 1.0  # width of the image over the focal length
-PROBE = 96  # pixels per side of the pictures by which candidates are chosen
+PROBE = 96  # pixels per side of the pictures for choosing candidates
 SMALLEST, LARGEST = 96, 640  # pixels per side
 CLEAR = 0.02  # near plane, as a share of the scene's radius
 ENOUGH = 1.0  # blending weight, summed over pixels, at which a Gaussian counts as seen
-PAIRS, MIDDLE = 2, 0.5  # nearest other views, and the position of a camera on the way to them
-WIDEST = np.pi / 4  # angle between two views from which on the space between them is unknown
-# Views up to which a fit to renders also gets views between them; with more views, it learns none by heart
+LEAST_GAIN = 1e-3  # a camera is added if it raises the opacity shown so far by more than this share
+PAIRS, MIDDLE = 2, 0.5  # nearest views to which each view has a camera between, and its share of the way
+WIDEST = np.pi / 4  # the space between two views is unknown if the angle between them is larger
+# With at most this many views, a fit to renders also gets views between them; more views it does not memorise
 FEW_VIEWS = 24
-OUTSIDE, MOST_OUTSIDE = 0.5, 24  # views from outside, as a share of all views, and at most
-# Least and largest step back of these, as a share of the depth, and rotations to the sides, and up or down, degrees
+OUTSIDE, MOST_OUTSIDE = 0.5, 24  # number of views from outside as a share of all views, and its maximum
+# Bounds of the views from outside: step back as a share of the depth, rotation to the sides, and rotation up or down,
+# degrees
 NEAREST, FARTHEST = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
 
 
@@ -111,8 +113,8 @@ def count_placed(count: int) -> int:
 def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
     """Add renders of a canonical scene from placed views, which come last.
 
-    ``count`` views each are far away, near by, and where most of the scene is visible; half as many are on a walk. The
-    transmittance of the renders becomes their ``empty``.
+    There are ``count`` views far away, ``count`` views near by, ``count`` views at positions that show most of the
+    scene, and half as many on a walk. The transmittance of the renders becomes their ``empty``.
     """
     means = thin_out(scene.gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64)
     centre, half = _extent(means)
@@ -166,17 +168,18 @@ def between_cameras(cameras: Cameras, *further: float) -> Cameras:
     """Place cameras half way from each of two or more views to the nearest other views.
 
     For each of the shares ``further``, each view gets one more camera at this share of the way to its nearest view. A
-    camera moves along the screw from one pose to the other, so it keeps looking at what both look at.
+    camera moves along the screw from one pose to the other, so it keeps looking at the point that both look at. Pairs
+    of views with an angle above ``WIDEST`` get no camera.
     """
     viewmats = cameras.viewmats.astype(np.float64)
     nearest = [nearest_views(cameras.centres, view)[:PAIRS] for view in range(len(cameras))]
-    middle = {(min(v, o), max(v, o)): MIDDLE for v, others in enumerate(nearest) for o in others}
-    beside = [((v, others[0]), part) for part in further for v, others in enumerate(nearest)]
-    pairs, parts = (np.array(column) for column in zip(*middle.items(), *beside, strict=True))
+    middle = {(min(view, i), max(view, i)): MIDDLE for view, neighbours in enumerate(nearest) for i in neighbours}
+    beside = [((view, neighbours[0]), share) for share in further for view, neighbours in enumerate(nearest)]
+    pairs, shares = (np.array(column) for column in zip(*middle.items(), *beside, strict=True))
     motions = motion_vectors(viewmats[pairs[:, 0]], viewmats[pairs[:, 1]])
     is_narrow = (motions[:, :3] ** 2).sum(1) <= WIDEST**2
-    first, moves = pairs[is_narrow, 0], motion_matrices((parts[:, None] * motions)[is_narrow])
-    return replace(cameras, viewmats=matmul(viewmats[first], moves), Ks=cameras.Ks[first])
+    views, moves = pairs[is_narrow, 0], motion_matrices((shares[:, None] * motions)[is_narrow])
+    return replace(cameras, viewmats=matmul(viewmats[views], moves), Ks=cameras.Ks[views])
 
 
 def place_cameras(
@@ -185,10 +188,10 @@ def place_cameras(
     """Place cameras that see as much of the scene as possible.
 
     Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it, looking in all
-    directions. They are chosen one by one; each is the candidate that shows the most opacity not shown yet, in pictures
-    of a sample of the Gaussians. There are at most ``num_views``. Images are square and grow with the number of
-    Gaussians up to ``largest`` pixels per side. Only every ``step``-th candidate is tried, on a smaller sample. Raises
-    ValueError if there is no Gaussian.
+    directions. They are chosen one by one, at most ``num_views``. The next camera is always the candidate that shows
+    the most opacity not shown yet, in pictures of a sample of the Gaussians. Images are square and grow with the number
+    of Gaussians up to ``largest`` pixels per side. Only every ``step``-th candidate is tried, on a sample smaller by
+    this factor. Raises ValueError if there is no Gaussian.
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
@@ -196,9 +199,9 @@ def place_cameras(
     centre, half = _extent(sample.means.astype(np.float64))
     viewmats = _candidates(centre, half)[::step]
     shares = _shares_seen(sample, viewmats, CLEAR * float(np.sqrt((half * half).sum())))
-    chosen = _most_seen(shares, num_views)
+    best = _choose_candidates(shares, num_views)
     size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST, largest))
-    return Cameras(viewmats[chosen], np.repeat(_lens(size)[None], len(chosen), 0), size, size)
+    return Cameras(viewmats[best], np.repeat(_lens(size)[None], len(best), 0), size, size)
 
 
 def _lens(size: int) -> np.ndarray:
@@ -225,7 +228,7 @@ def _sphere(count: int) -> np.ndarray:
 def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
-    inside = [_look(centre + place * half, direction) for place in grid for direction in _sphere(DIRECTIONS)]
+    inside = [_look(centre + position * half, direction) for position in grid for direction in _sphere(DIRECTIONS)]
     return np.concatenate([_around(centre, half, FAR_RADII, _sphere(AROUND)), inside])
 
 
@@ -260,7 +263,7 @@ def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.ndarray:
-    """Measure how much of each Gaussian's opacity each candidate shows, ``[c,n]`` float32."""
+    """Return the part of each Gaussian's opacity that each candidate shows, ``[c,n]`` float32."""
     splats, K = make_splats(sample), _lens(PROBE)
 
     def view_shares(viewmat: np.ndarray) -> np.ndarray:
@@ -270,15 +273,15 @@ def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.nda
     return np.stack(parallel_map(view_shares, viewmats))
 
 
-def _most_seen(shares: np.ndarray, num_views: int) -> list[int]:
-    """Choose at least one candidate; each is the one that adds most to the opacity that earlier ones show."""
+def _choose_candidates(shares: np.ndarray, num_views: int) -> list[int]:
+    """Choose candidates greedily, at least one: the next always adds most to the opacity shown so far."""
     seen = np.zeros(shares.shape[1], np.float32)
-    chosen: list[int] = []
+    candidates: list[int] = []
     for _ in range(num_views):
         gains = np.maximum(shares - seen, 0).sum(1, dtype=np.float64)
         best = int(gains.argmax())
-        if chosen and gains[best] <= 1e-3 * seen.sum(dtype=np.float64):
+        if candidates and gains[best] <= LEAST_GAIN * seen.sum(dtype=np.float64):
             break
-        chosen.append(best)
+        candidates.append(best)
         np.maximum(seen, shares[best], out=seen)
-    return chosen
+    return candidates

@@ -33,23 +33,23 @@ from gsmerge.runtime.record import choose, note, record_part, stage
 from gsmerge.settings.stages import Look, PrepareOptions
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
-FLAT = 2 / 255  # range of the colours of a picture that shows one
+FLAT = 2 / 255  # a picture shows one flat colour if the range of its values is smaller
 
 
 @dataclass(frozen=True)
 class Reference:
     """Pictures of a canonical scene that a result is fitted to and scored on."""
 
-    name: str  # What the pictures are: "photos", or what is used instead
+    name: str  # "photos", or the name of the pictures that replace them
     fit_views: tuple[int, ...]  # Views whose pictures a fit may use
     score_views: tuple[int, ...]  # Views whose pictures results are scored on
-    placed: bool = False  # The scene has no views: these were placed, only for scores
-    # [v,h,w,3] photos of the input scene as their files have them, if the run changed some
+    placed: bool = False  # The scene has no views of its own; its views were placed, only for scores
+    # [v,h,w,3] unchanged photos of the input scene, if the run changed some of them
     photo_files: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
     def of_views(self) -> bool:
-        """Whether the scene's own views have pictures other than renders of it, for the fit and for the scores."""
+        """Whether the scene's own views have pictures for fits and scores that are not renders of the scene."""
         return bool(self.fit_views) and self.name != RENDERS
 
 
@@ -57,16 +57,16 @@ class Reference:
 class Prepared:
     """A scene in its canonical frame, as the stages use it, with facts about it."""
 
-    input_scene: Scene  # The scene as it was given, in its own world frame, with photos that look like its Gaussians
-    # The canonical scene with pixels. Every view is there once, and photos that do not show the scene are replaced. It
+    input_scene: Scene  # The scene as it was read, in its own world frame, with photos that look like its Gaussians
+    # The canonical scene with pixels. It has every view once, and photos that do not show the scene are replaced. It
     # has all Gaussians except `unseen`
     scene: PicturedScene
     frame: Frame  # The canonical frame
     reference: Reference  # Use of the pictures
-    repeated: tuple[int, ...]  # Index in the canonical scene of every given view
-    moved: bool  # Views were moved to where their photos agree, before a fit or by it
+    repeated: tuple[int, ...]  # Index in the canonical scene of every view of the input scene
+    moved: bool  # Views were moved to poses at which their photos agree, before a fit or by it
     unseen: Gaussians  # Canonical Gaussians that no view sees, if the options keep them
-    agreement: Agreement | None = None  # How far views confirm each other's depth; None if they cannot be compared
+    agreement: Agreement | None = None  # Shares of depth that views confirm; None if views cannot be compared
 
     @property
     def size(self) -> SceneSize:
@@ -90,7 +90,7 @@ class Prepared:
 
     @cached_property
     def scene_around(self) -> PicturedScene:
-        """The canonical scene with additional renders of it from around its views, which a fit to renders needs."""
+        """The canonical scene with additional renders from around its views, which a fit to renders needs."""
         return draw_around(self.scene)
 
     @cached_property
@@ -132,12 +132,12 @@ def prepare(
     ValueError if there is no finite Gaussian, or if there are images without cameras.
     """
     options = options or PrepareOptions()
-    given, (scene, repeated, notes) = scene, without_repeats(scene)
+    input_scene, (scene, repeated, notes) = scene, without_repeats(scene)
     for text in notes:
         note(text)
     scene, frame = canonicalise(add_views(scene), frame)
-    prepared = _with_references(given, with_pixels(scene), frame, tuple(repeated), options)
-    files = _photos_before(given, prepared)
+    prepared = _with_references(input_scene, with_pixels(scene), frame, tuple(repeated), options)
+    files = _photos_before(input_scene, prepared)
     prepared = replace(prepared, reference=replace(prepared.reference, photo_files=files))
     agreement = confirm_depths(prepared.scene)
     if agreement is not None:
@@ -148,18 +148,18 @@ def prepare(
     return _without_holes(prepared, options) if fill and prepared.reference.of_views else prepared
 
 
-def _photos_before(given: Scene, prepared: Prepared) -> np.ndarray | None:
-    """Return the photos of a given scene if any pixel that results are scored on was changed; otherwise None."""
+def _photos_before(input_scene: Scene, prepared: Prepared) -> np.ndarray | None:
+    """Return the photos of the input scene if a pixel that counts in scores was changed; otherwise None."""
     photos, scored = prepared.scene.images, prepared.reference.score_views
-    if given.images is None or prepared.reference.name != PHOTOS or photos is given.images:
+    if input_scene.images is None or prepared.reference.name != PHOTOS or photos is input_scene.images:
         return None
     counting = np.full(photos.shape[:3], True) if prepared.scene.masks is None else prepared.scene.masks
     changed = (
         not np.array_equal(before[counting[view]], photos[view][counting[view]])
-        for before, view in zip(given.images, prepared.repeated, strict=True)
+        for before, view in zip(input_scene.images, prepared.repeated, strict=True)
         if view in scored
     )
-    return given.images if any(changed) else None
+    return input_scene.images if any(changed) else None
 
 
 def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
@@ -177,15 +177,15 @@ def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
 
 
 def _with_references(
-    given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
+    input_scene: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
 ) -> Prepared:
-    """Prepare a scene with pixels: choose the pictures that results are fitted to.
+    """Prepare a scene with pixels: choose the pictures to which results are fitted.
 
-    They are the photos that show the scene; without such photos, the colours of the views' own Gaussians; if views have
-    no Gaussians of their own, renders.
+    The first choice are photos that show the scene. Without such photos, the colours of the views' own Gaussians are
+    used. If views have no Gaussians of their own, renders of the scene are used.
     """
     own = canonical.has_own_pixels
-    stand_in = partial(add_row_colors, given=canonical.images is not None) if own else blank_pictures
+    stand_in = partial(add_row_colors, has_photos=canonical.images is not None) if own else blank_pictures
     scene, views = _with_pictures(canonical, stand_in, options.look)
     every, unseen = tuple(range(len(scene))), scene.gaussians[:0]
     if options.unseen == "keep" and not own:
@@ -195,17 +195,17 @@ def _with_references(
     elif own:
         reference = Reference(ROW_COLORS, every, every)
     else:
-        reason = "no photos" if given.images is None else "photos do not count"
+        reason = "no photos" if input_scene.images is None else "photos do not count"
         note(f"{reason}: renders of the scene itself are used instead")
         scene = draw_pictures(scene)
         shown = tuple(view for view in every if scene.images[view].any())  # any result equals an empty view
-        return Prepared(given, scene, frame, Reference(RENDERS, every, shown or every), repeated, False, unseen)
-    given, moved = _with_photos(given, scene, repeated), None
+        return Prepared(input_scene, scene, frame, Reference(RENDERS, every, shown or every), repeated, False, unseen)
+    input_scene, moved = _with_photos(input_scene, scene, repeated), None
     if own:  # each view's Gaussians have the exposure and the pose of the view
         scene = equalise_exposure(scene, reference.score_views, options.exposure)
         fixed, always = options.poses == "fixed", options.poses == "free"
         moved = None if fixed else move_poses(scene, reference.score_views, always=always)
-    return Prepared(given, moved or scene, frame, reference, repeated, moved is not None, unseen)
+    return Prepared(input_scene, moved or scene, frame, reference, repeated, moved is not None, unseen)
 
 
 def _with_pictures(
@@ -234,7 +234,7 @@ def without_repeats(scene: Scene) -> tuple[Scene, list[int], list[str]]:
 
 
 def views_notes(scene: Scene) -> list[str]:
-    """Return the notes of a run on repeated views, and on missing views or photos, without comparing colours."""
+    """Return the notes of a run about repeated views and about missing views or photos, without comparing colours."""
     if len(scene) == 0:
         return [NO_VIEWS]
     return [*without_repeats(scene)[2], *([NO_PHOTOS] if _lacks_photos(scene) else [])]
@@ -246,9 +246,9 @@ def _lacks_photos(scene: Scene) -> bool:
 
 
 def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
-    """Return a scene with the pictures that results are scored on, and whether :func:`prepare` changes its photos.
+    """Return a scene with its pictures for scores, and whether :func:`prepare` changes its photos.
 
-    As in :func:`prepare`, the pictures of a scene with pixels are its rows' own colours if photos are missing, have
+    As in :func:`prepare`, the rows' own colours are the pictures of a scene with pixels if photos are missing, have
     another look, or do not show the scene.
     """
     has_colors = scene.has_own_pixels and len(scene) > 0
@@ -268,7 +268,7 @@ def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
 
 @stage("prepare")
 def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
-    """Bring a scene without views into its canonical frame, and add pictures on which results are scored.
+    """Bring a scene without views into its canonical frame, and add pictures for scores.
 
     These pictures are not used for a fit. Raises ValueError if there is no finite Gaussian.
     """
@@ -279,17 +279,17 @@ def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
     return Prepared(scene, draw_pictures(scored), frame, reference, (), moved=False, unseen=finite.gaussians[:0])
 
 
-def _with_photos(given: Scene, canonical: PicturedScene, repeated: Sequence[int]) -> Scene:
-    """Return the given scene with the pictures and masks of its distinct views."""
-    if canonical.images is given.images and canonical.masks is given.masks:
-        return given
+def _with_photos(input_scene: Scene, canonical: PicturedScene, repeated: Sequence[int]) -> Scene:
+    """Return the input scene with the pictures and masks of the canonical scene, which has each view once."""
+    if canonical.images is input_scene.images and canonical.masks is input_scene.masks:
+        return input_scene
     masks = None if canonical.masks is None else canonical.masks[list(repeated)]
-    large = None if canonical.large_photos is None else given.large_photos
-    return replace(given, images=canonical.images[list(repeated)], masks=masks, large_photos=large)
+    large = None if canonical.large_photos is None else input_scene.large_photos
+    return replace(input_scene, images=canonical.images[list(repeated)], masks=masks, large_photos=large)
 
 
 def _split_unseen(scene: PicturedScene) -> tuple[PicturedScene, Gaussians]:
-    """Split a scene into Gaussians that views see and those that no view sees; if none is seen, all stay in it."""
+    """Split off the Gaussians that no view sees; if views see none or all of them, all stay in the scene."""
     seen = seen_weights(scene) > 0
     num_unseen = int((~seen).sum())
     note(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")

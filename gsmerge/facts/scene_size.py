@@ -9,13 +9,15 @@ import numpy as np
 from gsmerge.facts.views import camera_kinds
 from gsmerge.types import Gaussians, Scene
 
-# Bounds for the Gaussians of captures. The median largest scale is at least TINY times twice the median distance from
-# the middle, which a far sky does not stretch, and at most LARGE times the diagonal of the box that holds most of them.
-# The median coefficient of the base colours is at most BRIGHT. Fewer than FEWEST Gaussians are not tested
+# Bounds for the Gaussians of captures. The median largest scale is at least TINY times the extent, which is twice the
+# median distance from the middle, because a far sky does not stretch this. It is at most LARGE times the diagonal of
+# the box that holds most Gaussians. The median coefficient of the base colours is at most BRIGHT. Fewer than FEWEST
+# Gaussians are not tested
 TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
-DENSE = 0.5  # Gaussians per pixel from which on a scene is dense
+DENSE = 0.5  # a scene is dense from this number of Gaussians per pixel on
 FLAT, FAINT = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
-SAMPLE_GAUSSIANS = 65536  # Gaussians that these bounds are tested on
+SAMPLE_GAUSSIANS = 65536  # these bounds are tested on at least this many Gaussians, if there are as many
+Pictures = Literal["photos", "renders"]  # "photos": also row colours instead; "renders": drawings of the scene itself
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class SceneSize:
     height: int  # Pixels
     width: int
     has_own_pixels: bool  # Each view has Gaussians of its own
-    rendered: bool  # Renders of the input stand for the pictures of its views, which have neither photos nor pixels
+    pictures: Pictures  # Pictures to which results are fitted
     num_cameras: int = 2  # Number of different cameras; 1: all views have the same camera
     sh_degree: int = 0
 

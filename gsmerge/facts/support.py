@@ -19,8 +19,8 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, make_scene
 
-LEAST = FitOptions().min_contribution  # least blending weight in a pixel of a Gaussian that a view shows, as in a fit
-LEVEL, SIDE = 2, 480  # factor by which pictures are smaller, as in a fit's search for Gaussians; their largest width
+LEAST = FitOptions().min_contribution  # a view shows a Gaussian from this blending weight in a pixel on, as in a fit
+LEVEL, SIDE = 2, 480  # pictures are smaller by at least this factor, as in a fit's survey; largest side of pictures
 # Colours (sRGB) of Gaussians that no view or one view shows, and the weight of these colours; others keep their own
 TINTS, TINT = {0: (230, 40, 40), 1: (255, 190, 0)}, 0.7
 
@@ -28,7 +28,7 @@ TINTS, TINT = {0: (230, 40, 40), 1: (255, 190, 0)}, 0.7
 def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """Count the views that show each of n canonical Gaussians, ``[n]`` int32.
 
-    A view shows a Gaussian that has a blending weight of at least 1/255 in some pixel, the least weight that a fit
+    A view shows a Gaussian if its blending weight is at least 1/255 in some pixel, which is the least weight that a fit
     keeps.
     """
     splats = make_splats(gaussians)

@@ -33,20 +33,20 @@ def scored_views(num_views: int) -> list[int]:
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
 
-def pick_views(num_views: int, most: int) -> list[int]:
-    """Return at most ``most`` evenly spread view ids, if possible without the first and the last view."""
-    count = min(num_views, most)
+def pick_views(num_views: int, max_count: int) -> list[int]:
+    """Return at most ``max_count`` evenly spread view ids, if possible without the first and the last view."""
+    count = min(num_views, max_count)
     return [int((i + 0.5) * num_views / count) for i in range(count)]
 
 
 def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:
     """Return, for each pair of consecutive ``contexts``, the index of the candidate nearest to their middle, if any."""
-    chosen = []
+    midpoints = []
     for low, high in pairwise(sorted(contexts)):
-        inside = [i for i, place in enumerate(candidates) if low < place < high]
+        inside = [i for i, position in enumerate(candidates) if low < position < high]
         if inside:
-            chosen.append(min(inside, key=lambda i: (abs(candidates[i] - (low + high) / 2), candidates[i])))
-    return chosen
+            midpoints.append(min(inside, key=lambda i: (abs(candidates[i] - (low + high) / 2), candidates[i])))
+    return midpoints
 
 
 def camera_kinds(cameras: Cameras) -> np.ndarray:
@@ -56,18 +56,20 @@ def camera_kinds(cameras: Cameras) -> np.ndarray:
 
 
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
-    """Return the ids of views that repeat no earlier view and, for every view, its index among these.
+    """Return the ids of distinct views, which repeat no earlier view, and for every view its index among these.
 
-    A view repeats another if camera, photo and Gaussians are equal; it then has the index of that view.
+    A view repeats another if camera, photo and Gaussians are equal. Then both have the same index.
     """
     kinds = camera_kinds(scene.cameras)
-    distinct, places = list[int](), list[int]()
+    distinct, indices = list[int](), list[int]()
     for view, kind in enumerate(kinds):
-        equal = (i for i, other in enumerate(distinct) if kinds[other] == kind and _equal_views(scene, other, view))
-        places.append(next(equal, len(distinct)))
-        if places[-1] == len(distinct):
+        equal = (
+            i for i, earlier in enumerate(distinct) if kinds[earlier] == kind and _equal_views(scene, earlier, view)
+        )
+        indices.append(next(equal, len(distinct)))
+        if indices[-1] == len(distinct):
             distinct.append(view)
-    return distinct, places
+    return distinct, indices
 
 
 def _equal_views(scene: Scene, first: int, second: int) -> bool:
@@ -87,26 +89,26 @@ def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
     Otherwise all Gaussians stay, and their pixels are unknown.
     """
     ids = list(view_ids)
-    parts = {name: value[ids] for name, value in vars(scene).items() if name in BY_VIEW and value is not None}
-    parts["names"] = tuple(scene.names[i] for i in ids)
-    parts["pixels"] = None
+    fields = {name: array[ids] for name, array in vars(scene).items() if name in BY_VIEW and array is not None}
+    fields["names"] = tuple(scene.names[i] for i in ids)
+    fields["pixels"] = None
     if scene.has_own_pixels:
-        rows, parts["pixels"] = scene.get_pixels().select(ids)
-        parts["gaussians"] = scene.gaussians[rows]
-        parts["filled"] = None if scene.filled is None else scene.filled[rows]
-    return replace(scene, **parts)
+        rows, fields["pixels"] = scene.get_pixels().select(ids)
+        fields["gaussians"] = scene.gaussians[rows]
+        fields["filled"] = None if scene.filled is None else scene.filled[rows]
+    return replace(scene, **fields)
 
 
 def take_rows(scene: SceneT, rows: np.ndarray) -> SceneT:
-    """Return the scene with only the Gaussians ``rows [m]``, ascending; pixels of other Gaussians show none."""
+    """Return the scene with only the Gaussians ``rows [m]``, ascending; pixels of dropped Gaussians show none."""
     filled = None if scene.filled is None else scene.filled[rows]
-    part = replace(scene, gaussians=scene.gaussians[rows], filled=filled, pixels=None)
+    reduced = replace(scene, gaussians=scene.gaussians[rows], filled=filled, pixels=None)
     if not scene.has_own_pixels:
-        return part
-    pixels, numbers = scene.get_pixels(), np.full(len(scene.gaussians), -1, np.int32)
-    numbers[rows] = np.arange(len(rows), dtype=np.int32)
-    fronts = np.where(pixels.shown, numbers[pixels.fronts], np.int32(-1))
-    return replace(part, pixels=Pixels(pixels.homes[rows], fronts, own=True))
+        return reduced
+    pixels, new_rows = scene.get_pixels(), np.full(len(scene.gaussians), -1, np.int32)
+    new_rows[rows] = np.arange(len(rows), dtype=np.int32)
+    fronts = np.where(pixels.shown, new_rows[pixels.fronts], np.int32(-1))
+    return replace(reduced, pixels=Pixels(pixels.homes[rows], fronts, own=True))
 
 
 def in_float64(cameras: Cameras) -> Cameras:
