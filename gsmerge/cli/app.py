@@ -65,21 +65,21 @@ lab       research: charts, training"""
 
 
 def make_app(only: str | None = None) -> typer.Typer:
-    """Make the application with all commands, or with the command ``only``, so that no other is imported."""
-    made = typer.Typer(
+    """Make the application with all commands, or with the command ``only``; other commands are then not imported."""
+    app = typer.Typer(
         name=PROGRAM, cls=Group, pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )  # fmt: skip
-    made.callback(invoke_without_command=True)(root)
+    app.callback(invoke_without_command=True)(root)
     for panel, names in COMMANDS.items():
         for name in names:
             if only in (None, name):
                 function = getattr(import_module(f"gsmerge.cli.{name}_command"), name)
-                made.command(cls=Command, rich_help_panel=panel)(function)
+                app.command(cls=Command, rich_help_panel=panel)(function)
     if only == LOOK:
-        made.command(LOOK, cls=Command)(import_module("gsmerge.cli.compact_command").look)
+        app.command(LOOK, cls=Command)(import_module("gsmerge.cli.compact_command").look)
     if only in (*OWN_COMMANDS, LOOK):
-        return made
+        return app
     lab = typer.Typer(
         cls=Group, help="Research: charts of many runs, synthetic scenes, bad conditions, training of networks."
     )
@@ -95,17 +95,17 @@ def make_app(only: str | None = None) -> typer.Typer:
             if in_lab:
                 lab.command(name, cls=Command)(function)
             else:
-                made.command(name, cls=Command, rich_help_panel=PLUGIN_PANEL)(function)
+                app.command(name, cls=Command, rich_help_panel=PLUGIN_PANEL)(function)
     if only in (None, LAB):
-        made.add_typer(lab, name=LAB, rich_help_panel="Research")
-    return made
+        app.add_typer(lab, name=LAB, rich_help_panel="Research")
+    return app
 
 
 @lru_cache
 def make_command(only: str | None = None) -> Any:
-    """Make the Click command that parses and calls, with all commands or with ``only`` one.
+    """Make the Click command that parses the words and calls a command: any command, or ``only`` one.
 
-    Typer's option that installs completion is removed, since it writes into the files of the shell. The one that
+    Typer's option that installs completion is removed, since it writes into the files of the shell. Its option that
     prints the completion stays.
     """
     command = typer.main.get_command(make_app(only))
@@ -119,12 +119,12 @@ def _lab_root(context: typer.Context) -> None:
 
 
 def _is_research(entry: EntryPoint) -> bool:
-    """Return whether a command comes from this package, not from another one."""
+    """Return True if a command is part of this package, False if it comes from another package."""
     return entry.module.startswith("gsmerge.")
 
 
 def _command_of(words: list[str]) -> str | None:
-    """Return the name of the only command to import; None: import all, to show the help or an error."""
+    """Return the name of the command to import; None: import all commands, to show the help or an error."""
     name = words[0] if words else ""
     if name in (*OWN_COMMANDS, LAB, LOOK):
         return name
@@ -177,7 +177,7 @@ def root(
         print(OVERVIEW)
 
 
-_RETRY_SECONDS = 0.02  # delay before a signal is raised again, if it came where it could not be handled
+_RETRY_SECONDS = 0.02  # delay before a signal is raised again, if no caller could handle it
 
 
 @contextmanager
@@ -199,7 +199,7 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
         raise KeyboardInterrupt
 
     def retry(unraisable: sys.UnraisableHookArgs) -> None:
-        if unraisable.exc_type is KeyboardInterrupt:  # came in a library's callback, where no caller can catch it
+        if unraisable.exc_type is KeyboardInterrupt:  # raised in a library's callback, where no caller can catch it
             raise_later(signals[-1] if signals else signal.SIGINT)
         else:
             usual_hook(unraisable)
@@ -231,7 +231,7 @@ def _check_working_directory() -> None:
 
 
 def _take_progress(words: list[str]) -> tuple[list[str], list[str]]:
-    """Remove ``--progress`` from the words, wherever it stands; return the remaining words, and its values."""
+    """Remove ``--progress`` from the words before ``--``; return the remaining words, and its values."""
     end = words.index("--") if "--" in words else len(words)
     remaining, values, i = [], [], 0
     while i < end:
@@ -257,7 +257,7 @@ def _check_style(values: Sequence[str]) -> None:
 
 
 def run(args: Sequence[str] | None = None) -> int:
-    """Run the application; every error becomes one line on stderr and an exit code."""
+    """Run the application and return its exit code; print an error as one line on stderr."""
     arguments = list(sys.argv[1:] if args is None else args)
     words, styles = _take_progress([expand_home(word) for word in arguments if word != DEBUG])
 

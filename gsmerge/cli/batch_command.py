@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
 
 MAX_LISTED = 20  # rows of the table, failures, and results that are worse than their input
+OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
 
 
 def parse_jobs(text: str) -> int:
@@ -77,11 +78,11 @@ def batch(args: opt.Args) -> None:
     from gsmerge.batch import BatchOptions, find_jobs
     from gsmerge.batch.records import RecordIndex
 
-    settings, place = args.make(CompactOptions, Engine)
+    settings, engine = args.make(CompactOptions, Engine)
     try:
         options = BatchOptions(
             settings, args.opacity, hints, args.cameras, args.images, args.masks, args.protect, args.name,
-            args.jobs or None, args.overwrite, place.engine, place.address,
+            args.jobs or None, args.overwrite, engine.engine, engine.address,
         )  # fmt: skip
     except ValueError as error:
         raise UsageError(str(error).replace("output:", "--name:", 1)) from error
@@ -141,12 +142,12 @@ def run_jobs(
     add: Callable[[dict[str, Any]], None],
     name: str = "scene",
 ) -> None:
-    """Run jobs, show progress, and pass each record to ``add``; ``name``: key of the job's name in a record."""
+    """Run jobs, show progress, and pass each record to ``add``; ``name`` is the key of the job's name in a record."""
     from gsmerge.batch import run_batch
     from gsmerge.batch.records import FAILED, SKIPPED
 
     num_failed, weights = 0, {job.output: 1 + job.num_gaussians for job in jobs}
-    done, total = 0, sum(weights.values())  # weight of what this run makes
+    done, total = 0, sum(weights.values())  # weights of the finished jobs, and of all jobs that are not skipped
     with (
         separate_stdout(options.engine, quiet=args.silent),
         closing(run_batch(jobs, args.output, options)) as records,
@@ -154,7 +155,7 @@ def run_jobs(
     ):
         for num_ended, record in enumerate(records, 1):
             add(record)
-            why = record["error"] or ""
+            failure = record["error"] or ""
             num_failed += record["status"] == FAILED
             weight = weights.get(record["output"], 0)
             if record["status"] == SKIPPED:
@@ -162,19 +163,19 @@ def run_jobs(
             else:
                 done += weight
             share = done / total if total > 0 else 1.0
-            progress(record[name], record["status"], num_ended, why, num_failed, share)
+            progress(record[name], record["status"], num_ended, failure, num_failed, share)
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
-    """Raise BatchError if jobs ``failed`` (name, reason); it gives the first reason unless all were ``listed``."""
+    """Raise BatchError if jobs ``failed`` (name, reason); the message has the first reason unless all were ``listed``."""
     if failed:
         raise BatchError(f"{len(failed)} of {total} {unit} failed{_first_reason(failed, listed=listed)}")
 
 
 def _first_reason(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
     """Return the first scene and its reason, for the end of a message; "" if all were ``listed`` before."""
-    scene, why = reasons[0]
-    return "" if listed else f"; the first: {scene}: {why}"
+    scene, reason = reasons[0]
+    return "" if listed else f"; the first: {scene}: {reason}"
 
 
 @dataclass
@@ -187,9 +188,9 @@ class Totals:
     num_output: int = 0  # Gaussians in their results
     unmet: int = 0  # results that miss their target
     rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results
-    unused: list[tuple[str, str]] = field(default_factory=list)  # scene, and the columns of it that are not used
+    unused: list[tuple[str, str]] = field(default_factory=list)  # scene, and its columns that are not used
     worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
-    left_out: list[tuple[str, str]] = field(default_factory=list)  # scene, and the note on files that are not its own
+    left_out: list[tuple[str, str]] = field(default_factory=list)  # scene, and a note on files of another scene
     lacking: list[tuple[str, str]] = field(default_factory=list)  # scene, and the cameras or photos that it lacks
     failed: list[tuple[str, str]] = field(default_factory=list)  # scene and reason
 
@@ -228,7 +229,8 @@ class Totals:
 
         header = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
         rows = [header, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
-        lines = text_table(rows, columns=columns, least=(2, 7, 5, 6, 3)) if self.rows else []
+        omitted_first = [header.index(name) for name in OMITTED_FIRST]
+        lines = text_table(rows, columns=columns, least=omitted_first) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
         kinds = (
@@ -239,11 +241,12 @@ class Totals:
             (FAILED, self.failed),
         )
         for status, reasons in kinds:
-            lines += [f"{status}: {scene}: {why}" for scene, why in reasons[:MAX_LISTED]]
+            lines += [f"{status}: {scene}: {reason}" for scene, reason in reasons[:MAX_LISTED]]
             lines += [f"... and {len(reasons) - MAX_LISTED:,} more {status}"] if len(reasons) > MAX_LISTED else []
-        counts = [f"{self.counts[x]:,} {x}" for x in (DONE, SKIPPED, FAILED) if self.counts[x] or x == DONE]
-        left = self.total - self.counts.total()
-        line = f"{self.total:,} scenes: {', '.join(counts)}" + (f", {left:,} left" if left else "")
+        statuses = [status for status in (DONE, SKIPPED, FAILED) if self.counts[status] or status == DONE]
+        counts = [f"{self.counts[status]:,} {status}" for status in statuses]
+        num_left = self.total - self.counts.total()
+        line = f"{self.total:,} scenes: {', '.join(counts)}" + (f", {num_left:,} left" if num_left else "")
         if self.num_input:
             share = human_share(self.num_output / self.num_input)
             line += f"; {self.num_input:,} -> {self.num_output:,} Gaussians ({share})"
@@ -266,9 +269,9 @@ def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
 
     psnr = report["psnr_input_views"]
     quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
-    if judged := report["choices"].get("fidelity"):
+    if fidelity := report["choices"].get("fidelity"):
         # without photos the result is compared with the input
-        quality = ["the input", "equal" if judged["psnr"] >= MAX_PSNR else f"{judged['psnr']:.2f}"]
+        quality = ["the input", "equal" if fidelity["psnr"] >= MAX_PSNR else f"{fidelity['psnr']:.2f}"]
     counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
     gain = "" if new is None else f"{new['low']:+.1f} to {new['high']:+.1f} dB"
     return output, *counts, human_share(report["ratio"]), gain, *quality, f"{report['total_seconds']:.1f}"
@@ -277,13 +280,14 @@ def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
 def print_plan(
     args: opt.Args, jobs: Sequence[Job], options: BatchOptions, unit: str = "scenes", notes: Sequence[str] = ()
 ) -> None:
-    """Print what a run would do; ``unit``: word for its jobs."""
+    """Print which jobs a run would do; ``unit`` is the word for them."""
     from gsmerge.batch.run import choose_concurrency, pending_jobs
     from gsmerge.report import document_head
 
-    out, pending, concurrency = args.output, pending_jobs(jobs, args.output, options), choose_concurrency(jobs, options)
+    out, pending = args.output, pending_jobs(jobs, args.output, options)
+    concurrency = choose_concurrency(jobs, options)
     pending_outputs = {job.output for job, _ in pending}
-    num_refused = sum(why is not None for _, why in pending)
+    num_refused = sum(refusal is not None for _, refusal in pending)
     num_pending = len(pending) - num_refused
     document = {
         **document_head(),
@@ -305,7 +309,7 @@ def print_plan(
         "options": options.settings.to_dict(),
         "notes": list(notes),
     }
-    lines = [f"{job.scene} -> {f'refused: {why}' if why else out / job.output}" for job, why in pending]
+    lines = [f"{job.scene} -> {f'refused: {refusal}' if refusal else out / job.output}" for job, refusal in pending]
     lines += [f"note: {note}" for note in notes]
     refused = f", {num_refused:,} refused" if num_refused else ""
     lines.append(f"would write {out}: {num_pending:,} of {len(jobs):,} {unit} to do{refused}, {concurrency}")

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from gsmerge.scene.read import Loaded
     from gsmerge.types import Cameras, Gaussians, Scene, Views
 
-TOLERANCE = 1e-5  # difference of two equal poses after writing and reading, absolute and relative
+TOLERANCE = 1e-5  # largest difference, absolute and relative, of equal poses after writing and reading
 
 
 def lpips_networks(
     choice: str | None, usual: Sequence[str] = EvaluateOptions().lpips
 ) -> tuple[tuple[str, ...], list[str]]:
-    """Choose LPIPS networks by ``--lpips``, by default the ``usual`` ones that are installed; add a note if none is."""
+    """Choose LPIPS networks by ``--lpips``, by default the installed ones of ``usual``; add a note if none is installed."""
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
     if choice is None:
@@ -68,13 +68,13 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     from gsmerge.runtime.record import record_run
     from gsmerge.scene.files import result_cameras
 
-    if files.cameras is None and "cameras" not in files.named:  # a result may hold cameras that its scene has lost
+    if files.cameras is None and "cameras" not in files.named:  # a result may have cameras that its scene lacks
         files = replace(files, cameras=next(filter(None, map(result_cameras, args.after)), None))
-    load, notes = args.load(files), list[str]()
+    load = args.load(files)
     views = vars(args).get("views")
     if args.targets is not None or views is not None:
         require_views(load)
-    scene, held_out, adapted = held_out_views(load, args.targets, vars(args).get("target_images"), views)
+    scene, held_out, target_notes = held_out_views(load, args.targets, vars(args).get("target_images"), views)
     with record_run() as record:
         scene = add_views(scene, shown=True)
     notes = [PLACED_VIEWS if note == NO_VIEWS and not args.after else note for note in record.notes]
@@ -84,12 +84,12 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
             f"{files.ply.name} has fewer Gaussians than the files it is compared with; perhaps BEFORE and AFTER are"
             " swapped"
         )
-    cameras, moved = own_cameras(args.after, scene)
-    return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *adapted, *notes, *moved])
+    cameras, camera_notes = own_cameras(args.after, scene)
+    return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *target_notes, *notes, *camera_notes])
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
-    """Read the cameras that ``compact`` wrote into or beside results and that the fit has moved; with notes."""
+    """Read the cameras that ``compact`` wrote into or beside results, if the fit has moved them; add notes."""
     import numpy as np
 
     from gsmerge.frame import scene_depth
@@ -100,17 +100,20 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     cameras: dict[str, Cameras] = {}
     notes, start = list[str](), scene.cameras.viewmats
     for name, path in zip(file_names(paths), paths, strict=True):
-        holder, read = result_cameras(path), None
-        if holder is not None and scene.is_shown:
+        camera_path, camera_file = result_cameras(path), None
+        if camera_path is not None and scene.is_shown:
             with suppress(SceneError):  # the results can be measured without this file, whoever wrote it
-                read = read_cameras(holder)
-        if read is None or holder is None or read.names != scene.names:
+                camera_file = read_cameras(camera_path)
+        if camera_file is None or camera_path is None or camera_file.names != scene.names:
             continue
-        if np.allclose(read.viewmats, start, rtol=TOLERANCE, atol=TOLERANCE):
+        viewmats = camera_file.viewmats
+        if np.allclose(viewmats, start, rtol=TOLERANCE, atol=TOLERANCE):
             continue
-        cameras[name] = replace(scene.cameras, viewmats=read.viewmats)
-        moves = describe_moves(list_moves(scene.names, start, read.viewmats, scene_depth(scene)))
-        notes.append(f"{name}: its input views are drawn from the cameras in {holder.name}, which are moved by {moves}")
+        cameras[name] = replace(scene.cameras, viewmats=viewmats)
+        moves = describe_moves(list_moves(scene.names, start, viewmats, scene_depth(scene)))
+        notes.append(
+            f"{name}: its input views are drawn from the cameras in {camera_path.name}, which are moved by {moves}"
+        )
     return cameras, notes
 
 
@@ -130,20 +133,20 @@ def held_out_views(
 
     if target_images is not None and targets is None:
         raise UsageError("--target-images: expected the cameras of these photos too; name them with --targets")
-    read = None if targets is None else read_held_out(load, targets, target_images)
-    notes = () if read is None else read.notes
+    held_out = None if targets is None else read_held_out(load, targets, target_images)
+    notes = () if held_out is None else held_out.notes
     if views is None:
-        return load.scene, read, notes
+        return load.scene, held_out, notes
     with usage_errors():
         ids = even_views(len(load.scene), views)
-    chosen: Sequence[int] = ()
-    if read is not None:
-        if read.context_places is None:
+    target_ids: Sequence[int] = ()
+    if held_out is not None:
+        if held_out.context_places is None:
             raise UsageError("--views: expected --targets to name the input views too, in the order of the trajectory")
-        chosen = midpoint_views([read.context_places[i] for i in ids], read.places)
-        if not chosen:
+        target_ids = midpoint_views([held_out.context_places[i] for i in ids], held_out.places)
+        if not target_ids:
             raise UsageError(f"--views {views}: expected held-out views between the input views, found none")
-    return subset(load.scene, ids), read and read[chosen], notes
+    return subset(load.scene, ids), held_out and held_out[target_ids], notes
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:

@@ -68,9 +68,9 @@ def compact(args: opt.Args) -> None:
 def look(args: opt.Args) -> None:
     """Compact a scene, and open a page that compares it with the result: ``gsmerge SCENE``."""
     scene, features = args.scenes[0], _features_in(args.scenes)
-    usual = default_output(scene if features else args.files(*args.scenes).base)
+    default = default_output(scene if features else args.files(*args.scenes).base)
     writing: FileOptions = args.make(CompactOptions, FileOptions, Engine)[1]
-    args.output = output_file(args.output or usual, usual.name, site=writing.site)
+    args.output = output_file(args.output or default, default.name, site=writing.site)
     # The page cannot show joined files or Feature Gaussians, so it shows the result alone
     shown = [args.output] if features or len(args.scenes) > 1 else [scene, args.output]
     if os.path.lexists(args.output) and not (args.overwrite or args.dry_run):
@@ -92,7 +92,7 @@ def look(args: opt.Args) -> None:
 
 
 def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) -> None:
-    """Run ``compact``; ``on_read`` is called with the scene after reading it."""
+    """Run ``compact``, and call ``on_read`` with the scene after reading it."""
     start = perf_counter()
     features = _features_in(args.scenes)
     if features is not None:
@@ -100,8 +100,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
         return
     hints = args.hints()
     from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
-    from gsmerge.io.formats.table import find_format, output_format
-    from gsmerge.io.formats.write import level_output
+    from gsmerge.io.formats.table import find_format
 
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
@@ -113,25 +112,9 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     files = args.files(*args.scenes)
     default = default_output(files.base)
     out = output_file(args.output or default, default.name, site=writing.site)
-    chosen = find_format(out)
-    if chosen.levels == "inside" and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
-        settings = settings.with_settings({"levels": STREAMED_LEVELS})
-    if not chosen.levels and settings.budget.levels > 1:
-        raise UsageError(f"{out}: expected no --levels for {chosen.about.partition(':')[0]}, which holds one level")
-    if settings.budget.in_bytes and not output_format(out, levels=True, cameras=True).each:
-        raise UsageError(f"{out}: expected a --budget in Gaussians for this format, got {settings.budget.budget}")
-    num_apart = settings.budget.levels if chosen.levels == "apart" else 1
-    levels = [level_output(out, level) for level in range(1, num_apart)]
-    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not chosen.cameras else None
-    networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
-    inputs = (*input_files(files), *networks)
-    # Without --overwrite the camera file may exist, from a result in another format
-    replaced_cameras = cameras if args.overwrite else None
-    written = (out, *files_beside(out, site=writing.site), *levels, replaced_cameras)
-    check_outputs(written, inputs, overwrite=args.overwrite or args.dry_run)
-    check_format(out, writing)
-    if writing.columns == "full" and settings.budget.in_bytes:
-        raise UsageError(f"columns full: expected a --budget that is a number or a share, got {settings.budget.budget}")
+    settings = _fit_format(args, settings, out)
+    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not find_format(out).cameras else None
+    _check_outputs(args, files, settings, writing, out, cameras)
     if args.dry_run:
         print_plan(args, files, settings, out, hints)
         return
@@ -151,6 +134,39 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     _say_result(args, document, out, shown=on_read is not None)
 
 
+def _fit_format(args: opt.Args, settings: CompactOptions, out: Path) -> CompactOptions:
+    """Choose the number of levels by the format of ``out``; UsageError if levels or budget do not fit the format."""
+    from gsmerge.io.formats.table import find_format, output_format
+
+    format_ = find_format(out)
+    if format_.levels == "inside" and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
+        settings = settings.with_settings({"levels": STREAMED_LEVELS})
+    if not format_.levels and settings.budget.levels > 1:
+        raise UsageError(f"{out}: expected no --levels for {format_.about.partition(':')[0]}, which holds one level")
+    if settings.budget.in_bytes and not output_format(out, levels=True, cameras=True).each:
+        raise UsageError(f"{out}: expected a --budget in Gaussians for this format, got {settings.budget.budget}")
+    return settings
+
+
+def _check_outputs(
+    args: opt.Args, files: SceneFiles, settings: CompactOptions, writing: FileOptions, out: Path, cameras: Path | None
+) -> None:
+    """Raise an error if a file of the result, or its camera file ``cameras``, cannot be written."""
+    from gsmerge.io.formats.table import find_format
+    from gsmerge.io.formats.write import level_output
+
+    num_files = settings.budget.levels if find_format(out).levels == "apart" else 1
+    levels = [level_output(out, level) for level in range(1, num_files)]
+    networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
+    # Without --overwrite the camera file may exist, from a result in another format
+    replaced_cameras = cameras if args.overwrite else None
+    outputs = (out, *files_beside(out, site=writing.site), *levels, replaced_cameras)
+    check_outputs(outputs, (*input_files(files), *networks), overwrite=args.overwrite or args.dry_run)
+    check_format(out, writing)
+    if writing.columns == "full" and settings.budget.in_bytes:
+        raise UsageError(f"columns full: expected a --budget that is a number or a share, got {settings.budget.budget}")
+
+
 def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
     """Print the report of a run, and how to view it unless a page is ``shown``; TargetError if a target is missed."""
     from gsmerge.compaction.report import curve_lines, level_lines, result_table, summary_line
@@ -162,6 +178,7 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     if sys.stdout.isatty():
         words = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
         words = ["python", "-m", "http.server", "-d", str(out.parent)] if out.name == find_format(out).site else words
+        # A file name that begins with a dash would be taken for an option
         next_step = shlex.join([f"./{word}" if word.endswith(out.name) and word[0] == "-" else word for word in words])
         lines = result_table(document, next_step or None, columns=terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
@@ -170,9 +187,9 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
         say_notes(["--strict: nothing was checked, since there is no photo to compare with"], quiet=args.silent)
     problems = [document["unmet"], *(doubts if args.strict else [])]
     if document["worse"] and not args.strict:
-        own = document["psnr_input_views"]
-        lost = "fidelity" in document["choices"] or (own["after"] is not None and own["after"] < own["before"])
-        say_warning(f"{document['worse']}; {REMEDY}" if lost else document["worse"], quiet=args.silent)
+        psnr = document["psnr_input_views"]
+        has_loss = "fidelity" in document["choices"] or (psnr["after"] is not None and psnr["after"] < psnr["before"])
+        say_warning(f"{document['worse']}; {REMEDY}" if has_loss else document["worse"], quiet=args.silent)
     if any(problems):
         raise TargetError("; ".join(filter(None, problems)))
 
@@ -217,12 +234,11 @@ def _check_scenes(args: opt.Args) -> None:
     if args.cameras not in (None, NONE):
         problem = "--cameras: expected one scene with it, got several"
         raise UsageError(f"{problem}; the cameras of several scenes are read from beside or inside them")
-    for place, scene in enumerate(args.scenes):
+    for i, scene in enumerate(args.scenes):
         if not os.path.lexists(scene):
             raise UsageError(f"{scene}: no such scene; name the output with -o")
-        if any(os.path.realpath(scene) == os.path.realpath(other) for other in args.scenes[:place]):
-            remedy = "name the output with -o"
-            raise UsageError(f"{scene}: expected each scene once, got it twice; {remedy}")
+        if any(os.path.realpath(scene) == os.path.realpath(other) for other in args.scenes[:i]):
+            raise UsageError(f"{scene}: expected each scene once, got it twice; name the output with -o")
 
 
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:

@@ -116,7 +116,10 @@ def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
 
 
 def say_warning(text: str, *, quiet: bool = False) -> None:
-    """Print a warning on stderr unless ``quiet``, in red on terminals or with ``FORCE_COLOR``, without ``NO_COLOR``."""
+    """Print a warning on stderr unless ``quiet``, in red on terminals.
+
+    ``FORCE_COLOR`` colours it elsewhere too, and ``NO_COLOR`` prevents colours.
+    """
     has_colors = sys.stderr.isatty() or os.environ.get("FORCE_COLOR")
     colored = not (quiet or _stream.get()) and bool(has_colors) and not os.environ.get("NO_COLOR")
     with suppress(OSError):
@@ -147,16 +150,16 @@ def print_document(
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Print each warning in the block on one line, without file and line number; those of NumPy as one note."""
-    numbers: list[str] = []
+    """Print each warning in the block on one line, without file and line number; NumPy's warnings give one note."""
+    numeric_warnings: list[str] = []
 
     def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         if not issubclass(category, RuntimeWarning):
             say(str(message), kind="warning")
             return
-        if not numbers:
+        if not numeric_warnings:
             say(f"some numbers are too large or undefined ({message})", kind="note")
-        numbers.append(str(message))
+        numeric_warnings.append(str(message))
 
     with warnings.catch_warnings():
         warnings.showwarning = show
@@ -198,16 +201,36 @@ def _print_stages(stream: JsonLines) -> Progress:
     from gsmerge.runtime.record import current_forecast
     from gsmerge.runtime.time_left import Forecast
 
-    own = Forecast()
+    fallback = Forecast()
 
     def move(text: str, done: int, total: int) -> None:
         stage, _, detail = one_line(text).partition(": ")
-        own.move(text, done, total)
-        left = (current_forecast() or own).seconds_left
+        fallback.move(text, done, total)
+        left = (current_forecast() or fallback).seconds_left
         stream.move(None if left is None else stream.seconds / max(stream.seconds + left, 1e-9), left)
         stream.print({"stage": stage, "detail": detail, "done": done, "total": total})
 
     return move
+
+
+def _stage_columns(console: Any) -> list[Any]:
+    """Make the columns of a stage's bar: name, bar and count; on wide terminals also times and detail."""
+    from rich import progress as rich
+    from rich.table import Column
+
+    class TimeLeft(rich.ProgressColumn):
+        max_refresh = 0.5
+
+        def render(self, task: rich.Task) -> str:
+            seconds = task.time_remaining
+            return "" if task.finished or not seconds or seconds < LEAST_SHOWN else f"{duration(seconds)} left"
+
+    count, detail = (rich.TextColumn(f"{{task.fields[{field}]}}", markup=False) for field in ("count", "detail"))
+    name_column = Column(max_width=max(18, console.width // 3), no_wrap=True, overflow="ellipsis")
+    name = rich.TextColumn("{task.description:>12}", markup=False, table_column=name_column)
+    if console.width < NARROW:
+        return [name, _bar(console), count]
+    return [name, _bar(console), rich.TimeElapsedColumn(), count, TimeLeft(), detail]
 
 
 @contextmanager
@@ -225,24 +248,10 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
         yield lambda stage, done, total: None
         return
     from rich import progress as rich
-    from rich.table import Column
 
     from gsmerge.runtime.time_left import STAGES
 
-    class TimeLeft(rich.ProgressColumn):
-        max_refresh = 0.5
-
-        def render(self, task: rich.Task) -> str:
-            seconds = task.time_remaining
-            return "" if task.finished or not seconds or seconds < LEAST_SHOWN else f"{duration(seconds)} left"
-
-    count, detail = (rich.TextColumn(f"{{task.fields[{name}]}}", markup=False) for name in ("count", "detail"))
-    place = Column(max_width=max(18, console.width // 3), no_wrap=True, overflow="ellipsis")
-    name = rich.TextColumn("{task.description:>12}", markup=False, table_column=place)
-    columns: tuple[rich.ProgressColumn, ...] = (name, _bar(console), count)
-    if console.width >= NARROW:
-        columns = *columns[:2], rich.TimeElapsedColumn(), count, TimeLeft(), detail
-    with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
+    with rich.Progress(*_stage_columns(console), console=console, transient=True, refresh_per_second=5) as bars:
         tasks: dict[str, Any] = {}
         totals: dict[str, int] = {}
         running: list[str] = []
@@ -274,7 +283,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
 
 @contextmanager
 def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
-    """Keep Ray's messages about lost processes off stdout in the block: send them to stderr, or nowhere if quiet."""
+    """Redirect Ray's messages about lost processes in the block from stdout to stderr, or discard them if ``quiet``."""
     if engine != "ray":
         yield
         return

@@ -57,18 +57,18 @@ class MeasuringOptions(Settings):
 def evaluate(args: opt.Args) -> None:
     """Measure a scene and its compact versions against photos: PSNR, SSIM, LPIPS, fog, counts, bytes, render time."""
     args.after = args.after or []
-    args.lpips, missing = lpips_networks(args.lpips)
-    options, own = args.make(EvaluateOptions, MeasuringOptions)
+    args.lpips, lpips_notes = lpips_networks(args.lpips)
+    options, measuring = args.make(EvaluateOptions, MeasuringOptions)
     if not options.context and args.targets is None:
         raise UsageError("context=false: expected held-out views to measure instead; name them with --targets")
-    args.views, args.masks = own.views, None if own.masks is None else opt.named_or_none(own.masks)
+    args.views, args.masks = measuring.views, None if measuring.masks is None else opt.named_or_none(measuring.masks)
     files, outputs = args.files(args.before), args.output or []
     if args.quiet and not (outputs or args.json or args.maps):
         raise UsageError("--quiet: expected -o, --maps or --json with it, since otherwise nothing is shown or written")
-    _check_files(args, outputs, own, input_files(files))
+    _check_files(args, outputs, measuring, input_files(files))
     if args.maps is not None:
         check_folder(args.maps, tuple(input_files(files)), overwrite=True)
-    seconds = [_read_seconds(value) for value in own.merge_seconds]
+    seconds = [_read_seconds(value) for value in measuring.merge_seconds]
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
     from gsmerge.measure.scores import evaluation_document, evaluation_lines
     from gsmerge.pages.data import still_keeper
@@ -80,19 +80,19 @@ def evaluate(args: opt.Args) -> None:
         from gsmerge.measure.error_maps import require_photos
 
         require_photos(pair.scene, pair.load.files.ply)
-    notes = [*pair.notes, *missing]
+    notes = [*pair.notes, *lpips_notes]
     if pair.plys and len(pair.scene) < len(pair.load.scene):
         notes.append(
             f"scores assume results of {len(pair.scene)} views; a result of more views has seen the held-out photos"
         )
     say_notes(notes, quiet=args.silent)
     stills: Stills = {}
-    more = {"on_image": still_keeper(stills)} if any(path.suffix == PAGE for path in outputs) else {}
+    hooks = {"on_image": still_keeper(stills)} if any(path.suffix == PAGE for path in outputs) else {}
     with stage_progress(quiet=args.silent) as progress:
         evaluation = evaluate_scene(
-            pair.scene, pair.gaussians, pair.held_out, options, cameras=pair.cameras, progress=progress, **more
+            pair.scene, pair.gaussians, pair.held_out, options, cameras=pair.cameras, progress=progress, **hooks
         )
-        facts = _facts(pair, options, own, dict(zip(pair.plys, seconds, strict=False)))
+        facts = _facts(pair, options, measuring, dict(zip(pair.plys, seconds, strict=False)))
     document = evaluation_document(evaluation, facts, notes)
     _write(outputs, document, pair, evaluation, stills)
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
@@ -104,22 +104,22 @@ def evaluate(args: opt.Args) -> None:
     say_notes(evaluation.notes, quiet=args.silent)
 
 
-def _check_files(args: opt.Args, outputs: Sequence[Path], own: MeasuringOptions, inputs: Sequence[Path]) -> None:
-    """Raise UsageError if an output cannot be written, or if ``merge_seconds`` are not as many as the results."""
+def _check_files(args: opt.Args, outputs: Sequence[Path], measuring: MeasuringOptions, inputs: Sequence[Path]) -> None:
+    """Raise UsageError if an output cannot be written, or if the number of ``merge_seconds`` is not that of the results."""
     for path in outputs:
         if path.suffix not in SUFFIXES:
             raise UsageError(f"{path}: expected a name ending in {opt.join_words(SUFFIXES)}")
-    reports = [Path(value) for value in own.merge_seconds if isinstance(value, str)]
+    reports = [Path(value) for value in measuring.merge_seconds if isinstance(value, str)]
     check_outputs(outputs, (*inputs, *args.after, args.targets, args.target_images, *reports), overwrite=True)
     check_replaced(outputs)
-    if own.merge_seconds and len(own.merge_seconds) != len(args.after):
+    if measuring.merge_seconds and len(measuring.merge_seconds) != len(args.after):
         raise UsageError(
-            f"merge_seconds: expected one value for each of {len(args.after)} AFTER, got {len(own.merge_seconds)}"
+            f"merge_seconds: expected one value for each of {len(args.after)} AFTER, got {len(measuring.merge_seconds)}"
         )
 
 
 def _facts(
-    pair: BeforeAfter, options: EvaluateOptions, own: MeasuringOptions, seconds: Mapping[str, float]
+    pair: BeforeAfter, options: EvaluateOptions, measuring: MeasuringOptions, seconds: Mapping[str, float]
 ) -> dict[str, dict[str, Any]]:
     """Collect facts about each file by name, with the cost of rendering if requested."""
     from gsmerge.measure.evaluate import INPUT, near_plane
@@ -131,7 +131,7 @@ def _facts(
         name: {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
         for name, info in infos.items()
     }
-    if own.speed or own.merge_seconds:
+    if measuring.speed or measuring.merge_seconds:
         scenes = {INPUT: pair.scene.file_gaussians, **pair.gaussians}
         cameras = shrink_cameras(pair.scene.cameras, options.photo_side)
         zooms = SPEED_ZOOMS if options.zoom == EvaluateOptions().zoom else options.zoom

@@ -52,15 +52,15 @@ def extend(args: opt.Args) -> None:
     for files in batches:
         if any(path.resolve() == args.state.resolve() for path in input_files(files)):
             raise UsageError(f"{args.state}: expected a state other than the input; name another file")
-    documents, tried = list[dict[str, Any]](), None
+    documents, trial_state = list[dict[str, Any]](), None  # a dry run passes the state on, since it writes nothing
     for files in batches:
         before = {"import": perf_counter() - start} if not documents else {}
         with stage_progress(quiet=args.silent) as progress:
             document, state = extend_file(
                 args.state, files, settings, opacity=args.opacity, hints=hints, progress=progress,
-                seconds_before=before, dry_run=args.dry_run, tried=tried,
+                seconds_before=before, dry_run=args.dry_run, tried=trial_state,
             )  # fmt: skip
-        tried = state if args.dry_run else None
+        trial_state = state if args.dry_run else None
         documents.append(document)
         say_notes(document["notes"], quiet=args.silent)
         if not args.silent:

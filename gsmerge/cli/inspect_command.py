@@ -45,8 +45,8 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
     document, lines = {**document_head(), **facts, "problems": list(problems)}, inspection_lines(facts)
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
     if facts["compact"] is None:
-        place, _, problem = facts["alignment_problem"].partition(": ")
-        raise SceneError(place, problem)
+        problem_path, _, problem = facts["alignment_problem"].partition(": ")
+        raise SceneError(problem_path, problem)
     if problems:
         raise SceneError(path, "; ".join(problems))
 
@@ -61,16 +61,16 @@ def _check_files(args: opt.Args) -> None:
         for path in args.paths:
             progress(f"inspect: {path.name}", len(checks), len(args.paths))
             checks.append(check_content(path, opacity=args.opacity, hints=hints))
-    wrong, several = [result for result in checks if result.problems], len(checks) > 1
-    notes = [f"{result.path}: {note}" for result in checks for note in result.notes]
+    wrong, several = [check for check in checks if check.problems], len(checks) > 1
+    notes = [f"{check.path}: {note}" for check in checks for note in check.notes]
     say_notes(notes, quiet=args.silent)
     document = {
         **document_head(),
-        "files": [asdict(result) for result in checks],
+        "files": [asdict(check) for check in checks],
         "num_wrong": len(wrong),
         "notes": notes,
     }
-    lines = [result.line for result in checks if several or not result.problems]
+    lines = [check.line for check in checks if several or not check.problems]
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
     count = f"wrong files: {len(wrong)} of {len(checks)}" if several else ""
     if wrong and several and not args.silent:

@@ -1,4 +1,4 @@
-"""Fill the templates of pages; the one file of a page has everything that it shows."""
+"""Fill the templates of pages; the file of a page contains all that the page shows."""
 
 from __future__ import annotations
 
@@ -26,61 +26,59 @@ if TYPE_CHECKING:
 
 # Content security policy: a page may run only its own scripts and styles, which the policy names by their hashes
 PICTURES = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
-# Spark decodes in WebAssembly and sorts in a worker; its text has both as data: addresses
+# Spark decodes in WebAssembly and sorts in a worker; its text contains both as data: addresses
 SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
 POLICY = "{policy}"  # placeholder in the templates until the hashes are known
 VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
-NONE = "-"  # in place of a missing figure
-FASTER = 1.2  # least ratio of drawing times that the headline mentions
+NONE = "-"  # replaces a missing figure
+FASTER = 1.2  # the headline mentions a ratio of drawing times from this value on
 
 
 def view_page(data: ViewData) -> str:
     """Make the HTML page of a scene and its results."""
-    photos = any(view.photo is not None for view in data.views)
-    sources = _sources(data, photos)
-    right = min(int(photos) + 1, len(sources) - 1)
+    has_photos = any(view.photo is not None for view in data.views)
+    sources = _sources(data, has_photos)
+    right = min(int(has_photos) + 1, len(sources) - 1)
     left = max(right - 1, 0)
-    stills = [
-        [None if still is None else data_uri(still, "image/webp") for still in (view.photo, *view.stills)[not photos :]]
-        for view in data.shown
-    ]
-    opened = stills[data.start]
-    first = {side: opened[side] for side in (left, right)}  # in the HTML itself, so that they appear at once
-    opened[left] = opened[right] = None
+    stills = [_data_uris((view.photo, *view.stills)[not has_photos :]) for view in data.shown]
+    start_stills = stills[data.start]
+    first = {source: start_stills[source] for source in (left, right)}  # in the HTML itself, to appear at once
+    start_stills[left] = start_stills[right] = None
 
     def pictures(of_sides: Sequence[bytes | None], kind: str = "image/webp") -> list[str | None]:
-        of_sources = [None] * (len(sources) - len(of_sides)) + list(of_sides)
-        return [None if picture is None else data_uri(picture, kind) for picture in of_sources]
+        """Encode pictures of the sides; the photos, as a source, have none."""
+        return _data_uris([None] * (len(sources) - len(of_sides)) + list(of_sides), kind)
 
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     engine = VIEWER.read_bytes() if splats else None
     splats |= {
         f"support-{i}": base64_text(side.support) for i, side in enumerate(data.sides) if side.support is not None
     }
-    places = range(min(len(data.sides) - 1, 1), len(data.sides))
-    results = [_result(data, place) for place in places]
-    by_size = sorted(places, key=lambda place: data.sides[place].num_gaussians)
+    result_ids = range(min(len(data.sides) - 1, 1), len(data.sides))  # sides; a single scene counts as a result
+    results = [_result(data, i) for i in result_ids]
+    by_size = sorted(result_ids, key=lambda i: data.sides[i].num_gaussians)
+    own = reference_words(data)[1]
     return render_template(
         "view.html",
         policy=SOLID,
         data=data,
         results=results,
         table=results_table(data),
-        own=reference_words(data)[1],
+        own=own,
         sources=sources,
         left=left,
         right=right,
         first=first,
         json_data={
             "sources": sources,
-            "photos": photos,
+            "photos": has_photos,
             "lpips": any(side.mean.lpips_alex is not None for side in data.sides),
             "start": data.start,
             "results": [
                 result | {"figures": [[figure.new, figure.mark] for figure in result["figures"]]} for result in results
             ],
-            "sizes": [place + photos for place in by_size],
-            "own": reference_words(data)[1],
+            "sizes": [i + has_photos for i in by_size],
+            "own": own,
             "views": [_view(view) for view in data.shown],
         },
         stills=stills,
@@ -96,11 +94,18 @@ def view_page(data: ViewData) -> str:
     )
 
 
-def _sources(data: ViewData, photos: bool) -> list[dict[str, Any]]:
+def _data_uris(pictures: Sequence[bytes | None], kind: str = "image/webp") -> list[str | None]:
+    """Encode pictures as ``data:`` addresses; None stays None."""
+    return [None if picture is None else data_uri(picture, kind) for picture in pictures]
+
+
+def _sources(data: ViewData, has_photos: bool) -> list[dict[str, Any]]:
     """List the choices for the two sides of a page: the photos if there are any, and each scene."""
     picture = "own colours" if data.reference == ROW_COLORS else "photo"
     sources: list[dict[str, Any]] = (
-        [{"name": picture, "splats": None, "count": 0, "dropped": {}, "seen": {}, "support": None}] if photos else []
+        [{"name": picture, "splats": None, "count": 0, "dropped": {}, "seen": {}, "support": None}]
+        if has_photos
+        else []
     )
     return sources + [
         {
@@ -136,19 +141,19 @@ def headline(data: ViewData, place: int = 1) -> str:
         return share_text
     if not np.isfinite(old):  # the input itself is the reference
         return f"{share_text}, {new:.1f} dB from the input's own renders"
-    words = "photos that were not used" if data.held_out else "its own photos" if reference == PHOTOS else reference
-    return f"{share_text}, {_nearer(new - old)} {'to' if new >= old else 'from'} {words}"
+    target = "photos that were not used" if data.held_out else "its own photos" if reference == PHOTOS else reference
+    return f"{share_text}, {_closer_or_farther(new - old)} {'to' if new >= old else 'from'} {target}"
 
 
 def describe_gain(low: float, high: float) -> str:
     """Describe the bounds of a gain (dB) in words."""
     if low < 0 < high:
         return f"{-low:.1f} dB farther to {high:.1f} dB closer"
-    least, most = sorted((low, high), key=abs)
-    return f"{abs(least):.1f} to {_nearer(most)}"
+    smaller, larger = sorted((low, high), key=abs)
+    return f"{abs(smaller):.1f} to {_closer_or_farther(larger)}"
 
 
-def _nearer(gain: float) -> str:
+def _closer_or_farther(gain: float) -> str:
     """Return a gain (dB) as "closer" or "farther"."""
     return f"{abs(gain):.1f} dB {'closer' if gain >= 0 else 'farther'}"
 
@@ -168,7 +173,7 @@ def speed(data: ViewData, place: int = 1) -> float | None:
 
 
 def speed_words(ratio: float | None) -> str:
-    """Return the end of the headline, with one digit from a ratio of 3 on; "" if a result is not clearly faster."""
+    """Return the end of the headline, rounded to one digit from 3 on; "" if a result is not clearly faster."""
     if ratio is None or ratio < FASTER:
         return ""
     times = f"about {float(f'{ratio:.1g}'):.0f}" if ratio >= 3 else f"{ratio:.1f}"
@@ -191,11 +196,11 @@ class Figure:
     label: str
     old: str
     new: str
-    mark: str  # CSS class: "up" if better than the scene's, "own" if fits have seen the photos, otherwise ""
+    mark: str  # CSS class: "up" if better than the scene, "own" if the figure is over photos of the fit, otherwise ""
 
 
 def figures(data: ViewData, place: int) -> list[Figure]:
-    """Collect the figures at the top for one side: its size and mean quality."""
+    """Collect the figures at the top of the page for one side: its size and mean quality."""
     before, after = data.sides[0], data.sides[place]
     sizes = [
         Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", ""),
@@ -209,13 +214,10 @@ def figures(data: ViewData, place: int) -> list[Figure]:
         label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that the input covers"
         qualities.append((label, "psnr", before.covered, after.covered))
     scores = []
-    for label, name, *pair in qualities:
-        digits, unit = (2, " dB") if name == "psnr" else (3, "")
-        old, new = (getattr(quality, name) for quality in pair)
+    for label, name, old_quality, new_quality in qualities:
         if any(getattr(side.mean, name) is not None for side in data.sides[1:] or data.sides):
-            better = place > 0 and old is not None and new is not None and old < new
-            mark = "own" if own else "up" if better else ""
-            scores.append(Figure(label, _number(old, digits), _number(new, digits) + unit, mark))
+            old, new = getattr(old_quality, name), getattr(new_quality, name)
+            scores.append(_score_figure(label, name, old, new, own=own, is_result=place > 0))
     if is_expected:
         gain = after.new_gain
         words = NONE if gain is None else "{:+.1f} to {:+.1f} dB".format(*gain)
@@ -223,8 +225,15 @@ def figures(data: ViewData, place: int) -> list[Figure]:
     return sizes + (scores if data.scored else [])
 
 
+def _score_figure(label: str, name: str, old: float | None, new: float | None, *, own: bool, is_result: bool) -> Figure:
+    """Format a mean score ``name`` of the scene and of one side."""
+    digits, unit = (2, " dB") if name == "psnr" else (3, "")
+    is_better = is_result and old is not None and new is not None and old < new
+    return Figure(label, _number(old, digits), _number(new, digits) + unit, "own" if own else "up" if is_better else "")
+
+
 def reference_words(data: ViewData) -> tuple[str, bool]:
-    """Describe the pictures that scores compare with; also return whether they are own photos, which fits have seen."""
+    """Describe the reference of the scores; also return whether it is the scene's own photos, used in the fit."""
     if data.held_out:
         return "held-out photos", False
     return ("its own photos", True) if data.reference == PHOTOS else (data.reference, False)

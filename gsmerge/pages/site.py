@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.resources import files
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -31,14 +31,14 @@ POLICY = (
     " worker-src data: blob:; connect-src 'self' data: blob:"
 )
 NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "poster": "poster.webp", "licences": "LICENSES.txt"}
-MAX_VIEWS = 64  # largest number of viewpoints that the page knows
-REST = 43_000  # bytes of a page without the viewer: scripts, licences, and picture and textures of one Gaussian
-LONGEST_TITLE = 255  # largest number of bytes of a title, which is the name of a file
+MAX_VIEWS = 64  # largest number of viewpoints in the page
+REST = 43_000  # least bytes of a page without viewer: scripts, licences, and picture and textures of one Gaussian
+LONGEST_TITLE = 255  # bytes; a title is a file name
 LICENSED = ("spark", "three", "fflate")
 
 
 def files_beside(page: Path, apart: bool) -> tuple[Path, ...]:
-    """Return the paths of the files beside a page; none if the page holds all, that is, if it is not ``apart``."""
+    """Return the paths of the files beside a page that is ``apart`` from its scene; none if the page contains all."""
     return tuple(page.with_name(name) for name in NAMES.values() if apart)
 
 
@@ -63,6 +63,13 @@ def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> 
     return len(site_contents(gaussians, cameras, "x" * LONGEST_TITLE, comments, apart=False)[0].encode())
 
 
+def _read_licences() -> bytes:
+    """Join the licences of the viewer's parts to one text."""
+    vendor = resources.files("gsmerge.pages").joinpath("vendor")
+    texts = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]
+    return "\n\n".join(texts).encode()
+
+
 def site_contents(
     gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str], *, apart: bool
 ) -> tuple[str, dict[str, bytes]]:
@@ -70,29 +77,28 @@ def site_contents(
 
     Without cameras viewpoints are placed, and the user may look from any side.
     """
-    scene, expected = sog_bytes(gaussians, comments), read_new_views(comments)
+    expected = read_new_views(comments)
     is_free = len(cameras) == 0
-    shown = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
-    middle = 0 if is_free else median_camera(shown)  # the first placed viewpoint is outside
-    poster = encode_still(to_picture(render(gaussians.numpy(), shown[[middle]]).images[0]))
-    views = sorted({*even_views(len(shown), min(len(shown), MAX_VIEWS)), middle})
-    support = np.minimum(count_views_in_world(gaussians.numpy(), shown[views]), MAX_SUPPORT).astype(np.uint8)
-    vendor = files("gsmerge.pages").joinpath("vendor")
-    licences = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]
-    notice, engine = "\n\n".join(licences).encode(), VIEWER.read_bytes()
-    contents = dict(zip(NAMES.values(), (scene, engine, poster, notice), strict=True))
+    viewpoints = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
+    start = 0 if is_free else median_camera(viewpoints)  # the first placed viewpoint is outside
+    poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]]).images[0]))
+    views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWS)), start})
+    support = np.minimum(count_views_in_world(gaussians.numpy(), viewpoints[views]), MAX_SUPPORT).astype(np.uint8)
+    licences = _read_licences()
+    files = (sog_bytes(gaussians, comments), VIEWER.read_bytes(), poster, licences)
+    contents = dict(zip(NAMES.values(), files, strict=True))
     page = render_template(
         "site.html", policy=POLICY, title=title, count=len(gaussians), names=NAMES, apart=apart,
         poster=NAMES["poster"] if apart else data_uri(poster, "image/webp"),
-        licences=NAMES["licences"] if apart else data_uri(notice, "text/plain"),
+        licences=NAMES["licences"] if apart else data_uri(licences, "text/plain"),
         inside={} if apart else {NAMES[name]: base64_text(contents[NAMES[name]]) for name in ("engine", "scene")},
         gain=None if expected is None else describe_gain(*expected.bounds),
         download=f"{title}.sog",
         support=base64_text(pack_support(support[file_order(gaussians)])) if (support == 0).any() else None,
         json_data={
-            "names": NAMES, "free": is_free, "start": views.index(middle),
+            "names": NAMES, "free": is_free, "start": views.index(start),
             "views": [
-                camera_numbers(shown[[view]], middle_depth(gaussians.means, shown[[view]])) for view in views
+                camera_numbers(viewpoints[[view]], middle_depth(gaussians.means, viewpoints[[view]])) for view in views
             ],
         },
     )  # fmt: skip

@@ -26,7 +26,7 @@ from gsmerge.scene.read import as_scene
 from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
 
 MAX_SOLID = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
-HEIGHT = 820  # of a page in a notebook, pixels
+HEIGHT = 820  # height of a page in a notebook, pixels
 
 
 @dataclass(frozen=True, repr=False)
@@ -66,10 +66,12 @@ def view(
     """Show a scene, alone or beside results: photos, a swipe, 3D and scores, as ``gsmerge view`` does.
 
     Args:
-        scene: A scene from :func:`gsmerge.read_scene`, or the path that it reads. results: Results of the scene by
-        name, or one result: from :func:`gsmerge.compact`, Gaussians, or paths of files. held_out: Views with photos
-        that were not part of the input, for scores. light: Show the scene itself in stills only; None: if it has more
-        than 600,000 Gaussians. progress: Called with (name of the step, number done, total).
+        scene: A scene from :func:`gsmerge.read_scene`, or the path that it reads.
+        results: Results of the scene by name, or one result: from :func:`gsmerge.compact`, Gaussians, or paths of
+            files.
+        held_out: Views with photos that were not part of the input, for scores.
+        light: Show the scene itself in stills only; None: if it has more than 600,000 Gaussians.
+        progress: Called with (name of the step, number done, total).
 
     Returns:
         A page, which a notebook shows if it is the last value of a cell. ``save(path)`` writes it as one ``.html``
@@ -84,24 +86,24 @@ def view(
     with record_run(progress):
         read = as_scene(scene).numpy()
         shown = add_views(read, shown=True)
-    given = results if isinstance(results, Mapping) else {} if results is None else {"result": results}
-    files = {name: read_gaussians(value) for name, value in given.items() if isinstance(value, str | PathLike)}
-    loaded: dict[str, Any] = {**given, **files}
-    gaussians = {name: own_gaussians(value) for name, value in loaded.items()}
+    named = results if isinstance(results, Mapping) else {} if results is None else {"result": results}
+    files = {name: read_gaussians(path) for name, path in named.items() if isinstance(path, str | PathLike)}
+    loaded: dict[str, Any] = {**named, **files}
+    gaussians = {name: own_gaussians(result) for name, result in loaded.items()}
     gains = file_gains(files) | {
         name: expected.bounds
-        for name, value in given.items()
-        if (expected := getattr(getattr(value, "report", None), "new_views", None)) is not None
+        for name, result in named.items()
+        if (expected := getattr(getattr(result, "report", None), "new_views", None)) is not None
     }
     cameras = {
         name: replace(shown.cameras, viewmats=moved.numpy().viewmats)
-        for name, value in given.items()
-        if (moved := getattr(value, "cameras", None)) is not None and len(moved) == len(shown) == len(read)
+        for name, result in named.items()
+        if (moved := getattr(result, "cameras", None)) is not None and len(moved) == len(shown) == len(read)
     }
     is_light = len(read.gaussians) > MAX_SOLID if light is None else light
     data = collect(
         scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
-        [_num_bytes(scene), *(_num_bytes(files.get(name, value)) for name, value in given.items())], held_out,
+        [_num_bytes(scene), *(_num_bytes(result) for result in loaded.values())], held_out,
         cameras=cameras, new_gains=gains, light=is_light, progress=progress or (lambda *_: None),
     )  # fmt: skip
     return Page(view_page(data), headline(data))
@@ -114,7 +116,7 @@ def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, floa
 
 
 def _num_bytes(value: Any) -> int:
-    """Return the bytes of a scene's files or of a file that was read; for other Gaussians those of a ``.ply``."""
+    """Return the bytes of a scene's files, or of a file that was read; for other Gaussians, of a ``.ply`` of them."""
     if isinstance(value, GaussianFile):
         return value.info.file_bytes
     if isinstance(value, str | PathLike):

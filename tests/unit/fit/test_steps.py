@@ -80,8 +80,8 @@ def assert_same(first: FitState, second: FitState) -> None:
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_bits_are_those_of_the_slow_twin(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     if case.is_crowded:
-        monkeypatch.setattr(tiled_view, "MANY", 0)
-        monkeypatch.setattr(tiled_view, "MANY_EACH", 0)
+        monkeypatch.setattr(tiled_view, "CROWDED", 0)
+        monkeypatch.setattr(tiled_view, "CROWDED_EACH", 0)
     expected, errors, twin = take_steps(case, step_slowly)
     assert not np.array_equal(expected.x, case.state().x)
     for threads in (1, 2, 5):
@@ -109,9 +109,9 @@ def test_cut_lists_are_shorter_and_change_nothing(monkeypatch: pytest.MonkeyPatc
     near, wide = np.tile(0.2 * truth.means.mean(0), (5, 1)), np.full((5, 3), 5 * np.ptp(truth.means), np.float32)
     curtains = replace(truth[:5], means=near, scales=wide, opacities=np.full(5, 0.999, np.float32))
     run, hidden = Case().run(), Gaussians.concat([truth, curtains])
-    monkeypatch.setattr(tiled_view, "MANY_EACH", 0)
-    for many in (tiled_view.MANY, 0):
-        monkeypatch.setattr(tiled_view, "MANY", many)
+    monkeypatch.setattr(tiled_view, "CROWDED_EACH", 0)
+    for many in (tiled_view.CROWDED, 0):
+        monkeypatch.setattr(tiled_view, "CROWDED", many)
         optimiser, state = make_optimiser(run), start_state(hidden)
         optimiser.step(state, Schedule(run).draw(1, 0.0, len(hidden)))
         ((table, _),) = optimiser.buffers.tables.values()

@@ -192,7 +192,7 @@ def test_rows_of_pixels_have_depths(actual: ViewData, scene: Scene) -> None:
 
 def test_many_gaussians_are_less_exact(half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
     exact, _ = pack_splats(half)
-    monkeypatch.setattr(splats, "MANY", len(half) - 1)
+    monkeypatch.setattr(splats, "COARSE_COUNT", len(half) - 1)
     coarse, _ = pack_splats(half)
     assert len(coarse or b"") < 0.9 * len(exact or b"")
     (_, fine), (head, rough) = unpacked(exact), unpacked(coarse)
