@@ -1,8 +1,8 @@
-"""List captures, the scenes of a dataset, and read their cameras and photos; they have no Gaussians.
+"""List the captures of a dataset, and read their cameras and photos. A capture is a scene without Gaussians.
 
-A dataset is a folder with a folder for each scene (DL3DV: ``transforms.json``, also below ``nerfstudio/``; Mip-NeRF
-360: ``sparse/0`` and ``images_4/``). Or it is a dataset of pixelSplat, with ``index.json`` and ``.torch`` chunks
-(RE10K, ACID).
+A dataset is a folder with a folder for each scene. DL3DV has ``transforms.json``, also below ``nerfstudio/``. Mip-NeRF
+360 has ``sparse/0`` and ``images_4/``. A dataset of pixelSplat (RE10K, ACID) has ``index.json`` and ``.torch`` chunks
+instead.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from gsmerge.types import StrPath, Views
 
 INDEX = "index.json"  # lists the chunk of each scene
 CAMERA_PLACES = ("transforms.json", "nerfstudio/transforms.json", "sparse/0", "colmap/sparse/0", "cameras.json")
-PHOTO_PLACES = ("images_4", "images_8", "images_2", *IMAGE_PLACES)  # smaller ones first: models look at less
+PHOTO_PLACES = ("images_4", "images_8", "images_2", *IMAGE_PLACES)  # smaller photos first, since models reduce them
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A scene of a dataset, as the paths of its cameras and photos; nothing of it is in memory."""
+    """A scene of a dataset, as the paths of its cameras and photos; neither is in memory."""
 
     name: str
     path: Path  # path of the cameras: a file, a COLMAP folder, or a chunk that has the photos as well
@@ -82,6 +82,7 @@ def _read_index(root: Path) -> Mapping[str, str]:
 
 
 def _find(root: Path, name: str, chunks: Mapping[str, str]) -> Capture | None:
+    """Find a capture by name, in the chunks if there are any; None if it has no cameras."""
     if chunks:
         return Capture(name, root / chunks[name], root / chunks[name]) if name in chunks else None
     folder = root / name
@@ -92,5 +93,8 @@ def _find(root: Path, name: str, chunks: Mapping[str, str]) -> Capture | None:
     return Capture(name, path, next((place for place in places if place.is_dir()), None))
 
 
-def _missing(root: Path, what: str) -> SceneError:
-    return SceneError(root, f"expected {what} {', '.join(CAMERA_PLACES)}, or {INDEX} and {CHUNK} chunks, found none")
+def _missing(root: Path, expected: str) -> SceneError:
+    """Make the error for a dataset without captures, or without a named capture."""
+    return SceneError(
+        root, f"expected {expected} {', '.join(CAMERA_PLACES)}, or {INDEX} and {CHUNK} chunks, found none"
+    )

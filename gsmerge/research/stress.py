@@ -1,4 +1,4 @@
-"""Stress test: compact a scene under bad conditions, with worse views, poses, photos or rows.
+"""Compact a scene under bad conditions: with worse views, poses, photos or rows.
 
 A case defines how a scene is changed, which scenes it applies to, and the property that must hold. Every change returns
 a new scene, and also changes the views that results are compared with.
@@ -41,13 +41,13 @@ PROPERTIES: dict[Check, str] = {
     "bits": "the same result, bit for bit",
     "again": "compacted again to the same count, not more than {same:g} dB below",
 }
-SEED = 7  # of all random choices
+SEED = 7  # seed of all random choices
 FAR_SHARE, FAR_FACTOR = 2.5e-5, 1000.0  # share of the Gaussians that are moved far away, and the factor
 LARGE_SHARE, LARGE_FACTOR = 0.01, 8.0  # share of the Gaussians that are enlarged, and the factor
 BROKEN_SHARE = 0.01  # share of the rows that become NaN
 MAX_WORSE = 0.1  # dB by which a result may be below its input
-MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB by which the result of a changed scene may be below that of the unchanged scene
-FIT_SLACK = 1.0  # dB of additional tolerance after a full fit, since rounding changes thin structures by as much
+MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that the result of a changed scene may lose compared with the unchanged scene
+FIT_SLACK = 1.0  # additional tolerance after a full fit, dB, since rounding changes thin structures by up to this
 SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference, and largest ratio, of counts
 _QUICK = EvaluateOptions(lpips=(), fog=False)
 _FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -108,34 +108,34 @@ def change_exposure(setup: StressScene, share: float) -> StressScene:
 def break_rows(setup: StressScene) -> StressScene:
     """Break some rows, as if the file had NaN there."""
     scene = setup.scene
-    chosen = _choose(len(scene.gaussians), BROKEN_SHARE)
-    return replace(setup, scene=take_rows(scene, np.flatnonzero(~chosen)))
+    is_broken = _mark_share(len(scene.gaussians), BROKEN_SHARE)
+    return replace(setup, scene=take_rows(scene, np.flatnonzero(~is_broken)))
 
 
 def multiply(setup: StressScene, column: Literal["means", "scales"], share: float, factor: float) -> StressScene:
     """Multiply the means or the scales of a random share of the Gaussians by a factor."""
     gaussians = setup.scene.gaussians
-    values, chosen = getattr(gaussians, column), _choose(len(gaussians), share)[:, None]
-    changed = replace(gaussians, **{column: np.where(chosen, factor * values, values)})
+    values, is_changed = getattr(gaussians, column), _mark_share(len(gaussians), share)[:, None]
+    changed = replace(gaussians, **{column: np.where(is_changed, factor * values, values)})
     return replace(setup, scene=replace(setup.scene, gaussians=changed))
 
 
-def _choose(count: int, share: float) -> np.ndarray:
+def _mark_share(count: int, share: float) -> np.ndarray:
     """Mark a random share of the rows, ``[count]`` bool, at least one."""
-    chosen = np.zeros(count, bool)
-    chosen[np.random.default_rng(SEED).choice(count, max(1, round(share * count)), replace=False)] = True
-    return chosen
+    marked = np.zeros(count, bool)
+    marked[np.random.default_rng(SEED).choice(count, max(1, round(share * count)), replace=False)] = True
+    return marked
 
 
 @dataclass(frozen=True)
 class Case:
     """One bad condition to test compaction under."""
 
-    name: str  # on the command line
+    name: str  # name on the command line
     words: str  # description of the change
     check: Check  # name of the property that must hold, see ``PROPERTIES``
     needs: Needs = "anything"  # "pixels": one Gaussian per pixel; "photos": that and photos
-    # returns the changed scene; None: the scene does not change, but the run does
+    # function that returns the changed scene; None: the scene stays, and the run differs
     change: Callable[[StressScene], StressScene] | None = None
     threads: int | None = None  # threads of the run; None: as in the options
 
@@ -176,7 +176,7 @@ CASES: dict[str, Case] = {
 class StressOutcome:
     """Outcome of one case."""
 
-    case: str  # its name
+    case: str  # name of the case
     words: str  # how the scene was changed
     wanted: str  # the property that must hold
     held: bool | None  # True if it holds; None if the case does not apply to the scene
@@ -217,7 +217,7 @@ def stress(
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
     options = options or CompactOptions()
-    report, slack = progress or (lambda *_: None), _slack(options)
+    report, slack = progress or (lambda *_: None), _fit_slack(options)
     limits = {"same": MAX_SAME + slack, "near": MAX_NEAR + slack, "worse": MAX_WORSE}
     setup = StressScene(scene, targets)
     base = _run(setup, options)
@@ -233,7 +233,7 @@ def stress(
 
 
 def _check_case(case: Case, setup: StressScene, base: _Result, options: CompactOptions) -> tuple[bool | None, str]:
-    """Check if the property of a case holds; return the answer and the figures."""
+    """Check if the property of a case holds; return the answer, None if the case does not apply, and the figures."""
     if case.needs != "anything" and not setup.scene.has_own_pixels:
         return None, "needs a Gaussian for each pixel"
     if case.needs == "photos" and setup.scene.images is None:
@@ -247,10 +247,11 @@ def _check_case(case: Case, setup: StressScene, base: _Result, options: CompactO
     except (GsmergeError, ValueError) as error:  # a case that fails must not end the others
         return False, f"ended with: {error}"
     defect = _find_defect(result.gaussians, changed.scene)
-    return (False, defect) if defect else _check_result(case, base, result, _slack(options))
+    return (False, defect) if defect else _check_result(case, base, result, _fit_slack(options))
 
 
 def _run(setup: StressScene, options: CompactOptions) -> _Result:
+    """Compact a scene, and score the input and the result."""
     result = compact(setup.scene, options)
     count = len(result.gaussians) + result.report.choices.get("pruned", 0)
     return _Result(result.gaussians, count, *_quality(setup, result.gaussians))
@@ -264,12 +265,13 @@ def _quality(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
     return (math.inf if before is None else before), (math.nan if after is None else after)
 
 
-def _slack(options: CompactOptions) -> float:
+def _fit_slack(options: CompactOptions) -> float:
+    """Return the additional tolerance (dB) of results with these options."""
     return FIT_SLACK if options.fit.fit == "full" else 0.0
 
 
 def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> tuple[bool, str]:
-    count, former = result.count, base.count
+    """Compare a result with its own input, or with the result ``base`` of the unchanged scene."""
     figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
     both = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
     if case.check == "better":
@@ -277,20 +279,24 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
             return True, f"{figures} against renders of the input"
         return result.after >= result.before - MAX_WORSE, f"{figures}; its input {result.before:.2f} dB"
     if case.check == "bits":
-        same = all(np.array_equal(getattr(base.gaussians, n), getattr(result.gaussians, n)) for n in _FIELDS)
-        return same, "equal" if same else f"differs: {both}"
-    fits = {"once": count <= ONCE_COUNT * former, "same": abs(count - former) <= max(1, SAME_COUNT * former)}
-    most = MAX_NEAR if case.check == "near" else MAX_SAME
-    return fits.get(case.check, True) and result.after >= base.after - most - slack, both
+        equal = all(np.array_equal(getattr(base.gaussians, n), getattr(result.gaussians, n)) for n in _FIELDS)
+        return equal, "equal" if equal else f"differs: {both}"
+    count_holds = {
+        "once": result.count <= ONCE_COUNT * base.count,
+        "same": abs(result.count - base.count) <= max(1, SAME_COUNT * base.count),
+    }
+    max_loss = MAX_NEAR if case.check == "near" else MAX_SAME
+    return count_holds.get(case.check, True) and result.after >= base.after - max_loss - slack, both
 
 
 def _check_again(setup: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
     """Compact the result as a new scene, to as many Gaussians as it has, and check that it does not get worse."""
     scene = setup.scene
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)
-    once = replace(options, budget=BudgetOptions(budget=len(base.gaussians)), decode=replace(options.decode, k=1))
-    after = _quality(setup, compact(unaligned, once).gaussians)[1]
-    return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
+    same_count = BudgetOptions(budget=len(base.gaussians))
+    settings = replace(options, budget=same_count, decode=replace(options.decode, k=1))
+    after = _quality(setup, compact(unaligned, settings).gaussians)[1]
+    return after >= base.after - MAX_SAME - _fit_slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
 
 
 def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:

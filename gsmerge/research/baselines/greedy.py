@@ -30,7 +30,7 @@ NEIGHBORS = 10  # with 16 a real capture gains 0.03 dB, in 1.5 times the time
 COLOR_WEIGHT = 1.0  # weight of squared distances of harmonics against nats
 AREA_EXPONENT = 1.6075  # of Thomsen's formula for the area of an ellipsoid
 CHUNK = 65536  # Gaussians per piece of work
-UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # rows and columns of the upper triangle of a covariance
 
 
 def areas(scales: np.ndarray) -> Floats:
@@ -49,11 +49,11 @@ def log_determinants(covars: Floats) -> Floats:
 def pair_costs(cloud: Cloud, left: Ints, right: Ints) -> Floats:
     """Compute the costs ``[m]`` of merging pairs: Runnalls' bound per mass plus the squared distance of harmonics."""
     masses, covars = cloud.masses.astype(np.float64), cloud.covars.astype(np.float64)
-    p = (masses[left] / (masses[left] + masses[right]))[:, None]
-    apart = cloud.means[left] - cloud.means[right]
-    outer = np.stack([apart[:, i] * apart[:, j] for i, j in UPPER], 1)
-    merged = p * covars[left] + (1 - p) * covars[right] + p * (1 - p) * outer
-    before = p[:, 0] * log_determinants(covars[left]) + (1 - p[:, 0]) * log_determinants(covars[right])
+    share = (masses[left] / (masses[left] + masses[right]))[:, None]  # of the pair's mass in its left Gaussian
+    offsets = cloud.means[left] - cloud.means[right]
+    outer = np.stack([offsets[:, i] * offsets[:, j] for i, j in UPPER], 1)
+    merged = share * covars[left] + (1 - share) * covars[right] + share * (1 - share) * outer
+    before = share[:, 0] * log_determinants(covars[left]) + (1 - share[:, 0]) * log_determinants(covars[right])
     return 0.5 * (log_determinants(merged) - before) + COLOR_WEIGHT * ((cloud.sh[left] - cloud.sh[right]) ** 2).sum(1)
 
 
@@ -63,59 +63,59 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 
     with use_threads() as threads:
         tree = cKDTree(cloud.means, balanced_tree=False, compact_nodes=False)
-        _, near = tree.query(cloud.means, min(NEIGHBORS + 1, len(cloud)), workers=threads)
-    near = near.astype(np.int32)
+        _, nearest = tree.query(cloud.means, min(NEIGHBORS + 1, len(cloud)), workers=threads)
+    nearest = nearest.astype(np.int32)
 
-    def piece(first: int) -> tuple[Ints, Ints, Floats]:
-        chunk = near[first : first + CHUNK]
-        rows = np.repeat(np.arange(first, first + len(chunk)), chunk.shape[1])
+    def chunk_pairs(start: int) -> tuple[Ints, Ints, Floats]:
+        chunk = nearest[start : start + CHUNK]
+        rows = np.repeat(np.arange(start, start + len(chunk)), chunk.shape[1])
         neighbors = chunk.reshape(-1).astype(np.int64)
-        candidates = (neighbors <= rows).nonzero()[0]  # the row itself, or pairs that the other row may list too
-        twice = (near[neighbors[candidates]] == rows[candidates, None]).any(1)
+        candidates = (neighbors <= rows).nonzero()[0]  # the row itself, or pairs that the lower row may list too
+        is_repeat = (nearest[neighbors[candidates]] == rows[candidates, None]).any(1)
         keep = np.ones(len(rows), bool)
-        keep[candidates[twice | (neighbors[candidates] == rows[candidates])]] = False
+        keep[candidates[is_repeat | (neighbors[candidates] == rows[candidates])]] = False
         left, right = np.minimum(rows, neighbors)[keep], np.maximum(rows, neighbors)[keep]
         return left, right, pair_costs(cloud, left, right)
 
-    parts = parallel_map(piece, range(0, len(cloud), CHUNK))
-    left, right, costs = (np.concatenate(column) for column in zip(*parts, strict=True))
+    chunks = parallel_map(chunk_pairs, range(0, len(cloud), CHUNK))
+    left, right, costs = (np.concatenate(column) for column in zip(*chunks, strict=True))
     return left, right, costs
 
 
 def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Ints:
     """Choose at most ``limit`` disjoint pairs greedily, by ascending cost ``[m]``.
 
-    A pair that is the cheapest of both its members is always chosen. So all such pairs are chosen at once, and then
-    again among the remaining pairs. Of equal costs the first pair counts as cheaper. Returns indices of pairs, by
-    ascending cost.
+    A pair that is the cheapest pair of both its members is always chosen. So all such pairs are chosen at once, and the
+    search is repeated among the remaining pairs. Of pairs with equal costs the first counts as cheaper. Returns indices
+    of pairs, by ascending cost.
     """
     order = np.argsort(costs, kind="stable")
     left, right, ranks = left[order], right[order], np.arange(len(order))
-    first = np.empty(1 + int(right.max(initial=0)), np.int64)
-    taken, chosen = np.zeros(len(first), bool), np.empty(0, np.int64)
+    cheapest = np.empty(1 + int(right.max(initial=0)), np.int64)  # rank of the cheapest remaining pair of each Gaussian
+    is_merged, disjoint = np.zeros(len(cheapest), bool), np.empty(0, np.int64)
     while len(ranks):
         ends = np.stack([left[ranks], right[ranks]], 1)
-        first[ends[::-1].reshape(-1)] = np.repeat(ranks[::-1], 2)  # the cheapest pair is written last
-        best = ranks[(first[ends] == ranks[:, None]).all(1)]
-        taken[left[best]] = taken[right[best]] = True
-        chosen = np.sort(np.concatenate([chosen, best]))[:limit]
-        ranks = ranks[~taken[ends].any(1)]
-        if len(chosen) == limit:
-            ranks = ranks[ranks < chosen[-1]]
-    return order[chosen]
+        cheapest[ends[::-1].reshape(-1)] = np.repeat(ranks[::-1], 2)  # the cheapest pair is written last
+        best = ranks[(cheapest[ends] == ranks[:, None]).all(1)]
+        is_merged[left[best]] = is_merged[right[best]] = True
+        disjoint = np.sort(np.concatenate([disjoint, best]))[:limit]
+        ranks = ranks[~is_merged[ends].any(1)]
+        if len(disjoint) == limit:
+            ranks = ranks[ranks < disjoint[-1]]
+    return order[disjoint]
 
 
 def reduce_to(cloud: Cloud, count: int) -> Cloud:
     """Merge pairs in rounds until at most ``count`` Gaussians are left.
 
     A round merges as many pairs as possible. With fewer pairs per round cheap regions grow while the rest remains
-    unmerged, and renders are worse: on a real capture by 0.6 dB with a third of the Gaussians per round, and by 1.6 dB
-    with a sixth.
+    unmerged, and renders are worse. On a real capture they are worse by 0.6 dB with a third of the Gaussians per round,
+    and by 1.6 dB with a sixth.
     """
     while len(cloud) > max(count, 1):
         left, right, costs = neighbor_pairs(cloud)
-        chosen = cheapest_disjoint(left, right, costs, len(cloud) - count)
-        cloud = merge_rows(cloud, np.stack([left[chosen], right[chosen]], 1).astype(np.int32))
+        pairs = cheapest_disjoint(left, right, costs, len(cloud) - count)
+        cloud = merge_rows(cloud, np.stack([left[pairs], right[pairs]], 1).astype(np.int32))
     return cloud
 
 
@@ -130,7 +130,7 @@ def merge(gaussians: Gaussians, count: int) -> Gaussians:
 
 
 def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge to exactly ``count`` Gaussians; return the input if it has no more than that."""
+    """Merge to exactly ``count`` Gaussians; return the input if it has at most ``count``."""
     gaussians = prepared.scene.file_gaussians
     if len(gaussians) <= count:
         return gaussians

@@ -44,9 +44,10 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def prune(importance: Callable[[Gaussians, Cameras], np.ndarray], prepared: Prepared, _: Plan, count: int) -> Gaussians:
-    """Keep the ``count`` Gaussians with the largest ``importance [n]``, unchanged and in order; first ones if equal.
+    """Keep the ``count`` Gaussians with the largest ``importance [n]``, unchanged and in order.
 
-    The importance is, for example, the opacity or the contribution to the views (Mini-Splatting).
+    Of Gaussians with equal importance the first are kept. The importance is, for example, the opacity or the
+    contribution to the views (Mini-Splatting).
     """
     gaussians = prepared.scene.file_gaussians
     with stage("reduce"):
@@ -59,13 +60,13 @@ def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     splats = make_splats(gaussians)
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
-    def one_view(view: int) -> np.ndarray:
+    def view_weights(view: int) -> np.ndarray:
         sums, _ = contributions(tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height))
         return sums
 
-    total, step = np.zeros(len(splats)), max(1, MAX_TILED // max(len(splats), 1))
-    for first in range(0, len(cameras), step):
-        for sums in parallel_map(one_view, range(first, min(first + step, len(cameras)))):
+    total, num_tiled = np.zeros(len(splats)), max(1, MAX_TILED // max(len(splats), 1))
+    for start in range(0, len(cameras), num_tiled):
+        for sums in parallel_map(view_weights, range(start, min(start + num_tiled, len(cameras)))):
             total += sums
     return total
 
@@ -81,15 +82,15 @@ def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 def merge_superpixels(
     segmentation: str, rule: Literal["depth", "paper"], prepared: Prepared, plan: Plan, count: int
 ) -> Gaussians:
-    """Merge each superpixel into one Gaussian, without matching across views; all views have equally many superpixels.
+    """Merge each superpixel into one Gaussian, without matching across views.
 
-    Empty superpixels are left out. The ``rule`` "paper" is the paper's baseline without a network ("Mom. Match."): the
-    opacity-weighted mean and covariance of the members' means (eq. teacher_mean, teacher_cov). The paper states no
-    opacity, so the mean opacity of the members is used.
+    All views have equally many superpixels, up to one. Empty superpixels are left out. The ``rule`` "paper" is the
+    paper's baseline without a network ("Mom. Match."). It takes the opacity-weighted mean and covariance of the
+    members' means (eq. teacher_mean, teacher_cov). The paper states no opacity, so the members' mean opacity is used.
     """
     scene = prepared.scene
-    each, more = divmod(count, len(scene))
-    counts = [min(scene.pixels_per_view, each + (view < more)) for view in range(len(scene))]
+    quotient, remainder = divmod(count, len(scene))  # the first views have one superpixel more
+    counts = [min(scene.pixels_per_view, quotient + (view < remainder)) for view in range(len(scene))]
     with stage("segment"):
         pictures, views = scene.images, range(len(scene))
         labels = parallel_map(lambda view: superpixels(pictures[view], counts[view], segmentation), views)
@@ -103,8 +104,8 @@ def merge_superpixels(
 def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Merge with PlayCanvas' splat-transform, an installed program: ``-d COUNT`` on the CPU, with its own defaults.
 
-    The input is returned if it has at most ``count`` Gaussians. Nothing is downloaded. The measured time is that of the
-    program with its start-up, without the transfer of Gaussians.
+    The input is returned if it has at most ``count`` Gaussians. Nothing is downloaded. The measured time includes the
+    start of the program, but not the transfer of Gaussians.
     """
     gaussians = prepared.scene.file_gaussians
     if len(gaussians) <= count:

@@ -1,8 +1,8 @@
 """Merge by AnySplat's rule (Jiang et al. 2025): one Gaussian for each voxel, a softmax-weighted mean of its Gaussians.
 
-The means are those of the parameters that a network outputs: logarithms of scales, and logits of opacities. AnySplat's
-weights are the softmax of a confidence that no file stores; it is replaced by the opacity. The size of the voxels is
-found by bisection, so that the count is met from below.
+Averages are taken of the parameters that a network outputs, such as logarithms of scales and logits of opacities.
+AnySplat's weights are the softmax of a confidence. No file stores it, so the opacity replaces it. Bisection finds the
+size of the voxels. The result has at most the requested count.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ def voxel_size(means: np.ndarray, count: int) -> float:
         return 1 + int((keys[1:] != keys[:-1]).sum())
 
     extent = float(np.abs(means).max(initial=0))
-    fine, coarse = FINEST, max(FINEST, float(log(4 * extent) / log(2))) if extent > 0 else FINEST  # coarse: all in one
+    fine = coarse = FINEST  # octaves
+    if extent > 0:
+        coarse = max(FINEST, float(log(4 * extent) / log(2)))  # one voxel has all Gaussians
     if occupied(fine) <= count:
         return float(power(2, fine))
     while coarse - fine > PRECISION:
@@ -61,20 +63,20 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
     count = int(cells.max(initial=-1)) + 1
     total = np.bincount(cells, weights, count)
 
-    def mean(values: np.ndarray) -> np.ndarray:
+    def average(values: np.ndarray) -> np.ndarray:
         flat = values.reshape(len(values), -1)
         columns = [np.bincount(cells, weights * column, count) / total for column in flat.T]
         return np.stack(columns, 1).reshape(count, *values.shape[1:]) if columns else values[:count]
 
     bounded = opacities.clip(MIN_OPACITY, 1 - MIN_OPACITY)
-    _, axes = eigh(mean(quats[:, :, None] * quats[:, None]))
+    _, axes = eigh(average(quats[:, :, None] * quats[:, None]))
     arrays = (
-        mean(means),
+        average(means),
         axes[:, :, -1],
-        exp(mean(log(scales.clip(MIN_SCALE)))),
-        1 / (1 + exp(-mean(log(bounded / (1 - bounded))))),
-        mean(sh0),
-        mean(shN),
+        exp(average(log(scales.clip(MIN_SCALE)))),
+        1 / (1 + exp(-average(log(bounded / (1 - bounded))))),
+        average(sh0),
+        average(shN),
     )
     return Gaussians(*(array.astype(np.float32) for array in arrays))
 

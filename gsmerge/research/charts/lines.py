@@ -15,13 +15,13 @@ from gsmerge.research.charts.measure_run import INPUT, RunRecord
 from gsmerge.settings.compact import OURS
 
 LEVEL = 0.95  # confidence of the intervals
-MIN_SCENES = 3  # least number of scenes of an interval; that of two scenes is too wide to be useful
+MIN_SCENES = 3  # least number of scenes of an interval; with two scenes an interval is too wide to be useful
 MIN_SHARE = 0.5  # share of the scenes that every point of a line must have
-MIN_SHARE_VIEWS = 0.4  # the same for figures over the number of views, since not all scenes have as many views
+MIN_SHARE_VIEWS = 0.4  # the same share in figures over the number of views, since some scenes have few views
 TYPICAL_RATIO = 0.044  # typical share of the Gaussians; the runs nearest to it represent all sizes
 SIZES = ("budget", "superpixels")  # settings that define the number of Gaussians
 ONE_SIZE = ("unmerged", "unmerged-fit")  # methods that keep all Gaussians
-PARTS = {  # views and pixels that scores are means over, the most meaningful first
+PARTS = {  # views and pixels over which scores are averaged; the most meaningful first
     "target_visible": "held-out views, pixels that the input views see",
     "target": "held-out views",
     "context_visible": "input views, pixels that they see",
@@ -81,7 +81,7 @@ class Line:
 def mean_interval(values: Sequence[float]) -> Interval:
     """Compute the mean of at least one value with its two-sided t interval (Student 1908).
 
-    With few scenes it is wide: 12.7 standard errors to each side for two.
+    With few scenes it is wide; with two it has 12.7 standard errors to each side.
     """
     if not len(values):
         raise ValueError("expected at least one value, got none")
@@ -96,7 +96,7 @@ def mean_interval(values: Sequence[float]) -> Interval:
 def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
     """Compute confidence intervals of the columns of ``values [scenes, conditions]``, with scene differences removed.
 
-    Scenes differ by several dB, but conditions by tenths, so plain intervals would hide the conditions. Here the mean
+    Scenes differ by several dB, but conditions by tenths. So plain intervals would hide the effect of conditions. Here the mean
     of every scene is subtracted first (Cousineau 2005), and the interval is corrected for that (Morey 2008).
     """
     num_scenes, num_conditions = values.shape
@@ -110,7 +110,7 @@ def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
 
 
 def line_key(record: RunRecord) -> LineKey:
-    """Return the key of a record's line: the method, and all settings but the size."""
+    """Return the key of a record's line, which is the method and all settings except the size."""
     settings = {name: value for name, value in record.settings.items() if name not in SIZES}
     return record.method, tuple(sorted(settings.items()))
 
@@ -151,11 +151,12 @@ class Results:
 
     Attributes:
         runs: The runs.
-        names: Name of each line; that of the input is its method.
-        part: Key of ``PARTS``: views and pixels of the scores, the most meaningful ones that nine of ten runs have.
-        metrics: Names of the measured metrics: PSNR, SSIM and one LPIPS, VGG if possible.
-        views: Requested number of views in figures over other quantities: all (None), or the largest.
-        size: Size in figures over other quantities: the one nearest to the typical share of the input.
+        names: Name of each line. The line of the input is named by its method.
+        part: Key of ``PARTS``, which names views and pixels of the scores. It is the most meaningful part that nine of
+            ten runs have.
+        metrics: Names of the measured metrics, which are PSNR, SSIM and one LPIPS, VGG if possible.
+        views: Requested number of views in figures over other quantities. It is None (all views) or the largest number.
+        size: Size in figures over other quantities, which is nearest to the typical share of the input.
     """
 
     def __init__(self, records: Iterable[RunRecord]) -> None:
@@ -221,15 +222,15 @@ def make_lines(
     """
     cells: dict[tuple[LineKey, str], dict[str, tuple[float, float]]] = {}
     for record in sorted(records, key=lambda record: record.value(order) or 0.0):
-        at, value = record.value(x), record.value(y)
-        if at and value is not None:
-            cells.setdefault((line_key(record), label(record)), {})[record.scene] = float(at), value
-    kept = keep_common({cell: set(points) for cell, points in cells.items()}, min_share)
-    by_cell = {cell: {s: xy for s, xy in cells[cell].items() if s in scenes} for cell, scenes in kept.items()}
+        cost, value = record.value(x), record.value(y)
+        if cost and value is not None:
+            cells.setdefault((line_key(record), label(record)), {})[record.scene] = float(cost), value
+    common = keep_common({cell: set(points) for cell, points in cells.items()}, min_share)
+    by_cell = {cell: {s: xy for s, xy in cells[cell].items() if s in scenes} for cell, scenes in common.items()}
     intervals = _intervals(list(by_cell.values()))
     points: dict[LineKey, list[Point]] = {}
-    for ((key, name), by_scene), interval in zip(by_cell.items(), intervals, strict=True):
-        points.setdefault(key, []).append(Point(name, _mean_cost(by_scene), interval, by_scene))
+    for ((key, size), by_scene), interval in zip(by_cell.items(), intervals, strict=True):
+        points.setdefault(key, []).append(Point(size, _mean_cost(by_scene), interval, by_scene))
     names = line_names(list(points))
     keys = sorted(points, key=lambda key: (key[0] != OURS, len(key[1])))
     return [Line(names[key], key[0] == OURS, tuple(points[key])) for key in keys]
@@ -242,19 +243,19 @@ def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[s
     scenes each key keeps its own.
     """
     fewest = min_share * len(set().union(*scenes.values()))
-    kept = {name: scene_names for name, scene_names in scenes.items() if len(scene_names) >= fewest}
-    common = set.intersection(*kept.values()) if kept else set()
-    return {name: common or scene_names for name, scene_names in kept.items()}
+    covering = {name: scene_names for name, scene_names in scenes.items() if len(scene_names) >= fewest}
+    common = set.intersection(*covering.values()) if covering else set()
+    return {name: common or scene_names for name, scene_names in covering.items()}
 
 
 def _mean_cost(points: ByScene) -> float:
-    """Compute the geometric mean of positive costs; it is exact if all are equal."""
+    """Compute the geometric mean of positive costs; it is exact if all costs are equal."""
     costs = [x for x, _ in points.values()]
     return costs[0] if min(costs) == max(costs) else float(np.exp(np.mean(np.log(costs))))
 
 
 def _intervals(columns: Sequence[ByScene]) -> list[Interval]:
-    """Compute an interval for each column, with scene differences removed; of width 0 if the columns' scenes differ."""
+    """Compute an interval for each column, with scene differences removed; its width is 0 if columns differ in scenes."""
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
         return paired_intervals(np.array(values, np.float64))

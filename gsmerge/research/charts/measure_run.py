@@ -51,7 +51,7 @@ MAX_TIMED = 4  # most views whose rendering is timed
 MAX_PICTURES, MAX_WIDTH, QUALITY = 2, 640, 88  # views of a run with pictures, their width in pixels, JPEG quality
 MAX_ERROR = 0.25  # mean absolute error over the channels at the top of the scale of error maps
 MAX_DB = 100.0  # PSNR of equal pictures, since JSON has no infinity
-_warm_kinds: set[tuple[Any, ...]] = set()  # kinds of runs that this process has executed before
+_warm_kinds: set[tuple[Any, ...]] = set()  # kinds of runs whose kernels this process has loaded
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class RunRecord:
     output: str = ""  # name of its files in the folder
     scene_sha256: str = ""  # hash of all files that were read
     method: str = ""  # gsmerge, the name of a baseline, or input (the scene as it is)
-    settings: Mapping[str, Any] = field(default_factory=dict)  # settings by flat name; others have defaults
+    settings: Mapping[str, Any] = field(default_factory=dict)  # settings by flat name; the rest have defaults
     views_asked: int | None = None  # requested number of views; None: all
     command: str = ""  # the command line of the run
     environment: Mapping[str, str] = field(default_factory=dict)  # processor, threads and versions
@@ -105,6 +105,7 @@ class RunRecord:
 
 
 def _is_number(value: object) -> bool:
+    """Return True for a finite number from JSON, but not for a bool."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
@@ -133,13 +134,15 @@ def read_runs(folder: Path) -> tuple[list[RunRecord], list[str]]:
             newest.pop(output, None)  # a repeated run moves to the end
             newest[output] = _read_record(line)
     records = [record for record in newest.values() if record is not None]
-    foreign = len(newest) - len(records)
-    content = {record.scene: record.scene_sha256 for record in records if record.error is None}
-    kept = [record for record in records if record.error is not None or record.scene_sha256 == content[record.scene]]
-    notes = [f"{folder}: {foreign} record(s) of another version or kind were passed over"] if foreign else []
-    other = len(records) - len(kept)
-    notes += [f"{other} run(s) left out, which read other files than the last one of their scene"] if other else []
-    return kept, notes
+    hashes = {record.scene: record.scene_sha256 for record in records if record.error is None}
+    current = [record for record in records if record.error is not None or record.scene_sha256 == hashes[record.scene]]
+    num_foreign, num_outdated = len(newest) - len(records), len(records) - len(current)
+    notes = []
+    if num_foreign:
+        notes.append(f"{folder}: {num_foreign} record(s) of another version or kind were passed over")
+    if num_outdated:
+        notes.append(f"{num_outdated} run(s) left out, which read other files than the last one of their scene")
+    return current, notes
 
 
 def _read_record(record: Mapping[str, Any]) -> RunRecord | None:
@@ -181,8 +184,8 @@ class ChartRun:
     def key(self, files: SceneFiles) -> str:
         """Return a hash of everything that the measurements depend on; the record has the hash of the files."""
         run = asdict(replace(self.record, command=""))
-        how = {"measured": asdict(self.measured), "seed": self.settings.seed, "tool_version": __version__}
-        return digest({"run": run, **how})
+        conditions = {"measured": asdict(self.measured), "seed": self.settings.seed, "tool_version": __version__}
+        return digest({"run": run, **conditions})
 
     def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
         """Merge, score and time a scene, and save pictures; return a batch record's report and the picture files."""
@@ -196,25 +199,19 @@ class ChartRun:
     def _measure(
         self, scene: Scene, held_out: HeldOutViews | None, out: Path, threads: int
     ) -> tuple[dict[str, Any], list[Path]]:
-        method, views = self.record.method, self.record.views_asked
-        if views is not None and views > len(scene):
-            raise ValueError(f"expected at most {len(scene)} views, got {views}")
-        part, targets = choose_views(scene, held_out, views)
-        facts: dict[str, Any] = {"seconds": 0.0}
-        gaussians = part.file_gaussians
-        if method != INPUT:
-            settings = replace(self.settings, threads=threads)
-            kind = (method, *(self.record.settings.get(name) for name in ("fit", "segmentation", "k")))
-            if kind not in _warm_kinds:  # a run on two views, so that the measured time excludes the loading of kernels
-                compact(choose_views(scene, None, 2)[0], settings)
-                _warm_kinds.add(kind)
-            done = compact(part, settings)
-            gaussians, seconds = done.gaussians, done.report.seconds
-            merge = sum(value for name, value in seconds.items() if name not in SCORING)
-            facts = {"seconds": merge, "stages": dict(seconds), "notes": tuple(done.report.notes)}
-        measured = replace(self.measured, threads=threads)
+        """Merge the requested views and measure the result; return fields of the record, and the picture files."""
+        is_input, num_views = self.record.method == INPUT, self.record.views_asked
+        if num_views is not None and num_views > len(scene):
+            raise ValueError(f"expected at most {len(scene)} views, got {num_views}")
+        part, targets = choose_views(scene, held_out, num_views)
+        if is_input:
+            gaussians, facts = part.file_gaussians, {"seconds": 0.0}
+        else:
+            self._warm_up(scene, threads)
+            gaussians, facts = self._merge(part, threads)
+        options = replace(self.measured, threads=threads)
         cameras, near = part.cameras if targets is None else targets.cameras, near_plane(part)
-        cameras = shrink_cameras(cameras, measured.photo_side)
+        cameras = shrink_cameras(cameras, options.photo_side)
         timed = pick_views(len(cameras), MAX_TIMED)
         pictures, names = keep_pictures(out, gaussians, scene, held_out)
         facts |= {
@@ -222,11 +219,25 @@ class ChartRun:
             "num_input": part.num_gaussians,
             "count": len(gaussians),
             "bytes": file_bytes(len(gaussians), gaussians.sh_degree),
-            "scores": measure(part, None if method == INPUT else gaussians, targets, measured),
+            "scores": measure(part, None if is_input else gaussians, targets, options),
             "render_ms": 1000 * median(time_render(gaussians, cameras[[view]], near) for view in timed),
             "pictures": names,
         }
         return facts, pictures
+
+    def _warm_up(self, scene: Scene, threads: int) -> None:
+        """Run once on two views, so that the measured time excludes the loading of kernels."""
+        kind = (self.record.method, *(self.record.settings.get(name) for name in ("fit", "segmentation", "k")))
+        if kind not in _warm_kinds:
+            compact(choose_views(scene, None, 2)[0], replace(self.settings, threads=threads))
+            _warm_kinds.add(kind)
+
+    def _merge(self, scene: Scene, threads: int) -> tuple[Gaussians, dict[str, Any]]:
+        """Merge a scene; return the Gaussians, and times and notes as fields of the record."""
+        result = compact(scene, replace(self.settings, threads=threads))
+        stages = result.report.seconds
+        seconds = sum(time for name, time in stages.items() if name not in SCORING)
+        return result.gaussians, {"seconds": seconds, "stages": dict(stages), "notes": tuple(result.report.notes)}
 
 
 @lru_cache(maxsize=1)
@@ -245,7 +256,7 @@ def _load(
 
 
 def list_held_out_notes(records: Iterable[RunRecord]) -> list[str]:
-    """List a note on the held-out photos of each scene without targets, which its runs are scored on."""
+    """List a note for each scene without targets; it names the held-out photos on which the scene's runs are scored."""
     notes = (f"{record.scene}: {note}" for record in records for note in record.notes if note.startswith(HELD_OUT))
     return list(dict.fromkeys(notes))
 
@@ -263,18 +274,18 @@ def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:
 
 
 def choose_views(scene: Scene, held_out: HeldOutViews | None, count: int | None) -> tuple[Scene, Views | None]:
-    """Choose ``count`` evenly spread views of the scene, and the held-out views nearest to the middle between them.
+    """Choose ``count`` evenly spread views of a scene, and held-out views near the middle between two chosen views.
 
-    Without ``count`` all views are chosen. All held-out views are chosen if their order along the trajectory is
-    unknown.
+    Without ``count`` all views are chosen. If the order of views along the trajectory is unknown, all held-out views
+    are chosen.
     """
     if count is None or count >= len(scene):
         return scene, held_out
     ids = even_views(len(scene), count)
     if held_out is None or held_out.context_places is None:
         return subset(scene, ids), held_out
-    chosen = midpoint_views([held_out.context_places[i] for i in ids], held_out.places)
-    return subset(scene, ids), held_out[chosen] if chosen else None
+    midpoints = midpoint_views([held_out.context_places[i] for i in ids], held_out.places)
+    return subset(scene, ids), held_out[midpoints] if midpoints else None
 
 
 def measure(
@@ -282,7 +293,7 @@ def measure(
 ) -> dict[str, float]:
     """Measure mean scores by name (``psnr_target_visible``, ...); names without a measurement are left out.
 
-    Without ``gaussians`` those of the scene are measured.
+    Without ``gaussians`` the scene's own Gaussians are measured.
     """
     results = {} if gaussians is None else {"result": gaussians}
     evaluation = evaluate(scene, results, targets, replace(options, own=gaussians is None, fog=False))
@@ -321,6 +332,7 @@ def keep_pictures(
 
 
 def _write(path: Path, picture: Picture) -> None:
+    """Write a picture, reduced to ``MAX_WIDTH``."""
     height, width = picture.shape[:2]
     if width > MAX_WIDTH:
         size = MAX_WIDTH, max(1, round(height * MAX_WIDTH / width))

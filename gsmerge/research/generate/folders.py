@@ -25,10 +25,10 @@ from gsmerge.types import Cameras
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """Folder of one scene of a series; ``kept``: the scene existed already."""
+    """Folder of one scene of a series."""
 
     folder: Path
-    kept: bool
+    kept: bool  # True if the scene existed already
 
 
 def generate_scene(folder: Path, options: GenerateOptions | None = None, *, seed: int = 0, index: int = 0) -> Path:
@@ -69,7 +69,7 @@ def generate(
     Every folder gets ``scene.ply``, ``transforms.json``, ``images/``, held-out views in ``targets/``, and
     ``generated.json`` with the random settings. A folder with the same scene is not changed. So an interrupted call can
     be repeated, and a call with a larger ``count`` adds scenes. Random numbers depend only on ``seed`` and the scene's
-    number. ``progress`` is called with the number of finished scenes and of all scenes.
+    number. ``progress`` is called with the number of finished scenes and the number of all scenes.
 
     Raises:
         ValueError: If ``count`` or ``seed`` is out of range.
@@ -89,10 +89,10 @@ def generate(
         generate_scene(planned[index].folder, options, seed=seed, index=index)
 
     with use_threads(threads) as workers:
-        for first in range(0, len(todo), workers):
-            parallel_map(work, todo[first : first + workers])
+        for start in range(0, len(todo), workers):
+            parallel_map(work, todo[start : start + workers])
             if progress is not None:
-                progress(count - len(todo) + min(first + workers, len(todo)), count)
+                progress(count - len(todo) + min(start + workers, len(todo)), count)
     return planned
 
 

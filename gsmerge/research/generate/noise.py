@@ -21,16 +21,16 @@ ERRORS = (  # ranges that the setting ``noise`` scales; the other ranges are hab
     *("view_bias", "drift", "patches", "patch_error", "grain", "bleed", "floaters", "turn", "shift"),
     *("exposure", "tint", "oversized", "tilt"),
 )
-SPREAD = ("view_bias", "drift", "grain", "turn", "shift", "unit")  # values whose logarithms are drawn uniformly
-POSITIVE = (*SPREAD, "far", "scale", "bleed_width", "flatness", "blur")
+LOG_UNIFORM = ("view_bias", "drift", "grain", "turn", "shift", "unit")  # values whose logarithms are drawn uniformly
+POSITIVE = (*LOG_UNIFORM, "far", "scale", "bleed_width", "flatness", "blur")
 
 
 @dataclass(frozen=True)
 class NoiseOptions:
     """Ranges of an exporter's errors and habits; each scene draws its values from them.
 
-    Depth errors are standard deviations of the logarithm of depth, which are about relative errors of the depth.
-    docs/internals/lab.md compares them with real exports. Raises ValueError if a range is empty or impossible.
+    Depth errors are standard deviations of the logarithm of depth. They are about equal to relative errors of depth.
+    docs/internals/lab.md compares the ranges with real exports. Raises ValueError if a range is empty or impossible.
     """
 
     view_bias: Range = (0.0002, 0.02)  # scale error of a view
@@ -40,14 +40,14 @@ class NoiseOptions:
     grain: Range = (0.0007, 0.003)  # independent error of each pixel
     blank: Range = (0.0, 3.0)  # factor of additional errors where the photo has no texture
     bleed: Range = (0.1, 1.0)  # blend towards a smoothed inverse depth at edges, 0 to 1
-    bleed_width: Range = (0.6, 1.8)  # standard deviation of that smoothing, pixels
+    bleed_width: Range = (0.6, 1.8)  # standard deviation of the smoothing of inverse depth, pixels
     far: Range = (4.0, 12.0)  # largest depth that the network predicts, in medians of the depth
-    # share of the pixels that float in front of their surface; it is eleven times as large at edges
+    # share of the pixels that float in front of their surface; at depth edges the share is eleven times as large
     floaters: Range = (0.0, 0.004)
     turn: Range = (0.005, 0.3)  # rotation error of a pose, degrees
     shift: Range = (0.0001, 0.004)  # translation error of a pose, in median depths
     exposure: Range = (0.0, 0.12)  # standard deviation of the logarithm of a photo's brightness
-    tint: Range = (0.0, 0.03)  # the same for each colour
+    tint: Range = (0.0, 0.03)  # standard deviation of the logarithm of each colour channel's brightness
     blur: Range = (0.3, 0.75)  # standard deviation of the lens's blur, pixels
     offset: Range = (0.0, 0.3)  # largest distance of a mean from its pixel's centre, pixels
     scale: Range = (0.5, 1.5)  # scale of a Gaussian across its normal, in footprints of its pixel
@@ -93,8 +93,8 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
     drawn: dict[str, float] = {}
     for name in RANGES:
         low, high = getattr(options, name)
-        spread = name in SPREAD
-        drawn[name] = float(exp(rng.uniform(log(low), log(high)))) if spread else rng.uniform(low, high)
+        is_log = name in LOG_UNIFORM
+        drawn[name] = float(exp(rng.uniform(log(low), log(high)))) if is_log else rng.uniform(low, high)
     for name in ERRORS:
         drawn[name] *= factor
     for name in ("bleed", "patches", "floaters", "oversized"):
@@ -132,45 +132,59 @@ def edge_mask(depth: Array) -> Float:
     return np.clip((np.minimum(jump / 2, 4 * bend) - 0.01) / 0.09, 0, 1).astype(np.float32)
 
 
-FLAT = np.full(7, 1 / 7, np.float32)  # a filter: the mean of 7 pixels
+MEAN_FILTER = np.full(7, 1 / 7, np.float32)  # averages 7 pixels
+TEXTURED = 0.05  # standard deviation of grey values, from which an area counts as detailed
 
 
 def texture_mask(image: Float) -> Float:
     """Rate pixels ``[h,w]`` by texture: 0 in flat areas of a photo, 1 in detailed areas."""
     grey = image.mean(2)
-    mean, square = (convolve(one, FLAT, FLAT) for one in (grey, grey * grey))
-    deviation = np.sqrt(np.maximum(square - mean * mean, 0))
-    return np.clip(deviation / 0.05, 0, 1)
+    mean, mean_square = (convolve(values, MEAN_FILTER, MEAN_FILTER) for values in (grey, grey * grey))
+    deviation = np.sqrt(np.maximum(mean_square - mean * mean, 0))
+    return np.clip(deviation / TEXTURED, 0, 1)
 
 
-def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
+def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
     """Simulate a network's depth ``[h,w]`` and its confidence ``[h,w]`` in [0, 1].
 
     Errors of the logarithm of depth are a bias of the view, a slow drift, wrong patches and fine grain. All of them are
     larger in areas without texture. Inverse depth bleeds over edges, depth has a maximum, and some pixels float in
     front of their surface.
     """
-    height, width = seen.depth.shape
-    far = noise.far * float(np.median(seen.depth))
-    depth, beyond = np.minimum(seen.depth, far), seen.depth > far
-    blank = 1 - texture_mask(seen.image)
+    height, width = view.depth.shape
+    far = noise.far * float(np.median(view.depth))
+    depth, is_beyond = np.minimum(view.depth, far), view.depth > far
+    blank = 1 - texture_mask(view.image)
     edge = edge_mask(depth)
-    soft = blur(1 / depth, noise.bleed_width)
     near_edge = cv2.dilate(edge, np.ones((3, 3), np.uint8))
-    bled = 1 / (1 / depth + noise.bleed * near_edge * (soft - 1 / depth))
-    worse = 1 + noise.blank * blank + 3 * beyond
+    bled = _bleed(depth, near_edge, noise)
+    amplification = 1 + noise.blank * blank + 3 * is_beyond
     drift = noise.drift * smooth_noise(rng, height, width, int(rng.integers(3, 7)))
-    field = smooth_noise(rng, height, width, int(rng.integers(5, 12))) + noise.blank * blank
-    limit = np.float32(np.quantile(field.astype(np.float64), 1 - noise.patches))
-    patch = np.clip((field - limit) / 0.3, 0, 1) if noise.patches > 0 else np.zeros_like(field)
-    wrong = patch * noise.patch_error * smooth_noise(rng, height, width, 8)
+    patch = _wrong_patches(blank, noise, rng)
+    patch_error = patch * noise.patch_error * smooth_noise(rng, height, width, 8)
     grain = noise.grain * rng.normal(0, 1, depth.shape)
-    out = bled * exp(noise.view_bias * rng.normal() + worse * (drift + grain) + wrong)
-    floating = rng.random(depth.shape) < noise.floaters * (1 + 10 * edge)
-    out = np.where(floating, out * rng.uniform(0.4, 0.95, depth.shape), out)
-    distrust = 0.8 * near_edge + 0.5 * blank * noise.blank / 3 + 0.7 * patch * rng.uniform(0, 1) + 0.6 * beyond
-    trust = noise.trust * np.clip(1 - distrust, 0, 1) + 0.06 * smooth_noise(rng, height, width, 9)
-    return out.astype(np.float32), np.clip(np.where(floating, 0.5 * trust, trust), 0, 1).astype(np.float32)
+    predicted = bled * exp(noise.view_bias * rng.normal() + amplification * (drift + grain) + patch_error)
+    floats = rng.random(depth.shape) < noise.floaters * (1 + 10 * edge)
+    predicted = np.where(floats, predicted * rng.uniform(0.4, 0.95, depth.shape), predicted)
+    doubt = 0.8 * near_edge + 0.5 * blank * noise.blank / 3 + 0.7 * patch * rng.uniform(0, 1) + 0.6 * is_beyond
+    trust = noise.trust * np.clip(1 - doubt, 0, 1) + 0.06 * smooth_noise(rng, height, width, 9)
+    return predicted.astype(np.float32), np.clip(np.where(floats, 0.5 * trust, trust), 0, 1).astype(np.float32)
+
+
+def _bleed(depth: Array, near_edge: Float, noise: Noise) -> Array:
+    """Blend inverse depth ``[h,w]`` at edges with its smoothed values; return depth."""
+    smooth = blur(1 / depth, noise.bleed_width)
+    return 1 / (1 / depth + noise.bleed * near_edge * (smooth - 1 / depth))
+
+
+def _wrong_patches(blank: Float, noise: Noise, rng: np.random.Generator) -> Float:
+    """Draw patches ``[h,w]`` of wrong depth, 0 to 1, more likely where the photo is ``blank``."""
+    field = smooth_noise(rng, *blank.shape, int(rng.integers(5, 12))) + noise.blank * blank
+    limit = np.float32(np.quantile(field.astype(np.float64), 1 - noise.patches))
+    return np.clip((field - limit) / 0.3, 0, 1) if noise.patches > 0 else np.zeros_like(field)
+
+
+RAISED = 10.0  # base colour at which the effect of shN is measured; colours below 0 would be clamped
 
 
 def quats_facing(normals: Array) -> Array:
@@ -181,39 +195,48 @@ def quats_facing(normals: Array) -> Array:
 
 
 def _harmonics(colors: Float, means: Float, eye: Array, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Compute sh0 ``[n,1,3]`` and shN ``[n,k-1,3]`` that give Gaussians their colours in their own view."""
-    n, num = len(colors), (noise.sh_degree + 1) ** 2 - 1
+    """Compute sh0 ``[n,1,3]`` and random shN ``[n,k-1,3]`` with which Gaussians have ``colors`` seen from ``eye``."""
+    n, num_rest = len(colors), (noise.sh_degree + 1) ** 2 - 1
     sh0 = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)
-    common = rng.normal(0, 1, (1, num, 3))  # the same for all Gaussians, since highlights of a view are on one side
-    shN = (noise.harmonics * (0.7 * common + 0.7 * rng.normal(0, 1, (n, num, 3)))).astype(np.float32)
-    if num:
-        raised = np.full_like(sh0, 10 / SH_C0)  # colours are clamped at 0
-        seen_colors = np.empty((n, 3), np.float32)
-        view_colors(means, raised, shN, np.arange(n, dtype=np.int32), eye.astype(np.float32), 0, n, seen_colors)
-        sh0 -= ((seen_colors - 10.5) / SH_C0)[:, None]
+    common = rng.normal(0, 1, (1, num_rest, 3))  # equal for all Gaussians, since highlights of a view are on one side
+    shN = (noise.harmonics * (0.7 * common + 0.7 * rng.normal(0, 1, (n, num_rest, 3)))).astype(np.float32)
+    if num_rest:
+        raised = np.full_like(sh0, RAISED / SH_C0)
+        rendered = np.empty((n, 3), np.float32)
+        view_colors(means, raised, shN, np.arange(n, dtype=np.int32), eye.astype(np.float32), 0, n, rendered)
+        sh0 -= ((rendered - (RAISED + 0.5)) / SH_C0)[:, None]
     return sh0, shN
 
 
-def pixel_gaussians(seen: TrueView, lens: Pinhole, noise: Noise, rng: np.random.Generator) -> Gaussians:
+def pixel_gaussians(view: TrueView, lens: Pinhole, noise: Noise, rng: np.random.Generator) -> Gaussians:
     """Make one Gaussian for each pixel of a view, in row-major order."""
-    height, width = seen.depth.shape
+    height, width = view.depth.shape
     n = height * width
-    depth, confidence = (a.reshape(-1).astype(np.float64) for a in predict_depth(seen, noise, rng))
+    depth, confidence = (values.reshape(-1).astype(np.float64) for values in predict_depth(view, noise, rng))
     v, u = np.mgrid[:height, :width].reshape(2, -1) + 0.5 + rng.uniform(-noise.offset, noise.offset, (2, n))
     rays = np.stack([(u - width / 2) / lens.focal, (v - height / 2) / lens.focal, np.ones(n)], 1)
-    means = rotate(rays * depth[:, None], seen.c2w[:3, :3]) + seen.c2w[:3, 3]
-    normals = seen.normals.reshape(-1, 3) + rng.normal(0, noise.tilt, (n, 3))
+    means = (rotate(rays * depth[:, None], view.c2w[:3, :3]) + view.c2w[:3, 3]).astype(np.float32)
+    normals = view.normals.reshape(-1, 3) + rng.normal(0, noise.tilt, (n, 3))
     normals = np.where(np.linalg.norm(normals, axis=1, keepdims=True) < 1e-6, rays, normals)
     quats = quats_facing(normals / np.linalg.norm(normals, axis=1, keepdims=True))
-    shape = np.array([1.0, 1.0, noise.flatness]) * exp(rng.normal(0, noise.scale_jitter, (n, 3)))
-    scales = noise.scale * (depth / lens.focal)[:, None] * shape
-    oversized = rng.random(n) < noise.oversized
-    scales[oversized] *= rng.uniform(2, max(2.0, noise.oversize), (int(oversized.sum()), 1))
+    scales = _pixel_scales(depth / lens.focal, noise, rng)
     opacities = noise.opacity_low + (noise.opacity_high - noise.opacity_low) * confidence
     opacities = np.clip(opacities + rng.normal(0, noise.opacity_grain, n), 0.01, 0.995)
-    image = blur(seen.image, noise.color_blur) if noise.color_blur > 0.2 else seen.image
+    image = blur(view.image, noise.color_blur) if noise.color_blur > MIN_BLUR else view.image
     colors = np.clip(image.reshape(-1, 3) + rng.normal(0, noise.color_grain, (n, 3)), 0, 1).astype(np.float32)
-    means = means.astype(np.float32)
-    sh0, shN = _harmonics(colors, means, seen.c2w[:3, 3], noise, rng)
+    sh0, shN = _harmonics(colors, means, view.c2w[:3, 3], noise, rng)
     columns = (means, quats, scales, opacities, sh0, shN)
-    return Gaussians(*(np.ascontiguousarray(a, dtype=np.float32) for a in columns))
+    return Gaussians(*(np.ascontiguousarray(column, dtype=np.float32) for column in columns))
+
+
+MIN_BLUR = 0.2  # least standard deviation of the smoothing of colours, pixels; smaller values change nothing
+
+
+def _pixel_scales(footprints: Array, noise: Noise, rng: np.random.Generator) -> Array:
+    """Draw scales ``[n,3]`` from the footprints ``[n]`` of pixels; some Gaussians are far too large."""
+    n = len(footprints)
+    shape = np.array([1.0, 1.0, noise.flatness]) * exp(rng.normal(0, noise.scale_jitter, (n, 3)))
+    scales = noise.scale * footprints[:, None] * shape
+    is_oversized = rng.random(n) < noise.oversized
+    scales[is_oversized] *= rng.uniform(2, max(2.0, noise.oversize), (int(is_oversized.sum()), 1))
+    return scales

@@ -63,7 +63,7 @@ def chair(pal: Palette) -> Shapes:
 
 
 def shelf(pal: Palette, width: float, height: float) -> Shapes:
-    """Build shelves with books and objects, back at z = 0."""
+    """Build shelves with books and objects; their back is at z = 0."""
     rng, board, depth = pal.rng, pal.material("wood", "plain", "plaster", repeat=0.7), 0.3
     out = [box((x - 0.012, -height, -depth), (x + 0.012, 0, 0), board) for x in (-width / 2, width / 2)]
     out.append(box((-width / 2, -height, -0.01), (width / 2, 0, 0), board))
@@ -127,14 +127,14 @@ def bowl(pal: Palette) -> Shapes:
 
 def toy(pal: Palette) -> Shapes:
     """Build a figure of uneven lumps."""
-    rng, skin, other = pal.rng, pal.material("plain", "cloth", "plaster"), pal.material("plain", "cloth", "gradient")
+    rng, skin, limbs = pal.rng, pal.material("plain", "cloth", "plaster"), pal.material("plain", "cloth", "gradient")
     h = rng.uniform(0.12, 0.3)
     out = [blob((0, -0.35 * h, 0), h * np.array([0.26, 0.36, 0.24]), skin, rng, 0.15)]
     out.append(blob((0, -0.8 * h, 0), h * np.array([0.24, 0.22, 0.22]), skin, rng, 0.12))
     for side in (-1, 1):
-        out.append(blob((0.24 * side * h, -0.45 * h, -0.05 * h), h * np.array([0.18, 0.08, 0.08]), other, rng, 0.2))
-        out.append(blob((0.14 * side * h, -0.06 * h, -0.12 * h), h * np.array([0.09, 0.07, 0.16]), other, rng, 0.2))
-        out.append(blob((0.2 * side * h, -1.0 * h, 0), h * np.array([0.07, 0.16, 0.04]), other, rng, 0.2))
+        out.append(blob((0.24 * side * h, -0.45 * h, -0.05 * h), h * np.array([0.18, 0.08, 0.08]), limbs, rng, 0.2))
+        out.append(blob((0.14 * side * h, -0.06 * h, -0.12 * h), h * np.array([0.09, 0.07, 0.16]), limbs, rng, 0.2))
+        out.append(blob((0.2 * side * h, -1.0 * h, 0), h * np.array([0.07, 0.16, 0.04]), limbs, rng, 0.2))
         out.append(ball((0.09 * side * h, -0.84 * h, -0.2 * h), np.full(3, 0.03 * h), pal.material("plain", gloss=1.0)))
     return out
 
@@ -215,15 +215,18 @@ def small_object(pal: Palette) -> Shapes:
     return SMALL[pal.rng.integers(len(SMALL))](pal)
 
 
+CLEARANCE = 0.16  # least distance between the middles of small objects, metres
+
+
 def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) -> Shapes:
     """Spread small objects over a rectangle so that they do not touch, with papers and cables between them."""
     rng, out = pal.rng, []
-    taken: list[Array] = []
+    spots: list[Array] = []
     for _ in range(count * 4):
-        at = rng.uniform(-1, 1, 2) * half
-        if len(taken) < count and all(norm(at - other) > 0.16 for other in taken):
-            taken.append(at)
-            out += place(small_object(pal), (at[0], -height, at[1]), yaw=rng.uniform(0, 2 * np.pi))
+        spot = rng.uniform(-1, 1, 2) * half
+        if len(spots) < count and all(norm(spot - occupied) > CLEARANCE for occupied in spots):
+            spots.append(spot)
+            out += place(small_object(pal), (spot[0], -height, spot[1]), yaw=rng.uniform(0, 2 * np.pi))
     for _ in range(rng.integers(0, count // 2 + 1)):
         x, z = rng.uniform(-1, 1, 2) * half
         out += place(paper(pal), (x, -height, z), yaw=rng.uniform(0, 2 * np.pi))
@@ -238,7 +241,7 @@ FACING = axis_rotation(1, np.pi / 2)  # rotates -z to -x
 
 
 def light(rng: np.random.Generator, lamp_at: Array) -> Light:
-    """Draw a lamp above and in front of the scene, warm or cool."""
+    """Draw lights of random colour and strength; the direct light comes from above and in front of the scene."""
     side, up = rng.uniform(-1.2, 1.2), rng.uniform(0.5, 1.3)
     towards = np.array([sin(side), -up, -cos(side)])
     key = rng.uniform(0.8, 4.0) * (1 + (0.4 * color(rng, strength=(0, 0.4), light=(0.9, 1)) - 0.4))
@@ -247,7 +250,7 @@ def light(rng: np.random.Generator, lamp_at: Array) -> Light:
 
 
 def _walls(pal: Palette, width: float, depth: float, height: float) -> Shapes:
-    """Build floor, ceiling and four walls about the origin, with pictures, a window, a skirting and a pipe."""
+    """Build floor, ceiling and four walls about the origin, with objects on the walls, a skirting and a pipe."""
     rng = pal.rng
     kinds = ("plain", "plain", "plain", "plaster", "bricks", "cloth", "tiles", "wood")
     papers = [pal.material(*kinds, repeat=rng.uniform(0.3, 0.8), gloss=0.0) for _ in range(2)]
@@ -260,14 +263,14 @@ def _walls(pal: Palette, width: float, depth: float, height: float) -> Shapes:
     skirting = pal.material("plain", "wood")
     out.append(box((-w, -0.09, d - 0.02), (w, 0, d), skirting))
     out += [box((x - 0.02, -0.09, -d), (x + 0.02, 0, d), skirting) for x in (-w, w)]
-    for half, spot, facing in ((w, (0, 0, d), np.eye(3)), (d, (-w, 0, 0), FACING.T), (d, (w, 0, 0), FACING)):
-        out += place(_wall_objects(pal, half, h), spot, rotation=facing)
+    for half_length, spot, facing in ((w, (0, 0, d), np.eye(3)), (d, (-w, 0, 0), FACING.T), (d, (w, 0, 0), FACING)):
+        out += place(_wall_objects(pal, half_length, h), spot, rotation=facing)
     pipe = rng.uniform(-w, w)
     return [*out, rod((pipe, 0, d - 0.06), (pipe, -h, d - 0.06), rng.uniform(0.01, 0.04), skirting)]
 
 
 def _wall_objects(pal: Palette, half: float, height: float) -> Shapes:
-    """Build pictures, a window, a shelf or a door, side by side on the plane z = 0."""
+    """Build pictures, windows, shelves and doors at random, side by side on the plane z = 0."""
     rng, out, x = pal.rng, [], -half + 0.3
     while x < half - 0.5:
         wide, kind = rng.uniform(0.3, 1.2), rng.integers(0, 5)
@@ -315,6 +318,7 @@ def sofa(pal: Palette) -> Shapes:
 
 
 def _furniture(pal: Palette) -> Shapes:
+    """Build a chair, a sofa, or a table with small objects and perhaps a chair."""
     rng, kind = pal.rng, pal.rng.integers(0, 4)
     if kind == 0:
         return chair(pal)

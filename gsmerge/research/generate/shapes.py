@@ -18,6 +18,7 @@ Vector: TypeAlias = Sequence[float] | Array  # of length 3
 Pair: TypeAlias = tuple[float, float]
 NUM_WAVES = 4
 NO_WAVES = np.zeros((NUM_WAVES, 5))
+TAPER, AMPLITUDE = 3, 4  # columns of a shape's size, and of its waves
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def axis_rotation(axis: int, angle: float) -> Array:
     return out
 
 
-UPRIGHT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # rotations of quads and leaves that face -z, and up
+UPRIGHT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # rotations with which quads and leaves face -z, and up
 
 
 def box(low: Vector, high: Vector, material: Material) -> Shape:
@@ -94,7 +95,7 @@ def ball(centre: Vector, radii: Vector, material: Material) -> Shape:
 def column(foot: Vector, height: float, radius: float, material: Material, *, top: float = 1.0) -> Shape:
     """Make an upright cylinder or cone on ``foot``; its top radius is ``top`` times ``radius``."""
     x, y, z = foot
-    size = (radius * top, height / 2, radius * top, 1 / top)  # the kernel's radii are those at -y, which is up
+    size = (radius * top, height / 2, radius * top, 1 / top)  # the kernel takes the radii at -y, which is up
     return Shape(CONE, size, material, np.array([x, y - height / 2, z]))
 
 
@@ -158,8 +159,8 @@ def pack(shapes: Sequence[Shape]) -> ShapeArrays:
 def bounds(shapes: ShapeArrays) -> Array:
     """Compute half sizes ``[m,3]`` of the shapes' bounding boxes in shape frames."""
     half = shapes.sizes[:, :3].copy()
-    reach = np.abs(shapes.waves[:, :, 4]).sum(1)
-    half[shapes.kinds == BLOB] *= 1 + reach[shapes.kinds == BLOB, None]
-    wide = np.maximum(shapes.sizes[:, 3], 1)[shapes.kinds == CONE]
-    half[shapes.kinds == CONE] *= np.stack([wide, np.ones_like(wide), wide], 1)
+    relief = np.abs(shapes.waves[:, :, AMPLITUDE]).sum(1)
+    half[shapes.kinds == BLOB] *= 1 + relief[shapes.kinds == BLOB, None]
+    widening = np.maximum(shapes.sizes[:, TAPER], 1)[shapes.kinds == CONE]
+    half[shapes.kinds == CONE] *= np.stack([widening, np.ones_like(widening), widening], 1)
     return half

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import cv2
@@ -37,14 +37,18 @@ from gsmerge.settings.setting import Settings, setting
 from gsmerge.types import Cameras, Gaussians
 
 PATH_TRIES, STAGE_TRIES = 6, 6  # most paths per stage, and most stages, that are tried until all views are usable
-SMALL = 8  # views are checked, and exposures computed, at this fraction of the size
+SMALL = 8  # divides the sides of views to check if they are usable, and to compute exposures
 FOCAL = 0.58, 1.75  # range of the focal length, in the longer sides of the photo
-MIN_NEAR = 0.22  # first percentile of the depths, as a share of their median
-MAX_TURN = 50  # degrees between neighbouring views
+MIN_HITS = 0.6  # least share of a usable view's rays that hit a shape
+MIN_NEAR, MIN_NEAR_METRES = 0.22, 0.6  # least first percentile of depths: as a share of their median, or in metres
+MAX_TURN = 50  # largest angle between neighbouring views, degrees
 ARC = 15, 60  # range of the angle that a path has around the focus, degrees
-SWING = 35  # largest angle of cameras to either side of -z, seen from the focus, degrees
+SWING = 35  # largest angle between -z and a camera, seen from the focus, degrees
 HEIGHT = 0.9, 1.8  # range of the height of cameras above the ground, metres
-Pose = Callable[[float], Array]  # camera to world at 0, the start of a path, to 1
+BRIGHTNESS = 0.22, 0.62  # range of the mean of a scene's photos, sRGB
+VIGNETTE = 0.3  # loss of light at a distance of one diagonal from the middle of a photo; grows with its square
+SENSOR_NOISE = 0.004  # standard deviation of the noise of a photo, sRGB
+Path = Callable[[float], Array]  # position along a path, 0 to 1 -> camera-to-world matrix [4,4]
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
@@ -60,7 +64,7 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
     return out
 
 
-def draw_path(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
+def draw_path(stage: Stage, rng: np.random.Generator, num_views: int) -> Path:
     """Draw an arc around the focus that sways up and down."""
     limit = MAX_TURN * max(1, num_views - 1)
     span = rng.uniform(min(ARC[0], limit), min(ARC[1], limit))
@@ -70,20 +74,21 @@ def draw_path(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
     phase, closer = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)
 
     def pose(s: float) -> Array:
-        angle, away = np.deg2rad(start + span * s), distance * (1 + closer * s)
+        angle, radius = np.deg2rad(start + span * s), distance * (1 + closer * s)
         x, _, z = stage.focus
-        eye = np.array([x + away * sin(angle), -(height + swing * sin(6 * s + phase)), z - away * cos(angle)])
+        eye = np.array([x + radius * sin(angle), -(height + swing * sin(6 * s + phase)), z - radius * cos(angle)])
         return look_at(eye, stage.focus, 0.03 * sin(5 * s + phase))
 
     return pose
 
 
 def is_usable(hits: Hits) -> bool:
-    """Return True if a view is outside all shapes and not too close to any."""
+    """Return True if a view's camera is outside all shapes and not too close to any."""
     depth = hits.depth[hits.depth < FAR]
-    if depth.size < 0.6 * hits.depth.size:
+    if depth.size < MIN_HITS * hits.depth.size:
         return False
-    return bool(np.percentile(depth, 1) > MIN_NEAR * np.median(depth) or np.percentile(depth, 1) > 0.6)
+    nearest = np.percentile(depth, 1)
+    return bool(nearest > MIN_NEAR * np.median(depth) or nearest > MIN_NEAR_METRES)
 
 
 @dataclass(frozen=True)
@@ -117,87 +122,124 @@ class SyntheticScene:
     noise: Noise
 
 
+@dataclass(frozen=True)
+class _Shoot:
+    """A lit room with a path of cameras, and the settings of its photos and of the simulated network."""
+
+    lit: LitStage
+    poses: list[Array]  # camera to world, in metres: views at even places, held-out views between them
+    to_export: Array  # [4,4] world of the room -> world of the exporter, without its unit
+    lens: Pinhole  # camera of the views
+    photo_lens: Pinhole  # camera of the photos
+    noise: Noise
+    gain: float  # exposure of the photos
+
+    def exported_pose(self, place: int) -> Array:
+        """Return a camera-to-world matrix in the world and the units of the exporter."""
+        pose = matmul(self.to_export, self.poses[place])
+        pose[:3, 3] *= self.noise.unit
+        return pose
+
+    def take_photo(self, place: int, seed: int) -> Float:
+        """Take the photo ``[h,w,3]`` at one place of the path."""
+        return _photo(self.lit, self.poses[place], self.photo_lens, self.noise, self.gain, seed)
+
+    def predict(self, place: int, photo: Float, deviation: Array, seed: int) -> tuple[Array, Gaussians]:
+        """Simulate the network at one place of the path; return the pose and the Gaussians that it estimates.
+
+        ``deviation [2,3]`` is the random error of the pose, see :func:`_perturb_pose`.
+        """
+        hits = trace(self.lit.shapes, self.poses[place], self.lens, 1)
+        depth = np.minimum(hits.depth, FAR) * self.noise.unit
+        pose = _perturb_pose(self.exported_pose(place), self.noise, float(np.median(depth)), deviation)
+        normals = matmul(hits.normals, self.to_export[:3, :3].T).astype(np.float32)
+        size = self.lens.width, self.lens.height
+        image = photo if self.photo_lens == self.lens else cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+        view = TrueView(image, depth, normals, pose)
+        return pose, pixel_gaussians(view, self.lens, self.noise, np.random.default_rng(seed))
+
+
 def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScene:
     """Generate scene ``index`` of a series; the same arguments give the same bits on any number of threads."""
     rng = np.random.default_rng([seed, index])
-    num_views = options.views
+    shoot = _plan_shoot(rng, options)
+    num_places = len(shoot.poses)
+    photo_seeds = rng.integers(0, 2**63, num_places)
+    # many exporters use the frame of the first camera
+    shoot = replace(shoot, to_export=invert(shoot.poses[0]) if rng.random() < 0.5 else np.eye(4))
+    views, targets = range(0, num_places, 2), range(1, num_places, 2)
+    errors = {place: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for place in views}
+
+    def take_view(place: int) -> tuple[Float, Array, Gaussians | None]:
+        photo = shoot.take_photo(place, photo_seeds[place])
+        if place not in errors:
+            return photo, shoot.exported_pose(place), None
+        return photo, *shoot.predict(place, photo, *errors[place])
+
+    photos, poses, gaussians = zip(*parallel_map(take_view, [*views, *targets]), strict=True)
+    num_views = len(views)
+    return SyntheticScene(
+        gaussians=Gaussians.concat(list(gaussians[:num_views])),
+        cameras=_cameras(poses[:num_views], shoot.lens),
+        images=photos[:num_views],
+        targets=_cameras(poses[num_views:], shoot.photo_lens),
+        target_images=photos[num_views:],
+        noise=shoot.noise,
+    )
+
+
+def _plan_shoot(rng: np.random.Generator, options: GenerateOptions) -> _Shoot:
+    """Draw errors, cameras, room, path and exposure of a scene, in the world of the room."""
     noise = draw_noise(options.ranges, rng, options.noise)
     focal = max(options.width, options.height) * rng.uniform(*FOCAL)
-    lens = Pinhole(options.width, options.height, focal)
-    scale = options.photo_scale
-    large = Pinhole(scale * lens.width, scale * lens.height, scale * lens.focal)  # camera of the photos
-    scene, pose = _find_stage(rng, large, num_views)
-    places = np.linspace(0, 1, 2 * num_views - 1)
-    poses = [pose(s) for s in places]
-    gain = find_exposure([radiance(scene, p, _shrink(lens), 1) for p in poses[::2]], rng.uniform(0.22, 0.62))
-    seeds = rng.integers(0, 2**63, len(poses))
-    world = invert(poses[0]) if rng.random() < 0.5 else np.eye(4)  # many exporters use the frame of the first camera
-    moved = [matmul(world, pose) for pose in poses]  # in the world and the units of the exporter
-    for estimate in moved:
-        estimate[:3, 3] *= noise.unit
-    views = range(0, len(poses), 2)
-    errors = {i: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for i in views}
-
-    def take(i: int) -> tuple[Float, Array, Gaussians | None]:
-        """Take the photo at one place of the path; at the place of a view also estimate its pose and Gaussians."""
-        image = _photo(scene, poses[i], large, noise, gain, seeds[i])
-        if i not in errors:
-            return image, moved[i], None
-        deviation, seed = errors[i]
-        hits = trace(scene.shapes, poses[i], lens, 1)
-        depth = np.minimum(hits.depth, FAR) * noise.unit
-        estimate = _perturb_pose(moved[i], noise, float(np.median(depth)), deviation)
-        normals = matmul(hits.normals, world[:3, :3].T).astype(np.float32)
-        seen = image if large == lens else cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-        predicted = pixel_gaussians(TrueView(seen, depth, normals, estimate), lens, noise, np.random.default_rng(seed))
-        return image, estimate, predicted
-
-    shots = parallel_map(take, [*views, *range(1, len(poses), 2)])
-    return SyntheticScene(
-        gaussians=Gaussians.concat([gaussians for _, _, gaussians in shots if gaussians is not None]),
-        cameras=_cameras([pose for _, pose, _ in shots[:num_views]], lens),
-        images=tuple(image for image, _, _ in shots[:num_views]),
-        targets=_cameras([pose for _, pose, _ in shots[num_views:]], large),
-        target_images=tuple(image for image, _, _ in shots[num_views:]),
-        noise=noise,
-    )
+    lens, scale = Pinhole(options.width, options.height, focal), options.photo_scale
+    photo_lens = Pinhole(scale * lens.width, scale * lens.height, scale * lens.focal)
+    lit, path = _find_stage(rng, photo_lens, options.views)
+    poses = [path(s) for s in np.linspace(0, 1, 2 * options.views - 1)]
+    previews = [radiance(lit, pose, _shrink(lens), 1) for pose in poses[::2]]
+    gain = find_exposure(previews, rng.uniform(*BRIGHTNESS))
+    return _Shoot(lit, poses, np.eye(4), lens, photo_lens, noise, gain)
 
 
 def _shrink(lens: Pinhole) -> Pinhole:
     return Pinhole(max(8, lens.width // SMALL), max(8, lens.height // SMALL), lens.focal / SMALL)
 
 
-def _find_stage(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitStage, Pose]:
+def _find_stage(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitStage, Path]:
     """Draw a room and a path on which all views are usable; after too many tries, return the last ones."""
     side = 1 << min(max(int(1.6 * max(lens.width, lens.height)).bit_length() - 1, 7), 10)  # side of textures, pixels
     for _ in range(STAGE_TRIES):
-        scene = light_stage(room(Palette(rng, side)))
+        lit = light_stage(room(Palette(rng, side)))
         for _ in range(PATH_TRIES):
-            pose = draw_path(scene.stage, rng, num_views)
-            poses = (pose(s) for s in np.linspace(0, 1, 2 * num_views - 1))
-            if all(is_usable(trace(scene.shapes, at, _shrink(lens), 1)) for at in poses):
-                return scene, pose
-    return scene, pose
+            path = draw_path(lit.stage, rng, num_views)
+            poses = (path(s) for s in np.linspace(0, 1, 2 * num_views - 1))
+            if all(is_usable(trace(lit.shapes, pose, _shrink(lens), 1)) for pose in poses):
+                return lit, path
+    return lit, path
 
 
-def _photo(scene: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
+def _photo(lit: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
     """Take a photo with the errors of lens, sensor and exposure."""
     rng = np.random.default_rng(seed)
-    linear = radiance(scene, pose, lens, SAMPLE_RAYS)
+    linear = radiance(lit, pose, lens, SAMPLE_RAYS)
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
-    away = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
-    linear = linear * gains.astype(np.float32) * (1 - 0.3 * away)[..., None].astype(np.float32)
+    square_radius = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
+    linear = linear * gains.astype(np.float32) * (1 - VIGNETTE * square_radius)[..., None].astype(np.float32)
     image = blur(develop(linear), noise.blur)
-    image = np.clip(image + rng.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
+    image = np.clip(image + rng.normal(0, SENSOR_NOISE, image.shape), 0, 1).astype(np.float32)
     return np.round(image * 255) / np.float32(255)
 
 
 def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
-    """Add the network's error to a pose; ``deviation [2,3]`` is of rotation and position, in units of their errors."""
-    turn = np.deg2rad(noise.turn) * deviation[0] / 3**0.5
-    angle = np.sqrt((turn * turn).sum())
-    quat = np.array([cos(angle / 2), *(sin(angle / 2) / max(angle, 1e-12) * turn)])
+    """Add the network's error to a pose, for a median ``depth``.
+
+    ``deviation [2,3]`` has standard normal numbers for rotation and position. They are multiplied by the sizes of the
+    errors, ``noise.turn`` and ``noise.shift``.
+    """
+    rotation = np.deg2rad(noise.turn) * deviation[0] / 3**0.5
+    angle = np.sqrt((rotation * rotation).sum())
+    quat = np.array([cos(angle / 2), *(sin(angle / 2) / max(angle, 1e-12) * rotation)])
     out = pose.copy()
     out[:3, :3] = matmul(pose[:3, :3], quat_to_rotmat(quat))
     out[:3, 3] += noise.shift * depth * deviation[1] / 3**0.5

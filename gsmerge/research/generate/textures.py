@@ -30,10 +30,10 @@ def enlarge(cells: NDArray[np.float64], size: int) -> Grey:
 def noise(
     rng: np.random.Generator, size: int, *, first: int = 4, fade: float = 0.6, stretch: int = 1, ridged: bool = False
 ) -> Grey:
-    """Draw noise as a sum of octaves, each ``fade`` times as strong as the one before: 0.3 gives clouds, 0.9 grit.
+    """Draw noise as a sum of octaves. Each octave is ``fade`` times as strong as the one before.
 
-    ``first`` is the number of cells of the coarsest octave along a side, and ``stretch`` the ratio of their length to
-    their height. ``ridged`` gives sharp crests, as in rock and bark.
+    A ``fade`` of 0.3 gives clouds, 0.9 gives grit. ``first`` is the number of cells of the coarsest octave along a
+    side. ``stretch`` is the ratio of a cell's length to its height. ``ridged`` gives sharp crests, as in rock and bark.
     """
     out, strength, cells = np.zeros((size, size), np.float32), 1.0, min(first, size // 2)
     while cells <= size // 2:
@@ -46,15 +46,15 @@ def noise(
 
 def grid(size: int) -> tuple[Grey, Grey]:
     """Return x and y of every pixel, 0 to 1."""
-    at = (np.arange(size, dtype=np.float32) + 0.5) / size
-    x, y = np.meshgrid(at, at)
+    centres = (np.arange(size, dtype=np.float32) + 0.5) / size
+    x, y = np.meshgrid(centres, centres)
     return x, y
 
 
 def courses(
     rng: np.random.Generator, size: int, rows: int, columns: int, *, joint: float, offset: float
 ) -> tuple[Grey, Grey]:
-    """Draw ``rows`` courses of ``columns`` bricks or tiles; return a random tone per brick, and a mask of the joints.
+    """Draw ``rows`` courses of ``columns`` bricks or tiles; return each pixel's random tone, and a mask of the joints.
 
     ``joint`` is the width of the joints as a share of a stone's height, and ``offset`` the shift of every second course
     as a share of a stone's width.
@@ -70,8 +70,13 @@ def courses(
 
 
 def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
-    """Draw ``count``² pebbles; return the random tone and the distance to the edge of each pixel's pebble."""
-    at = (np.stack(np.meshgrid(np.arange(count), np.arange(count)), -1) + rng.uniform(0, 1, (count, count, 2))) / count
+    """Draw ``count``² pebbles; return the random tone of each pixel's pebble, and the distance to the pebble's edge.
+
+    Pebbles are the Voronoi cells of random points, one point in each square of a grid.
+    """
+    points = (
+        np.stack(np.meshgrid(np.arange(count), np.arange(count)), -1) + rng.uniform(0, 1, (count, count, 2))
+    ) / count
     tones = rng.uniform(0, 1, (count, count)).astype(np.float32)
     x, y = grid(size)
     column, row = np.floor(x * count).astype(int), np.floor(y * count).astype(int)
@@ -79,12 +84,12 @@ def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
     tone = np.zeros((size, size), np.float32)
     for i in (-1, 0, 1):
         for j in (-1, 0, 1):
-            centre = at[(row + i) % count, (column + j) % count]
-            dx, dy = x - centre[..., 0], y - centre[..., 1]
-            d = np.sqrt((dx - np.round(dx)) ** 2 + (dy - np.round(dy)) ** 2)
-            tone = np.where(d < nearest, tones[(row + i) % count, (column + j) % count], tone)
-            second = np.minimum(second, np.maximum(d, nearest))
-            nearest = np.minimum(nearest, d)
+            neighbour = (row + i) % count, (column + j) % count
+            dx, dy = x - points[neighbour][..., 0], y - points[neighbour][..., 1]
+            distance = np.sqrt((dx - np.round(dx)) ** 2 + (dy - np.round(dy)) ** 2)
+            tone = np.where(distance < nearest, tones[neighbour], tone)
+            second = np.minimum(second, np.maximum(distance, nearest))
+            nearest = np.minimum(nearest, distance)
     return tone, np.clip((second - nearest) * count, 0, 1).astype(np.float32)
 
 
@@ -100,16 +105,19 @@ def glyphs(rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
     return out
 
 
+PITCH, WORD_SPACE = 6, 4  # pixels from letter to letter, and additional pixels between words
+
+
 def text_line(rng: np.random.Generator, alphabet: NDArray[np.uint8], height: int, width: int) -> Grey:
     """Draw the ink ``[height,width]`` of one line of words."""
     line = np.zeros((7, max(6, 7 * width // height)), np.uint8)
-    at = 0
-    while at < line.shape[1] - 6:
+    column = 0
+    while column < line.shape[1] - PITCH:
         for letter in alphabet[rng.integers(0, len(alphabet), rng.integers(2, 10))]:
-            if at < line.shape[1] - 6:
-                line[:, at : at + 5] = letter
-            at += 6
-        at += 4
+            if column < line.shape[1] - PITCH:
+                line[:, column : column + 5] = letter
+            column += PITCH
+        column += WORD_SPACE
     return cv2.resize(line.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
 
@@ -237,7 +245,7 @@ def carpet(rng: np.random.Generator, size: int) -> Picture:
 
 
 def bark(rng: np.random.Generator, size: int) -> Picture:
-    """Draw furrows along y."""
+    """Draw bark with furrows along y."""
     base = color(rng, hue=(0.04, 0.12), strength=(0.1, 0.5), light=(0.25, 0.55))
     return mix(*shades(rng, base, 0.6), noise(rng, size, first=32, fade=0.75, stretch=4, ridged=True).T)
 
@@ -278,18 +286,20 @@ def printed(rng: np.random.Generator, size: int) -> Picture:
     margin, y = size // 16, size // 16
     page[: size // 64] = page[:, : size // 64] = 0.7 * paper
     while y < size - 2 * margin:
-        kind, left = rng.random(), margin
-        height = size // int(rng.integers(6, 12)) if kind < 0.2 else size // int(rng.integers(22, 44))
+        draw, left = rng.random(), margin
+        is_heading, is_picture = draw < 0.2, draw > 0.8
+        height = size // int(rng.integers(6, 12)) if is_heading else size // int(rng.integers(22, 44))
         width = int(rng.uniform(0.5, 1) * (size - 2 * margin))
-        if kind > 0.8:  # a picture, with text beside it
-            height, wide = int(rng.uniform(0.1, 0.25) * size), int(rng.uniform(0.2, 0.5) * size)
-            area = page[y : y + height, left : left + wide]
+        if is_picture:  # with text beside it
+            height, picture_width = int(rng.uniform(0.1, 0.25) * size), int(rng.uniform(0.2, 0.5) * size)
+            area = page[y : y + height, left : left + picture_width]
             area[:] = mix(color(rng), color(rng), noise(rng, size, first=4, fade=0.6))[: area.shape[0], : area.shape[1]]
-            left, width, height = left + wide + margin // 2, size - 2 * margin - wide, height // 4
+            left, width = left + picture_width + margin // 2, size - 2 * margin - picture_width
+            height //= 4
         line = text_line(rng, letters, height, max(8, width))
         area = page[y : y + height, left : min(left + width, size - margin)]
         area += (ink - area) * line[: area.shape[0], : area.shape[1], None]
-        y += int(height * rng.uniform(1.3, 1.7)) + (size // 8 if kind > 0.8 else 0)
+        y += int(height * rng.uniform(1.3, 1.7)) + (size // 8 if is_picture else 0)
     return page
 
 
@@ -355,7 +365,8 @@ def pyramid(texture: Picture) -> list[Picture]:
     return out
 
 
-MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4}  # per scene; of other kinds 3
+MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4}  # most textures of a kind in a scene
+OTHER_TEXTURES = 3  # most textures of any other kind
 
 
 @dataclass
@@ -365,20 +376,20 @@ class Palette:
     rng: np.random.Generator
     size: int  # side of the textures, pixels
     textures: list[Picture] = field(default_factory=list)
-    by_kind: dict[str, list[int]] = field(default_factory=dict)  # their indices
+    by_kind: dict[str, list[int]] = field(default_factory=dict)  # indices of the textures of each kind
 
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
-        """Make a material of one of the kinds, with a new texture, or an existing one if the kind has enough.
+        """Make a material of one of the kinds. Its texture is new, or an existing one if the kind has enough textures.
 
-        ``repeat`` is the number of repeats per world unit; 0: once over every face. ``gloss`` is by default random, and
-        usually zero.
+        ``repeat`` is the number of repeats per world unit; 0: once over every face. ``gloss`` is random by default, and
+        zero in about half of the cases.
         """
         kind = kinds[self.rng.integers(len(kinds))]
-        ids = self.by_kind.setdefault(kind, [])
-        if len(ids) < MAX_TEXTURES.get(kind, 3):
+        ids, limit = self.by_kind.setdefault(kind, []), MAX_TEXTURES.get(kind, OTHER_TEXTURES)
+        if len(ids) < limit:
             ids.append(len(self.textures))
             self.textures.append(KINDS[kind](self.rng, self.size).astype(np.float32))
-        texture = ids[self.rng.integers(len(ids))] if len(ids) == MAX_TEXTURES.get(kind, 3) else ids[-1]
+        texture = ids[self.rng.integers(len(ids))] if len(ids) == limit else ids[-1]
         shift = self.rng.uniform(0, 1, 2) if repeat else np.zeros(2)
         gloss = max(0.0, float(self.rng.uniform(-0.5, 0.5))) if gloss is None else gloss
         return Material(texture, repeat, gloss, (float(shift[0]), float(shift[1])))
