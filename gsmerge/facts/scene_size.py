@@ -17,7 +17,6 @@ TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
 DENSE = 0.5  # a scene is dense from this number of Gaussians per pixel on
 FLAT, FAINT = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
 SAMPLE_GAUSSIANS = 65536  # these bounds are tested on at least this many Gaussians, if there are as many
-Pictures = Literal["photos", "renders"]  # "photos": also row colours instead; "renders": drawings of the scene itself
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class SceneSize:
     height: int  # Pixels
     width: int
     has_own_pixels: bool  # Each view has Gaussians of its own
-    pictures: Pictures  # Pictures to which results are fitted
+    rendered: bool  # Renders of the input stand for the pictures of its views, which have neither photos nor pixels
     num_cameras: int = 2  # Number of different cameras; 1: all views have the same camera
     sh_degree: int = 0
 
