@@ -14,8 +14,8 @@ _MAX_SPREAD = 0.15  # median relative deviation of depth ratios; above it the ma
 def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scene:
     """Add a Gaussian at the depth of ``maps [v,h,w]`` for each pixel without a Gaussian.
 
-    The unit of the maps follows from the pixels with a Gaussian, and so does their kind: depth along z or distance. The
-    colours of new Gaussians are those of the photos ``images [v,h,w,3]``. Their opacity, rotation and size in pixels
+    The unit of the maps follows from the pixels with a Gaussian, and so does their kind: depth along z or distance. New
+    Gaussians have the colours of the photos ``images [v,h,w,3]``. Their opacity, rotation and size in pixels
     are copied from the previous pixel with a Gaussian. The scene is returned unchanged if its Gaussians do not lie at
     the depths of the maps.
     """
