@@ -94,8 +94,8 @@ class MovedCameras:
         )
         if self.confirmed:
             text = (
-                f"the Gaussians are off their pixels by a median of up to {self.worst_px:.1f} px: those of each view"
-                " were moved to its camera, since the photos agree better from there"
+                f"the Gaussians are off their pixels by a median of up to {self.worst_px:.1f} px: the Gaussians of each"
+                " view were moved to its camera, since the photos agree better from there"
             )
         return f"{text}, {describe_moves(self.moves)}"
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from gsmerge.geometry import camera_depths, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.types import Gaussians, Scene, fill_pixels
+from gsmerge.types import Cameras, Gaussians, Scene, fill_pixels
 
 _MAX_SPREAD = 0.15  # median relative deviation of depth ratios; above it the map does not belong to the Gaussians
 
@@ -14,16 +14,13 @@ _MAX_SPREAD = 0.15  # median relative deviation of depth ratios; above it the ma
 def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scene:
     """Add a Gaussian at the depth of ``maps [v,h,w]`` for each pixel without a Gaussian.
 
-    The unit of the maps follows from the pixels with a Gaussian, and so does their kind: depth along z or distance. The
-    colours of new Gaussians are those of the photos ``images [v,h,w,3]``. Their opacity, rotation and size in pixels
+    The unit of the maps follows from the pixels with a Gaussian, and so does their kind: depth along z or distance. New
+    Gaussians have the colours of the photos ``images [v,h,w,3]``. Their opacity, rotation and size in pixels
     are copied from the previous pixel with a Gaussian. The scene is returned unchanged if its Gaussians do not lie at
     the depths of the maps.
     """
     g, V, fronts = scene.gaussians, scene.cameras.viewmats, scene.get_pixels().fronts.reshape(len(scene), -1)
-    height, width = scene.cameras.height, scene.cameras.width
-    y, x = np.mgrid[:height, :width].reshape(2, -1) + 0.5
-    pixels = np.stack([x, y, np.ones(x.size)], 1)
-    rays = matmul(pixels, invert(scene.cameras.Ks).transpose(0, 2, 1))  # [v,p,3] in the camera, z = 1
+    rays = _make_rays(scene.cameras)
     z = camera_depths(g.means[fronts].astype(np.float64), V[:, None])
     lengths, maps = np.linalg.norm(rays, axis=2), maps.reshape(len(scene), -1).astype(np.float64)
     has_depth = (maps > 0) & np.isfinite(maps)
@@ -34,10 +31,8 @@ def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scen
     if spread > _MAX_SPREAD:
         return scene
     empty = np.flatnonzero((fronts < 0) & has_depth)  # pixels that get a Gaussian
-    views = empty // (height * width)
     new_z = (unit * maps / (lengths if is_distance else 1)).reshape(-1)[empty]
-    local = rays.reshape(-1, 3)[empty] * new_z[:, None]
-    means = (V[views, :3, :3] * (local - V[views, :3, 3])[:, :, None]).sum(1)
+    means = _unproject(rays.reshape(-1, 3)[empty], new_z, V[empty // scene.pixels_per_view])
     previous = np.flatnonzero(usable)
     previous = previous[np.maximum(np.searchsorted(previous, empty) - 1, 0)]
     models = g[fronts.reshape(-1)[previous]]
@@ -46,6 +41,19 @@ def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scen
     means = means.astype(g.means.dtype)
     added = Gaussians(means, models.quats, scales, models.opacities, sh0, np.zeros_like(models.shN))
     return fill_pixels(scene, added, empty)
+
+
+def _make_rays(cameras: Cameras) -> np.ndarray:
+    """Return the points ``[v,p,3]`` at depth 1 on the rays of all pixels, in the frame of each camera."""
+    y, x = np.mgrid[: cameras.height, : cameras.width].reshape(2, -1) + 0.5
+    pixels = np.stack([x, y, np.ones(x.size)], 1)
+    return matmul(pixels, invert(cameras.Ks).transpose(0, 2, 1))
+
+
+def _unproject(rays: np.ndarray, z: np.ndarray, viewmats: np.ndarray) -> np.ndarray:
+    """Return points ``[n,3]`` of the world at depths ``z [n]`` on ``rays [n,3]`` of cameras ``viewmats [n,4,4]``."""
+    local = rays * z[:, None]
+    return np.asarray((viewmats[:, :3, :3] * (local - viewmats[:, :3, 3])[:, :, None]).sum(1))
 
 
 def _fit_unit(z: np.ndarray, maps: np.ndarray, lengths: np.ndarray) -> tuple[float, float, bool]:

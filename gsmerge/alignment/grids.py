@@ -49,7 +49,7 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class Place:
+class PlacedGrid:
     """Cameras that show Gaussians in place: the cameras of a grid, moved into the frame of the Gaussians."""
 
     grid: Grid

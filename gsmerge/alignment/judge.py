@@ -56,7 +56,7 @@ class Recovery:
     chosen: Candidate
     margin: float  # distance of the Gaussians from shuffled pixels, divided by their distance from their own pixels
     other: ScoredLayout | None = None  # another layout that fits the pixels as well; None if the pixels decided
-    color_margin: float | None = None  # colour error of the other layout, divided by that of the chosen layout
+    color_margin: float | None = None  # colour error of the other layout, divided by the chosen layout's
     # True if the photos' colours agree with the layout, False if they do not, None without photos that could decide
     confirmed: bool | None = None
 

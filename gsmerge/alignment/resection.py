@@ -143,12 +143,7 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     """
     middle = np.median(points, 0)
     unit = float(np.median(np.abs(points - middle))) or 1.0
-    homogeneous = np.concatenate([(points - middle) / unit, np.ones((len(points), 1))], 1)
-    homogeneous /= np.linalg.norm(homogeneous, axis=1, keepdims=True)
-    values, axes = eigh(matmul(homogeneous.T, homogeneous))
-    used = values > _FLAT * values[-1]  # points in a plane or on a line do not determine the other axes
-    basis = axes[:, used] / np.sqrt(values[used])
-    local = matmul(homogeneous, basis)
+    local, basis = _whiten((points - middle) / unit)
     centre, size = pixels.mean(0), float(pixels.std()) or 1.0
     targets = (pixels - centre) / size
     zero = np.zeros_like(local)
@@ -170,3 +165,16 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     camera[:, :3] /= unit
     camera[:, 3] -= matmul(camera[:, :3], middle)
     return camera, size * float(np.median(error))
+
+
+def _whiten(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return homogeneous coordinates ``[n,d]`` of points ``[n,3]`` in a basis of equal second moments, and the basis.
+
+    The basis ``[4,d]`` has fewer than four axes if the points lie in a plane or on a line.
+    """
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
+    homogeneous /= np.linalg.norm(homogeneous, axis=1, keepdims=True)
+    values, axes = eigh(matmul(homogeneous.T, homogeneous))
+    used = values > _FLAT * values[-1]  # points in a plane or on a line do not determine the other axes
+    basis = axes[:, used] / np.sqrt(values[used])
+    return matmul(homogeneous, basis), basis

@@ -22,7 +22,7 @@ from gsmerge.alignment.centres import CentreCheck, check_centres, find_rows, sam
 from gsmerge.alignment.frames import exporter_frames, scale_by
 from gsmerge.alignment.grids import (
     Grid,
-    Place,
+    PlacedGrid,
     file_grids,
     grids_of,
     network_sizes,
@@ -168,7 +168,7 @@ def _has_rows(source: RowSource) -> bool:
 # Search for pixels and cameras
 
 
-def _search(source: RowSource, known_grids: Sequence[Grid]) -> Recovery | Place | None:
+def _search(source: RowSource, known_grids: Sequence[Grid]) -> Recovery | PlacedGrid | None:
     """Find the pixels of the rows, or at least cameras that show the Gaussians in place; None if neither is found.
 
     ``known_grids`` are the grids of the sizes that files give.
@@ -176,9 +176,9 @@ def _search(source: RowSource, known_grids: Sequence[Grid]) -> Recovery | Place 
     if source.order == "none" or not _has_rows(source):
         return None
     recovery: Recovery | None = None
-    place: Place | None = None
+    place: PlacedGrid | None = None
     for result in _run_searches(source, known_grids):
-        if isinstance(result, Place):
+        if isinstance(result, PlacedGrid):
             place = place or _at_photo_size(result, known_grids)
             if not _have_smaller_grid(source, len(result.grid.cameras), result.grid):
                 break
@@ -189,7 +189,7 @@ def _search(source: RowSource, known_grids: Sequence[Grid]) -> Recovery | Place 
     return recovery or place
 
 
-def _run_searches(source: RowSource, known_grids: Sequence[Grid]) -> Iterator[Recovery | Place | None]:
+def _run_searches(source: RowSource, known_grids: Sequence[Grid]) -> Iterator[Recovery | PlacedGrid | None]:
     """Yield the results of one search after another: by the number of rows, by pixel centres, by the rows' own grid."""
     recovery = _match(source, [(grid, layout) for grid in known_grids for layout in _layouts(source, grid)])
     yield recovery
@@ -215,7 +215,7 @@ def _match(source: RowSource, grid_layouts: Sequence[GridLayout]) -> Recovery | 
     return judge(candidates, source.inputs, partial(rescore, source)) if candidates else None
 
 
-def _at_photo_size(place: Place, known_grids: Sequence[Grid]) -> Place:
+def _at_photo_size(place: PlacedGrid, known_grids: Sequence[Grid]) -> PlacedGrid:
     """Bring cameras to the size of the photos, because larger photos show more detail than photos at a network's size.
 
     ``known_grids`` are the grids of the sizes that files give; the cameras stay unchanged if none has their shape.
@@ -225,14 +225,14 @@ def _at_photo_size(place: Place, known_grids: Sequence[Grid]) -> Place:
     return replace(place, grid=replace(grid, camera_file=place.grid.camera_file, cameras=cameras))
 
 
-def _usual_places(source: RowSource, grid: Grid) -> Iterator[Place]:
+def _usual_places(source: RowSource, grid: Grid) -> Iterator[PlacedGrid]:
     """Yield the cameras of a grid in each frame of exporters, then in each other convention of their poses."""
     evidence = "Gaussians' places in their pixels"
-    yield from (Place(grid, frame, evidence) for frame in exporter_frames(grid.cameras, source.scale))
-    yield from (Place(other, IDENTITY) for other in other_grids(source, grid))
+    yield from (PlacedGrid(grid, frame, evidence) for frame in exporter_frames(grid.cameras, source.scale))
+    yield from (PlacedGrid(other, IDENTITY) for other in other_grids(source, grid))
 
 
-def _align_by_centres(source: RowSource, places: Iterable[Place]) -> Recovery | Place | None:
+def _align_by_centres(source: RowSource, places: Iterable[PlacedGrid]) -> Recovery | PlacedGrid | None:
     """Choose cameras under which the Gaussians lie around pixel centres, and find the pixels of the rows.
 
     Returns only the cameras if the rows have no pixels, and None if the photos contradict the cameras as well.
@@ -247,7 +247,7 @@ def _align_by_centres(source: RowSource, places: Iterable[Place]) -> Recovery | 
     return place if recovery is None and _shows_colors(source, place) else recovery
 
 
-def _shows_colors(source: RowSource, place: Place) -> bool:
+def _shows_colors(source: RowSource, place: PlacedGrid) -> bool:
     """Return True if the cameras see the Gaussians, with the colours of the photos if there are any."""
     from gsmerge.alignment.unaligned import check_cameras  # here because few files need it
 
@@ -255,7 +255,7 @@ def _shows_colors(source: RowSource, place: Place) -> bool:
     return check_cameras(inputs.gaussians, inputs.valid, place.cameras, inputs.images).ok
 
 
-def _find_pixels(source: RowSource, place: Place, check: CentreCheck) -> Recovery | None:
+def _find_pixels(source: RowSource, place: PlacedGrid, check: CentreCheck) -> Recovery | None:
     """Find the pixels of rows whose cameras are known; None if they have none.
 
     Layouts with the right number of rows are tried first, then the nearest pixel centre of each row.
@@ -298,11 +298,11 @@ def _ordered_layouts(source: RowSource, grid: Grid) -> list[Layout]:
     return [ordered for layout in _layouts(source, grid) for ordered in layout.with_views_in(orders)]
 
 
-def _has_shape_of(layout: Layout, others: Sequence[Layout]) -> bool:
-    """Return True if a layout without its borders has the size, order and layers of one of ``others``."""
+def _has_shape_of(layout: Layout, shown_layouts: Sequence[Layout]) -> bool:
+    """Return True if a layout without its borders has the size, order and layers of one of ``shown_layouts``."""
     y, x = np.divmod(layout.pixels[0][[0, -1]], layout.width)
     key = int(np.ptp(x)) + 1, int(np.ptp(y)) + 1, layout.order, layout.per_pixel
-    return any(key == (other.width, other.height, other.order, other.per_pixel) for other in others)
+    return any(key == (other.width, other.height, other.order, other.per_pixel) for other in shown_layouts)
 
 
 # Inexact cameras
@@ -351,7 +351,7 @@ def _choose_grid(source: RowSource, grids: Sequence[Grid]) -> Grid | None:
 
 
 def _choose_cameras(
-    source: RowSource, grid: Grid, frames: Callable[[], Sequence[Similarity]], place: Place | None
+    source: RowSource, grid: Grid, frames: Callable[[], Sequence[Similarity]], place: PlacedGrid | None
 ) -> AlignmentResult:
     """Choose cameras that see rows without pixels, unless they are known as ``place``.
 
@@ -397,7 +397,7 @@ def _check_photo_size(source: RowSource) -> None:
         raise error
 
 
-def _place_upright(source: RowSource, grid: Grid, rotation: Similarity) -> Place:
+def _place_upright(source: RowSource, grid: Grid, rotation: Similarity) -> PlacedGrid:
     """Find the frame of rows that an exporter centred, rescaled and turned upright; SceneError if that fails."""
     from gsmerge.alignment.upright import solve_upright, upright_error
 
@@ -405,7 +405,7 @@ def _place_upright(source: RowSource, grid: Grid, rotation: Similarity) -> Place
     for photos_grid in grids:
         frame = solve_upright(source.inputs(photos_grid), rotation)
         if frame is not None:
-            return Place(photos_grid, frame, "photos' colours")
+            return PlacedGrid(photos_grid, frame, "photos' colours")
     raise upright_error(source.ply.info, len(source.photos))
 
 

@@ -1,4 +1,4 @@
-"""Measure how near Gaussians project to their pixels, and how near their colours are to those of the photos."""
+"""Measure how near Gaussians project to their pixels, and how near their colours are to the colours of the photos."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class AlignmentInput:
     cameras: Cameras  # all c cameras at the grid's size, in their own world
     images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
     order: str = "auto"  # the order of the rows if it is given, otherwise "auto"
-    scale: float | None = None  # scale of the Gaussians' world over that of the cameras, if it is given
+    scale: float | None = None  # length of one unit of the cameras' world in the Gaussians' world, if given
 
     def pairs(self, layout: Layout) -> Correspondences:
         """Return the valid rows of a layout with their pixels and views."""
@@ -113,7 +113,7 @@ class ScoredLayout:
     """A layout of the rows in a frame, and how well it fits."""
 
     layout: Layout  # the assumed pixel of each row
-    frame: Similarity  # from the frame of the cameras to that of the Gaussians
+    frame: Similarity  # from the frame of the cameras to the frame of the Gaussians
     alignment: Alignment  # distance of the Gaussians of each part from their pixels
     effort: int = 0  # 0: the frame is an exporter's; 1: its scale or shift was solved for; 2: its rotation as well
 

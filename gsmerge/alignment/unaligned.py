@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.alignment.cameras import Poses, other_conventions
 from gsmerge.alignment.centres import check_centres, sample_points
 from gsmerge.alignment.frames import exporter_frames
-from gsmerge.alignment.grids import Grid, Place, with_poses
+from gsmerge.alignment.grids import Grid, PlacedGrid, with_poses
 from gsmerge.alignment.score import MARGIN, RANDOM_SHARE, SAME_COLORS, AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
@@ -123,9 +123,9 @@ def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: in
     return ratio, float(np.sqrt(np.square(residuals).mean() / count)) / mean_shuffled
 
 
-def _mean_difference(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
+def _mean_difference(colors: np.ndarray, other_colors: np.ndarray) -> np.ndarray:
     """Return the mean absolute difference ``[n]`` over the channels of colours ``[n,3]``."""
-    red, green, blue = np.abs(colors - others).T
+    red, green, blue = np.abs(colors - other_colors).T
     return np.asarray((red + green + blue) / 3)
 
 
@@ -174,13 +174,13 @@ def choose_poses(
 
 def choose_cameras(
     inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], no_pixels: SceneError
-) -> tuple[Place, list[str]]:
+) -> tuple[PlacedGrid, list[str]]:
     """Choose cameras that see the Gaussians: unchanged, in another frame, or in another convention; also return notes.
 
     ``frames`` are the frames that a file gives. The usual frames of exporters are tried next. The error ``no_pixels``
     explains why the rows have no pixels. It is raised, with what was tried, if no camera sees the Gaussians.
     """
-    rows, unchanged = (inputs.gaussians, inputs.valid), Place(grid, IDENTITY)
+    rows, unchanged = (inputs.gaussians, inputs.valid), PlacedGrid(grid, IDENTITY)
     if frames:
         given_score = check_cameras(*rows, inputs.cameras, inputs.images).score
         checks = [check_cameras(*rows, frame.move(inputs.cameras), inputs.images) for frame in frames]
@@ -191,7 +191,7 @@ def choose_cameras(
     other = _choose_frame(inputs, check)
     if other is not None:
         _check_colors(inputs, other.move(inputs.cameras), other.description, no_pixels)
-        return Place(grid, other, "photos' colours"), []
+        return PlacedGrid(grid, other, "photos' colours"), []
     if not check.ok:
         raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", no_pixels.remedy)
     if poses is None:

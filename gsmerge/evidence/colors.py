@@ -3,8 +3,8 @@
 A change is a hypothesis with parameters: red and blue exchanged, a tone curve for each channel, or a linear map of
 colours. Pictures are cut into blocks, which are dealt into two halves like the squares of a chess board. The change of
 one half is fitted to the other half, so no block is scored by a change that was fitted to it. A change is accepted if
-it reduces the errors of blocks by more than their noise and by more than half. The errors are those of the means of
-blocks, because wrong depth displaces few Gaussians across a block.
+it reduces the errors of blocks by more than their noise and by more than half. The error of a block is the error of its
+mean colour, because wrong depth displaces few Gaussians across a block.
 """
 
 from __future__ import annotations

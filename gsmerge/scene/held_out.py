@@ -77,7 +77,7 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
 
 
 def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int]]:
-    """Read a camera file into the frame of a scene's Gaussians; also map its views to those of the scene.
+    """Read a camera file into the frame of a scene's Gaussians; also map its views to views of the scene.
 
     Frame and convention are chosen as in :func:`read_held_out`.
     """

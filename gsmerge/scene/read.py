@@ -126,7 +126,7 @@ class Loaded:
 
     @property
     def comments(self) -> tuple[str, ...]:
-        """Comments of the file's header that a result copies, except that for 2D Gaussians: those of results are 3D."""
+        """Comments of the file's header that a result copies; not the comment on 2D Gaussians, since results are 3D."""
         return tuple(comment for comment in kept_comments(self.info) if comment != FLAT_COMMENT)
 
     @property

@@ -73,7 +73,7 @@ def register(scenes: Sequence[Scene]) -> Registration:
     agreeing = [pair.select(_squares(similarities, pair, spread) < AGREE) for pair in connected]
     matches = [sum(len(pair) for pair in agreeing if i in pair.scenes) for i in range(count)]
     unit = _unit(photos, similarities)
-    rounded = tuple(None if each is None else round_similarity(each, unit) for each in similarities)
+    rounded = tuple(None if similarity is None else round_similarity(similarity, unit) for similarity in similarities)
     return Registration(rounded, tuple(matches))
 
 
@@ -218,13 +218,21 @@ def _chain(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> S
         similarities = _chain_from(start, links, count)
         if _num_connected(similarities) > _num_connected(best):
             best = similarities
-    first = next(each for each in best if each is not None)
+    first = next(similarity for similarity in best if similarity is not None)
     to_first = invert_similarity(first)
-    return [each and (IDENTITY if each is first else compose(to_first, each)) for each in best]
+
+    def move(similarity: Similarity | None) -> Similarity | None:
+        """Change the frame of a similarity to the frame of the first scene."""
+        if similarity is None:
+            return None
+        return IDENTITY if similarity is first else compose(to_first, similarity)
+
+    return list(map(move, best))
 
 
 def _num_connected(similarities: Similarities) -> int:
-    return sum(each is not None for each in similarities)
+    """Count the scenes that are placed."""
+    return sum(similarity is not None for similarity in similarities)
 
 
 def _chain_from(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
