@@ -228,7 +228,9 @@ def _split_views(
     scene: Scene, pictures: np.ndarray, held_out: Views | None
 ) -> dict[str, tuple[Cameras, np.ndarray, Sequence[str]]]:
     """Return cameras in the world, photos and names of the views by split."""
-    splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
+    splits: dict[str, tuple[Cameras, np.ndarray, Sequence[str]]] = {
+        "context": (scene.cameras.numpy(), pictures, scene.names)
+    }
     if held_out is not None:
         splits["target"] = (held_out.cameras.numpy(), held_out.images, held_out.names)
     return splits

@@ -39,7 +39,7 @@ def test_the_table_of_a_step_is_the_struct_of_its_source():
     text = (FOLDER / "raster" / "step.c").read_text()
     (body,) = re.findall(r"typedef struct \{\n([^}]*)\} Step;", text)
     fields = [(kind, name) for kind, names in re.findall(r"(\w+) ([^;]*);", body) for name in re.split(r",\s*", names)]
-    assert [name.lstrip("*") for _, name in fields] == list(STEP.places)
+    assert [name.lstrip("*") for _, name in fields] == list(STEP.fields)
     for (kind, name), argument in zip(fields, STEP.arrays.values(), strict=False):
         assert f"{kind} *" == argument.c.removeprefix("const "), name
     assert all(kind == "int64_t" and name[0] != "*" for kind, name in fields[len(STEP.arrays) :])
