@@ -41,10 +41,10 @@ class Setting:
     neutral: tuple[Any, ...] = ()  # values besides the default with which it decides nothing
     replaces: bool = False  # true: it replaces the closed formulas of the stages
     in_batches: bool = True  # false: batches of views take its default only
-    # Of a group of settings: "superpixels" if they decide how views become superpixels, "views" if they act on the
-    # views otherwise
+    # For a group of settings: "superpixels" if they decide how views become superpixels, "views" if they have another
+    # effect on views
     acts_on: Literal["", "views", "superpixels"] = ""
-    common: bool = False  # true: every method uses it, baselines too
+    common: bool = False  # True if every method uses it, baselines too
     # Not empty: values other than the default need the whole scene, and messages call the setting by its "name", or
     # by name and "value"
 
@@ -117,7 +117,7 @@ class Setting:
         return all(bool(holds(value, limit)) for limit, holds in limits if is_number and limit is not None)
 
     def values(self, *, null: bool = True) -> str:
-        """Describe the possible values: choices, a range, or a type; ``null``: mention None too."""
+        """Describe the possible values: choices, a range, or a type; if ``null``, also None."""
         kinds = [kind for kind in self.kinds if kind is not NoneType]
         texts = [self._describe_range(kind) if kind in (int, float) else KIND_NAMES.get(kind, "") for kind in kinds]
         texts += [str(word) for word in self.words]
