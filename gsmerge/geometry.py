@@ -1,6 +1,6 @@
-"""Geometry on batches: quaternions, covariances, projection, harmonics, similarities, motions, regions; medians.
+"""Compute geometry on batches: quaternions, covariances, projection, harmonics, similarities, motions and regions.
 
-Also damped descent, by which small problems are solved.
+The module also has medians, and damped descent, which solves small problems.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
 
 State = TypeVar("State")  # state that a descent changes
-MORTON_BITS = 21  # bits for each axis; three times as many fit into 63 bits
-DEPTH_SAMPLE = 50_000  # points by which the median depth in a view is measured
+MORTON_BITS = 21  # bits for each axis; three axes fit into 63 bits
+DEPTH_SAMPLE = 50_000  # points; the median depth in a view is measured on about so many
+MIN_COSINE = 1e-9  # angles about x and z have the same axis if the cosine of the angle about y is smaller
 DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
 BRIGHT = np.float32(20.0)  # harmonic of degree 0 so large that no colour is clipped at 0
 
@@ -82,8 +83,8 @@ def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
 def project(means: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Project points ``[n,3]`` into c cameras, in float64.
 
-    Returns positions ``[c,n,2]`` in pixels, with pixel centres at +0.5, and depths ``[c,n]`` along z. Positions mean
-    nothing for points whose depth is not positive.
+    Returns positions ``[c,n,2]`` in pixels, with pixel centres at +0.5, and depths ``[c,n]`` along z. Positions of
+    points with a depth of 0 or less are meaningless.
     """
     with np.errstate(divide="ignore", invalid="ignore"):  # behind or on the plane of a camera
         return project_points(*(array.astype(np.float64) for array in (means, cameras.viewmats, cameras.Ks)))
@@ -101,7 +102,7 @@ def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> 
 
 
 def is_inside(pixels: np.ndarray, cameras: Cameras) -> np.ndarray:
-    """Return a mask ``[...]`` of the positions ``[...,2]``, in pixels, that lie in the cameras' pictures."""
+    """Return a mask ``[...]`` of the positions ``[...,2]`` (pixels) inside the cameras' pictures."""
     column, row = pixels[..., 0], pixels[..., 1]
     return np.asarray((column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height))
 
@@ -119,11 +120,11 @@ def motion_matrices(vectors: np.ndarray) -> np.ndarray:
     """
     vectors = vectors.astype(np.float64)
     angles = _lengths(vectors[:, :3])
-    shares = np.where(angles > 0, sin(angles / 2) / np.where(angles > 0, angles, 1), 0.5)
-    out = np.tile(np.eye(4), (len(vectors), 1, 1))
-    out[:, :3, :3] = quat_to_rotmat(np.concatenate([cos(angles / 2), shares * vectors[:, :3]], 1))
-    out[:, :3, 3] = vectors[:, 3:]
-    return out
+    factors = np.where(angles > 0, sin(angles / 2) / np.where(angles > 0, angles, 1), 0.5)
+    motions = np.tile(np.eye(4), (len(vectors), 1, 1))
+    motions[:, :3, :3] = quat_to_rotmat(np.concatenate([cos(angles / 2), factors * vectors[:, :3]], 1))
+    motions[:, :3, 3] = vectors[:, 3:]
+    return motions
 
 
 def euler_to_rotmat(degrees: np.ndarray) -> np.ndarray:
@@ -134,10 +135,10 @@ def euler_to_rotmat(degrees: np.ndarray) -> np.ndarray:
 
 def rotmat_to_euler(rotation: np.ndarray) -> np.ndarray:
     """Return the ``degrees [3]`` about x, y and z with which :func:`euler_to_rotmat` makes ``rotation [3,3]``."""
-    # cosine of the angle about y; near 0, the other two angles have the same axis, and that about z is set to 0
+    # cosine of the angle about y; near 0, the other two angles have the same axis, and the angle about z is set to 0
     cosine = np.sqrt(np.square(rotation[:2, 0]).sum())
     about_y = arctan2(-rotation[2, 0], cosine)
-    if cosine < 1e-9:
+    if cosine < MIN_COSINE:
         return np.asarray(np.degrees([arctan2(-rotation[1, 2], rotation[1, 1]), about_y, 0.0]))
     about_x, about_z = arctan2(rotation[2, 1], rotation[2, 2]), arctan2(rotation[1, 0], rotation[0, 0])
     return np.asarray(np.degrees([about_x, about_y, about_z]))
@@ -192,7 +193,7 @@ def middle_depth(means: np.ndarray, camera: Cameras) -> float:
 
 
 def depths_inside(means: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; a 1 if there are none."""
+    """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; ``[1]`` if there are none."""
     points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
     (pixels,), (depths,) = project(points, camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
@@ -240,7 +241,7 @@ def camera_distances(cameras: Cameras) -> np.ndarray:
     viewmats = cameras.viewmats.astype(np.float64)
     centres_and_directions = (camera_centres(viewmats), viewmats[:, 2, :3])
     differences = [vectors[:, None] - vectors[None] for vectors in centres_and_directions]
-    return np.asarray(sum(np.sqrt((vectors * vectors).sum(-1)) for vectors in differences))
+    return np.asarray(sum(np.sqrt((difference * difference).sum(-1)) for difference in differences))
 
 
 def order_others(distances: np.ndarray) -> np.ndarray:
@@ -313,16 +314,16 @@ def _harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:
     count = len(means)
     sh0 = np.full((count, 1, 3), BRIGHT)
     ids = np.arange(count, dtype=np.int32)
-    plain = np.empty((count, 3), np.float32)
+    degree0_colors = np.empty((count, 3), np.float32)
     colors = np.empty((count, 3), np.float32)
     eye = np.zeros(3, np.float32)
-    view_colors(means, sh0, np.zeros((count, num, 3), np.float32), ids, eye, 0, count, plain)
+    view_colors(means, sh0, np.zeros((count, num, 3), np.float32), ids, eye, 0, count, degree0_colors)
     columns = []
-    for base in range(num):
+    for harmonic in range(num):
         shN = np.zeros((count, num, 3), np.float32)
-        shN[:, base] = 1
+        shN[:, harmonic] = 1
         view_colors(means, sh0, shN, ids, eye, 0, count, colors)
-        columns.append((colors - plain)[:, 0].astype(np.float64))
+        columns.append((colors - degree0_colors)[:, 0].astype(np.float64))
     return np.stack(columns, 1)
 
 
@@ -337,7 +338,7 @@ def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
 
 
 def robust_weights(errors: np.ndarray, doubt: float, least: float, sizes: np.ndarray | float = 1.0) -> np.ndarray:
-    """Return Cauchy's weights ``[n]`` for reweighted least squares; they are small for errors far above the median.
+    """Return Cauchy's weights ``[n]`` for reweighted least squares, which are small for errors far above the median.
 
     The weights are 1 / (sizes^2 (1 + (errors / (doubt * median + least))^2)).
     """
@@ -348,11 +349,11 @@ def robust_weights(errors: np.ndarray, doubt: float, least: float, sizes: np.nda
 class Damping:
     """Limits of the steps of :func:`descend`, and changes of their damping."""
 
-    steps: int  # Most steps
+    steps: int  # Largest number of steps
     first: float  # Damping of the first step, a share of the curvature
     ease: float  # Factor on the damping after a step that lowers the error
-    brake: float  # Factor on the damping after a step that does not
-    most: float  # Damping beyond which no step is tried
+    brake: float  # Factor on the damping after a step that does not lower the error
+    most: float  # Largest damping; no step is tried beyond it
     min_gain: float  # Share of the error that a step must remove for another step to follow
 
 
@@ -361,22 +362,22 @@ def descend(
 ) -> State:
     """Take damped steps that each lower the error, by Levenberg and Marquardt's rule, and return the last state.
 
-    ``step`` returns the next state with an amount of damping, or None if there is none.
+    ``step`` takes a state and its damping, and returns the next state, or None if there is none.
     """
     state, amount = start, damping.first
-    least = error(state)
+    least_error = error(state)
     for _ in range(damping.steps):
         trial = step(state, amount)
         if trial is None:
             break
         trial_error = error(trial)
-        if not trial_error < least:
+        if not trial_error < least_error:
             amount *= damping.brake
             if amount > damping.most:
                 break
             continue
-        gain = 1 - trial_error / least
-        state, least = trial, trial_error
+        gain = 1 - trial_error / least_error
+        state, least_error = trial, trial_error
         if gain < damping.min_gain:
             break
         amount *= damping.ease
@@ -391,7 +392,7 @@ class Similarity:
     scale: float  # Positive
     shift: np.ndarray  # [3] in units of the Gaussians
     description: str = ""  # Text for people; empty if both frames are the same
-    # "same", "scaled", "shifted"; "first", "middle" or "upright", the camera by which it was rotated; "other"
+    # "same", "scaled" or "shifted"; "first", "middle" or "upright" if rotated into the frame of this camera; or "other"
     kind: str = "same"
 
     def move_points(self, points: np.ndarray) -> np.ndarray:
@@ -427,8 +428,8 @@ IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
 def move_region(region: Region, origin: np.ndarray, unit: float) -> Region:
     """Move a region into a frame with another origin and unit, in which positions are float32."""
     middle, half = (region.middle - origin) / unit, region.half / unit
-    own = float(np.finfo(np.float32).eps) * float(np.abs(middle).max() + half.max())
-    return replace(region, middle=middle, half=half, rounding=region.rounding / unit + own)
+    rounding = float(np.finfo(np.float32).eps) * float(np.abs(middle).max() + half.max())  # of float32
+    return replace(region, middle=middle, half=half, rounding=region.rounding / unit + rounding)
 
 
 def lies_inside(region: Region, points: np.ndarray) -> np.ndarray:
@@ -441,14 +442,14 @@ def lies_inside(region: Region, points: np.ndarray) -> np.ndarray:
 
 
 def clamp_inside(region: Region, points: np.ndarray) -> np.ndarray:
-    """Return the points of a region that are nearest to ``points [n,3]``, in float64."""
+    """Move ``points [n,3]`` outside a region to the nearest points inside it; return all in float64."""
     local = matmul(points - region.middle, region.axes.T)
-    most = np.maximum(region.half - region.rounding, region.half / 2)
+    half = np.maximum(region.half - region.rounding, region.half / 2)
     if region.is_sphere:
         lengths = np.sqrt(np.square(local).sum(1, keepdims=True))
-        local *= np.minimum(1.0, most[0] / np.maximum(lengths, most[0]))
+        local *= np.minimum(1.0, half[0] / np.maximum(lengths, half[0]))
     else:
-        local = np.clip(local, -most, most)
+        local = np.clip(local, -half, half)
     return np.asarray(region.middle + matmul(local, region.axes))
 
 

@@ -1,10 +1,11 @@
 """The core types: frozen dataclasses of arrays, which can be indexed, concatenated and moved to a device.
 
 Arrays are NumPy's. Gaussians and cameras may hold torch tensors of one device instead, for :func:`gsmerge.render`,
-networks and training; this module imports torch only if it is asked for tensors.
+networks and training. This module imports torch only when tensors are requested.
 
-One convention in memory (docs/reference/conventions.md): linear scales, opacities in [0, 1], unit quaternions wxyz that
-rotate local to world, world-to-camera matrices with OpenCV axes, pixel centres at +0.5, sRGB in [0, 1].
+Arrays in memory follow one convention (docs/reference/conventions.md): linear scales, opacities in [0, 1], unit
+quaternions wxyz that rotate local to world, world-to-camera matrices with OpenCV axes, pixel centres at +0.5, and sRGB
+in [0, 1].
 """
 
 from __future__ import annotations
@@ -185,7 +186,7 @@ class LargePhotos:
     Ks: np.ndarray  # [v,3,3] intrinsics at the size of the photos
     width: int
     height: int
-    ids: tuple[int, ...]  # Number by which the photo of each view is read
+    ids: tuple[int, ...]  # Number of each view's photo, for `read`
     read: Callable[[int], np.ndarray]  # Number -> [height,width,3] uint8 sRGB; several threads may call it
 
     def __getitem__(self, views: Sequence[int]) -> LargePhotos:
@@ -236,8 +237,8 @@ class Pixels:
     Pixels are numbered over all views, ``(v·H + y)·W + x``.
 
     Args:
-        homes: ``[n]`` int, the pixel in which each Gaussian is most visible; -1: no view sees it.
-        fronts: ``[v,h,w]`` int32, the Gaussian in front in each pixel; -1: none.
+        homes: ``[n]`` int, the pixel in which each Gaussian is most visible; -1 if no view sees it.
+        fronts: ``[v,h,w]`` int32, the front Gaussian of each pixel; -1 for none.
         own: Each view has Gaussians of its own, one or more for a pixel, with the colours of its photo.
     """
 
@@ -271,17 +272,17 @@ class Pixels:
             order = np.argsort(views, kind="stable")
             views = views[order]
         starts = np.searchsorted(views, np.arange(len(self.fronts) + 1))
-        return [order[first:last] for first, last in pairwise(starts.tolist())]
+        return [order[start:end] for start, end in pairwise(starts.tolist())]
 
     def select(self, views: Sequence[int]) -> tuple[np.ndarray, Pixels]:
         """Return the rows ``[m]`` of the Gaussians of some views, view by view, and their pixels in these views."""
         size, view_rows = int(np.prod(self.fronts.shape[1:])), [self.rows_of_views[view] for view in views]
-        homes, fronts, first = [self.homes[:0]], list[np.ndarray](), 0
+        homes, fronts, num_selected = [self.homes[:0]], list[np.ndarray](), 0
         for new_view, (view, rows) in enumerate(zip(views, view_rows, strict=True)):
             homes.append(self.homes[rows] + self.homes.dtype.type((new_view - view) * size))
-            front, places = self.fronts[view], np.searchsorted(rows, self.fronts[view])
-            fronts.append(np.where(front >= 0, first + places, -1).astype(np.int32))
-            first += len(rows)
+            view_fronts, positions = self.fronts[view], np.searchsorted(rows, self.fronts[view])
+            fronts.append(np.where(view_fronts >= 0, num_selected + positions, -1).astype(np.int32))
+            num_selected += len(rows)
         shape = len(view_rows), *self.fronts.shape[1:]
         rows = np.concatenate([np.zeros(0, np.int64), *view_rows])
         return rows, Pixels(np.concatenate(homes), np.array(fronts, np.int32).reshape(shape), own=self.own)
@@ -295,7 +296,7 @@ class Region:
     half: np.ndarray  # [3] half of each side of a box; three times the same radius for a sphere
     axes: np.ndarray  # [3,3] rotation into the directions of the sides
     is_sphere: bool
-    rounding: float = 0.0  # Rounding of stored positions; clamped positions stay so far inside the border
+    rounding: float = 0.0  # Rounding of stored positions; clamped positions stay inside the border by this distance
 
 
 @dataclass(frozen=True)
@@ -384,7 +385,7 @@ class Scene:
 
     @property
     def covered(self) -> np.ndarray | None:
-        """Mask ``[v,h,w]`` of the pixels for which the file has a Gaussian of their view; None if that is all pixels.
+        """Mask ``[v,h,w]`` of the pixels with a Gaussian of their view in the file; None if all pixels have one.
 
         It is also None if views have no Gaussians of their own.
         """
@@ -407,7 +408,7 @@ class Scene:
 
     @property
     def protected(self) -> np.ndarray | None:
-        """Mask ``[v,h,w]`` of the pixels with at least half the importance of a protected one; None if none has."""
+        """Mask ``[v,h,w]`` of the pixels with at least half the importance of a protected pixel; None for none."""
         if self.images is None or self.importance is None:
             return None
         mask = self.importance >= PROTECTED / 2
@@ -420,7 +421,7 @@ class Scene:
 
     @property
     def file_gaussians(self) -> Gaussians:
-        """Gaussians of the file, without those that fill holes."""
+        """Gaussians of the file, without Gaussians that fill holes."""
         return self.gaussians if self.filled is None else self.gaussians[~self.filled]
 
     @property
@@ -435,22 +436,22 @@ def make_scene(gaussians: Gaussians, cameras: Cameras) -> Scene:
 
 
 def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:
-    """Add Gaussians to a scene, one in each of the pixels ``places [n]``, numbered over all views, that show none."""
-    first, before = len(scene.gaussians), scene.get_pixels()
-    homes, fronts = before.homes, before.fronts.copy()
-    fronts.reshape(-1)[places] = np.arange(first, first + len(added), dtype=np.int32)
-    pixels = replace(before, homes=np.concatenate([homes, places.astype(homes.dtype)]), fronts=fronts)
-    filled = np.zeros(first, bool) if scene.filled is None else scene.filled
+    """Add Gaussians to a scene, each in an empty pixel of ``places [n]``; pixels are numbered over all views."""
+    count, old_pixels = len(scene.gaussians), scene.get_pixels()
+    homes, fronts = old_pixels.homes, old_pixels.fronts.copy()
+    fronts.reshape(-1)[places] = np.arange(count, count + len(added), dtype=np.int32)
+    pixels = replace(old_pixels, homes=np.concatenate([homes, places.astype(homes.dtype)]), fronts=fronts)
+    filled = np.zeros(count, bool) if scene.filled is None else scene.filled
     filled = np.concatenate([filled, np.ones(len(added), bool)])
     return replace(scene, gaussians=Gaussians.concat([scene.gaussians, added]), pixels=pixels, filled=filled)
 
 
 @dataclass(frozen=True)
 class PicturedScene(Scene):
-    """A scene with a picture of every view: its photo, or a picture that is used instead.
+    """A scene with a picture of every view: its photo, or a replacement.
 
-    ``empty [v,h,w]`` marks pixels, by a mask or by shares, in which the scene may show nothing; pictures are black
-    there, and do not count for scores. None: no pixel.
+    ``empty [v,h,w]`` is a mask, or a share, of pixels in which the scene may show nothing. Pictures are black there,
+    and these pixels do not count for scores. None: no pixel.
     """
 
     images: np.ndarray
@@ -487,7 +488,7 @@ class Segmentation:
 
     groups: Groups  # Superpixels of every view
     count: int  # Largest number of Gaussians in the result
-    exact: bool  # Exactly that number was asked for
+    exact: bool  # True if exactly this number was requested
 
 
 @dataclass(frozen=True)
@@ -549,6 +550,6 @@ class Decoded:
 
     gaussians: Gaussians  # Canonical Gaussians
     count: int  # Number to which the fit may grow
-    exact: bool  # The result has to have exactly that number
+    exact: bool  # True if the result must have exactly this number
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that the fit does not change; None: none
-    is_input: bool = False  # These are all Gaussians of the scene, unchanged
+    is_input: bool = False  # True if these are all Gaussians of the scene, unchanged

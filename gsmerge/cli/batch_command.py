@@ -167,7 +167,7 @@ def run_jobs(
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
-    """Raise BatchError if jobs ``failed`` (name, reason); its message gives the first reason unless ``listed``."""
+    """Raise BatchError if jobs ``failed`` (name, reason); give the first reason unless all were ``listed``."""
     if failed:
         raise BatchError(f"{len(failed)} of {total} {unit} failed{_first_reason(failed, listed=listed)}")
 

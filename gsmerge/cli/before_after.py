@@ -24,7 +24,7 @@ TOLERANCE = 1e-5  # largest difference, absolute and relative, of equal poses af
 def lpips_networks(
     choice: str | None, usual: Sequence[str] = EvaluateOptions().lpips
 ) -> tuple[tuple[str, ...], list[str]]:
-    """Choose LPIPS networks by ``--lpips``, by default the installed ones of ``usual``; note if none is installed."""
+    """Choose LPIPS networks by ``--lpips``, by default the installed ones of ``usual``; note if there is none."""
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
     if choice is None:

@@ -105,7 +105,7 @@ def evaluate(args: opt.Args) -> None:
 
 
 def _check_files(args: opt.Args, outputs: Sequence[Path], measuring: MeasuringOptions, inputs: Sequence[Path]) -> None:
-    """Raise UsageError if an output cannot be written, or if ``merge_seconds`` are not as many as the results."""
+    """Raise UsageError if an output cannot be written, or if ``merge_seconds`` has not one value per result."""
     for path in outputs:
         if path.suffix not in SUFFIXES:
             raise UsageError(f"{path}: expected a name ending in {opt.join_words(SUFFIXES)}")

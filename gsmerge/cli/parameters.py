@@ -48,7 +48,7 @@ METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH",
 REQUIRED = Parameter.empty
 LIST_SETTINGS = "help"  # value for which --set prints all settings
 SEED = "GSMERGE_SEED"  # environment variable: the seed of commands that are given none
-MAX_DIGITS = 1000  # of that seed; Python refuses only far more
+MAX_DIGITS = 1000  # of the seed in this variable; Python's own limit is far higher
 
 SETTINGS = {
     setting.name: setting for kind in (EvaluateOptions, Engine, PlacementOptions, CompactOptions)
@@ -61,7 +61,7 @@ class Args(SimpleNamespace):
 
     @property
     def silent(self) -> bool:
-        """Whether to print only data, or nothing."""
+        """True if only data is printed, or nothing."""
         return bool(self.quiet or self.json)
 
     def given(self, names: Iterable[str]) -> dict[str, Any]:
@@ -70,7 +70,7 @@ class Args(SimpleNamespace):
         return {name: values[name] for name in names if values.get(name) is not None}
 
     def require_scene(self, names: Collection[str], path: Path) -> None:
-        """Raise UsageError for an option that is not in ``names``, since the input ``path`` holds Feature Gaussians."""
+        """Raise UsageError for a given option outside ``names``, since the input ``path`` holds Feature Gaussians."""
         for name, value in vars(self).items():
             if value and name not in names and value != OPTIONS[name].default:
                 flag = f"--{name.replace('_', '-')}"
@@ -92,10 +92,10 @@ class Args(SimpleNamespace):
         """Collect the settings of the classes ``kinds`` that the user gave, by flat name, except those in ``but``."""
         settings = {name: setting for kind in kinds for name, setting in flat_settings(kind).items() if name not in but}
         options = self.given(settings)
-        chosen = parse_pairs("--set", vars(self).get("set") or (), settings)
-        for name in options.keys() & chosen.keys():
+        pairs = parse_pairs("--set", vars(self).get("set") or (), settings)
+        for name in options.keys() & pairs.keys():
             raise UsageError(f"--set {name}: expected this setting once, got --{name.replace('_', '-')} too")
-        values = options | chosen
+        values = options | pairs
         if "seed" in settings:
             values |= {"seed": values["seed"]} if "seed" in values else _environment_seed()
         if Path(str(values.get("crop"))).suffix.lower() in CROP_FILES:
@@ -106,8 +106,8 @@ class Args(SimpleNamespace):
 
     def settings(self, **changes: Any) -> CompactOptions:
         """Make the options of :func:`gsmerge.compact`, as :meth:`make` does."""
-        made: CompactOptions = self.make(CompactOptions, **changes)[0]
-        return made
+        options: CompactOptions = self.make(CompactOptions, **changes)[0]
+        return options
 
     @property
     def opacity(self) -> OpacityChoice:
@@ -130,13 +130,13 @@ class Args(SimpleNamespace):
     def files(self, scene: Path, *more: Path) -> SceneFiles:
         """Find the .ply, cameras and photos of a scene, and of further scenes to join with it.
 
-        Cameras and photos are those that the user named, otherwise those beside each scene.
+        Cameras and photos that the user named are used; otherwise cameras and photos beside each scene.
         """
         from gsmerge.scene.files import find_scene_files
 
-        places = {"cameras": self.cameras, **{name: vars(self).get(name) for name in ("images", "masks", "protect")}}
-        first, *others = (find_scene_files(path, **places) for path in (scene, *more))
-        return replace(first, more=tuple(others))
+        named = {"cameras": self.cameras, **{name: vars(self).get(name) for name in ("images", "masks", "protect")}}
+        files, *more_files = (find_scene_files(path, **named) for path in (scene, *more))
+        return replace(files, more=tuple(more_files))
 
     def load(self, files: SceneFiles, **defaults: Any) -> Loaded:
         """Read the scene of ``files``, unless the command that called this one has already ``loaded`` it.
@@ -162,21 +162,26 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
         if not sign:
             raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}")
         if name not in settings:
-            near = join_words(find_near_names(name, settings, 3, 0.5))
-            hint = f"; perhaps {near}" if near else ""
-            known = f"{flag} {LIST_SETTINGS} lists all" if flag == "--set" else f"expected {join_words(settings)}"
-            raise UsageError(f"{flag} {name}: unknown{hint}; {known}")
+            similar = join_words(find_near_names(name, settings, 3, 0.5))
+            hint = f"; perhaps {similar}" if similar else ""
+            remedy = f"{flag} {LIST_SETTINGS} lists all" if flag == "--set" else f"expected {join_words(settings)}"
+            raise UsageError(f"{flag} {name}: unknown{hint}; {remedy}")
         if name in values:
             raise UsageError(f"{flag} {name}: expected it once, got it twice")
-        candidates = _parse_value(text)
-        if settings[name].is_list:
-            candidates.append([_parse_value(part.strip())[0] for part in text.split(",")])
-        fitting = [value for value in candidates if settings[name].fits(value)]
-        if not fitting:
-            expected, hint = settings[name].expected(candidates[0], null=True), suggest_name(text, settings[name].words)
-            raise UsageError(f"{flag} {name}: expected {expected}, got {text!r}{hint}")
-        values[name] = fitting[0]
+        values[name] = _parse_setting(f"{flag} {name}", text, settings[name])
     return values
+
+
+def _parse_setting(label: str, text: str, declared: Setting) -> Any:
+    """Parse the value of a setting; UsageError that begins with ``label`` if it has the wrong type."""
+    candidates = _parse_value(text)
+    if declared.is_list:
+        candidates.append([_parse_value(element.strip())[0] for element in text.split(",")])
+    for value in candidates:
+        if declared.fits(value):
+            return value
+    expected, hint = declared.expected(candidates[0], null=True), suggest_name(text, declared.words)
+    raise UsageError(f"{label}: expected {expected}, got {text!r}{hint}")
 
 
 def _parse_value(text: str) -> list[Any]:
@@ -218,8 +223,8 @@ def option(
 ) -> Parameter:  # fmt: skip
     """Declare an option of a command; ``kind`` bool makes a switch, a tuple lists the possible values.
 
-    ``flags``: by default derived from the name. ``wording``: the default in words, if the library decides it. ``more``
-    is passed to Typer.
+    By default ``flags`` are derived from the name. ``wording`` is the default in words, if the library decides it.
+    ``more`` is passed to Typer.
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
     if more.get("metavar") is None:
@@ -274,7 +279,7 @@ def _escape(help: str) -> str:
 
 
 def command(*parameters: str | Parameter) -> Callable[[Callable[[Args], None]], Callable[..., None]]:
-    """Decorate a command with its parameters, in the order of the help; a text holds names of declared options."""
+    """Decorate a command with its parameters, in the order of the help; a text lists names of declared options."""
     listed: dict[str, Parameter] = {}
     for parameter in (*parameters, "json quiet"):
         for name in parameter.split() if isinstance(parameter, str) else [parameter.name]:
@@ -300,14 +305,14 @@ def command(*parameters: str | Parameter) -> Callable[[Callable[[Args], None]], 
 
 
 def call(function: Callable[..., None], **values: Any) -> None:
-    """Run another command with the given parameters; all others have their defaults."""
+    """Run another command with parameters ``values``; its other parameters have their defaults."""
     declared: Signature = function.__signature__  # type: ignore[attr-defined]
     function(**{name: parameter.default for name, parameter in declared.parameters.items()} | values)
 
 
 def settings_option(*kinds: type | LazyFunction, help: str = "Any other setting, such as {}; may be repeated. --set "
                     "help lists all.", example: str = "match=aabb") -> Parameter:  # fmt: skip
-    """Declare ``--set`` for the settings of ``kinds``, which ``--set help`` lists; slow ones are LazyFunctions."""
+    """Declare ``--set`` for the settings of ``kinds``; a class that takes long to import is given as a LazyFunction."""
 
     def show(values: list[str] | None) -> list[str] | None:
         if LIST_SETTINGS not in (values or ()):
@@ -339,7 +344,7 @@ def _settings_lines(settings: Mapping[str, Setting]) -> list[str]:
 
 def share_list(text: str) -> list[str]:
     """Parse shares that are separated by commas: "1,4.4%" -> ["1%", "4.4%"]."""
-    shares = [f"{part.strip().removesuffix('%')}%" for part in text.split(",")]
+    shares = [f"{number.strip().removesuffix('%')}%" for number in text.split(",")]
     try:
         numbers = [parse_share(share) for share in shares]
     except ValueError:

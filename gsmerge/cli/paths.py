@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
 
 
-# One of these is in the first MARKED_BYTES of the reports that gsmerge writes: pages, JSON, CSV, Markdown
+# Reports that gsmerge writes (pages, JSON, CSV, Markdown) have one of these texts in their first MARKED_BYTES
 MARKS = (b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,", b"<!-- gsmerge ")
 MARKED_BYTES = 4000
 
@@ -41,10 +41,10 @@ def default_output(ply: Path) -> Path:
 
 
 def output_file(output: Path, name: str, *, site: bool = False) -> Path:
-    """Return the file that an output names; for a folder, that is a file in it.
+    """Return the file that an output names; for a folder, return a file in it.
 
-    A name without an ending is a folder unless such a file exists. In a folder the file is the page of a ``site``, the
-    main file of the format that the folder's name stands for, or otherwise ``name``.
+    A name without an ending is a folder unless a file of this name exists. The file in a folder is the page of a
+    ``site``, or the main file of a format if the folder has the name of the format, or otherwise ``name``.
     """
     from gsmerge.io.formats.table import FOLDERS, FORMATS, OUTPUT_FORMATS
 
@@ -74,7 +74,7 @@ def _read_start(path: Path) -> bytes:
 
 
 def files_beside(output: Path, *, site: bool = False) -> tuple[Path, ...]:
-    """List the further files of an output with known names; SceneError if files of another program have these names."""
+    """List further files that belong to an output; SceneError if files of another program have their names."""
     from gsmerge.io.formats.table import find_format
 
     return tuple(find_format(output).beside(output, site))
@@ -92,7 +92,7 @@ def check_format(output: Path, options: FileOptions) -> None:
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Raise UsageError for an output that is an input, exists without ``overwrite``, or is given twice.
 
-    ``inputs`` are the files that are read, and folders of photos or COLMAP models, in which no file is replaced.
+    ``inputs`` are the files that are read, and folders of photos or COLMAP models; no file in them is replaced.
     SceneError if the output cannot be written. Missing folders are made together with their first file, so a run that
     fails earlier makes no folders.
     """
@@ -132,7 +132,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
         raise UsageError(f"{output}: expected an output other than the input; name another output")
     if os.path.lexists(output) and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another output")
-    _check_place(output.parent, output, "a folder to write to")
+    _check_writable(output.parent, output, "a folder to write to")
 
 
 def check_replaced(outputs: Sequence[Path]) -> None:
@@ -142,8 +142,8 @@ def check_replaced(outputs: Sequence[Path]) -> None:
             raise UsageError(f"{output}: exists already and is not a report of gsmerge; name another output")
 
 
-def _check_place(folder: Path, output: Path, expected: str) -> None:
-    """Raise SceneError if a folder, or the nearest one above it that exists, cannot be written to."""
+def _check_writable(folder: Path, output: Path, expected: str) -> None:
+    """Raise SceneError if a folder, or the nearest existing folder above it, cannot be written to."""
     try:
         nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     except OSError as error:
@@ -175,7 +175,7 @@ def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
 
     The folder is made together with its first file, so a run that fails earlier makes no folder.
     """
-    _check_place(folder, folder, "a folder to write pictures to")
+    _check_writable(folder, folder, "a folder to write pictures to")
     try:
         occupied = folder.is_dir() and next(folder.iterdir(), None) is not None
     except OSError as error:

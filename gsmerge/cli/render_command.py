@@ -14,11 +14,11 @@ from gsmerge.errors import UsageError
 from gsmerge.settings.pictures import CLIPS, PICTURES
 from gsmerge.settings.reading import NONE
 
-MAX_SIDE = 1 << 20  # pixels; so large that pictures have the size of the cameras
-# Endings of outputs that can hold each channel: "color" with alpha, opacity, and depth, which takes 16 bits. Folders
-# can hold all
+MAX_SIDE = 1 << 20  # pixels; larger than any camera, so that pictures keep the size of the cameras
+# Endings of outputs that can hold each channel: "color" with alpha, "alpha", and "depth", which takes 16 bits. Folders
+# can hold all channels
 LAYERS = {"color": (".png", ".webp", ".webm"), "alpha": (*PICTURES, *CLIPS), "depth": (".png",)}
-MAX_DIGITS = 9  # of a number of views that are read
+MAX_DIGITS = 9  # only so many digits of a number of views are read
 SIDES = (16, 16384)  # least and largest width and height of a picture, pixels
 
 
@@ -138,14 +138,14 @@ def _choose_kind(args: opt.Args) -> str:
         raise UsageError(f"--frames: expected a clip, {opt.join_words(CLIPS)}, or a --path with it")
     if is_layer and is_picture and isinstance(args.views, int):
         raise UsageError(f"{args.output}: expected a folder for several --views, or the name of one view")
-    alone = is_layer or (isinstance(args.views, str) and len(args.scenes) == 1)
-    return "panel" if is_picture and not alone else "views"
+    is_single = is_layer or (isinstance(args.views, str) and len(args.scenes) == 1)
+    return "panel" if is_picture and not is_single else "views"
 
 
 def _check_layer(args: opt.Args, suffix: str) -> bool:
-    """Return whether alpha, opacity or depth is drawn; UsageError if an output with this ``suffix`` cannot hold it.
+    """Return True if colours with alpha, opacity or depth are drawn; UsageError if the output cannot hold them.
 
-    ``suffix``: "" for a folder.
+    ``suffix`` is the ending of the output, "" for a folder.
     """
     channel = args.channel or "color"
     if channel == "color" and args.background != NONE:
@@ -153,9 +153,9 @@ def _check_layer(args: opt.Args, suffix: str) -> bool:
     option, endings = f"--channel {channel}", LAYERS[channel]
     if channel == "color":
         option = "--background none"
-    for other in ("overlay", "background") if channel != "color" else ():
-        if vars(args)[other] is not None:
-            raise UsageError(f"--{other}: expected --channel color with it, got {option}")
+    for name in ("overlay", "background") if channel != "color" else ():
+        if vars(args)[name] is not None:
+            raise UsageError(f"--{name}: expected --channel color with it, got {option}")
     if len(args.scenes) > 1 or (suffix and suffix not in endings):
         raise UsageError(f"{args.output}: expected one scene, and a folder or {opt.join_words(endings)}, with {option}")
     return True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -19,9 +19,9 @@ from gsmerge.settings.setting import find_near_names, flat_settings, suggest_nam
 PROGRAM = "gsmerge"
 LAB = "lab"  # group of research commands
 LOOK = "look"  # compact with a page; runs if the first word is a scene instead of a command
-_LEAST_SIMILARITY = 0.75  # of an unknown option and the suggested one, 0 to 1, as difflib measures it
+_LEAST_SIMILARITY = 0.75  # of an unknown option and a suggestion, 0 to 1, as difflib measures it
 
-# Names of other programs for our commands
+# Names in other programs of the commands
 COMMAND_SYNONYMS = {
     "compact": ("compress", "simplify", "reduce", "decimate", "optimize", "optimise", "run"),
     "convert": ("transform", "export", "join", "merge", "combine", "crop", "translate"),
@@ -30,7 +30,7 @@ COMMAND_SYNONYMS = {
     "render": ("preview", "segment"),
     "view": ("viewer", "compare"),
 }
-# Names of other programs for our options
+# Names in other programs of the options
 OPTION_SYNONYMS = {
     "overwrite": ("force", "f", "clobber", "replace", "yes", "y"),
     "output": ("o", "out", "outdir", "out_dir", "output_dir", "output_path", "outfile", "dest"),
@@ -39,7 +39,7 @@ OPTION_SYNONYMS = {
     "images": ("photos", "image", "image_dir", "image_path"),
     "cameras": ("camera", "poses", "transforms", "colmap"),
 }
-# The same for formats, which the name of an output decides here, and for --budget
+# Names in other programs of an option for the format, which is here the ending of the output, and of --budget
 FORMAT_WORDS = ("format", "to", "type", "ext", "extension")
 BUDGET_WORDS = (
     "ratio", "percent", "percentage", "share", "fraction", "factor", "keep", "count", "num", "number", "gaussians",
@@ -83,14 +83,14 @@ def _check_words(param: Any, words: Any, times: int, names: set[str]) -> None:
     is_option = param.param_type_name == "option"
     label = param.opts[0] if is_option else param.metavar or str(param.name).upper()
     words = [word for word in (words if isinstance(words, (list, tuple)) else [words]) if isinstance(word, str)]
-    for place, word in enumerate(words):
+    for i, word in enumerate(words):
         if not word:
             raise UsageError(f"{label}: expected a value, got an empty one")
         if is_option and word == "-" and param.name == "output":
             raise UsageError(f"{label}: expected a file to write, got -; results are not written to stdout")
         if is_option and (word in names or word == "-" or word.startswith("--")):
             raise UsageError(f"{label}: expected a value, got {word}")
-        if is_option and word in words[:place]:
+        if is_option and word in words[:i]:
             raise UsageError(f"{label}: expected each value once, got {word} twice")
     if is_option and words and times > 1 and not param.multiple:
         raise UsageError(f"{label}: expected one value, got {times}")
@@ -115,12 +115,12 @@ class Command(_Words, TyperCommand):
 
 def usage_message(error: Any, make_command: Callable[[], Any]) -> str:
     """Describe wrong usage in one line, with a correction if one is known; ``make_command`` makes all commands."""
-    place = PROGRAM if error.ctx is None else error.ctx.command_path.replace(f" {LOOK}", " compact")
+    path = PROGRAM if error.ctx is None else error.ctx.command_path.replace(f" {LOOK}", " compact")
     message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # Typer adds this prefix
     parameters = [] if error.ctx is None else error.ctx.command.params
     has_output = any(parameter.name == "output" for parameter in parameters)
     if hasattr(error, "possibilities") and error.ctx is not None:
-        suggestion = _suggest(error.option_name, error.ctx.command, place, make_command)
+        suggestion = _suggest(error.option_name, error.ctx.command, path, make_command)
         message = suggestion or f"No such option: {error.option_name}"
     elif match := re.search(r": '(.*)' is not one of (.*)", message):
         message += suggest_name(match[1], re.findall("'([^']*)'", match[2]))
@@ -131,14 +131,14 @@ def usage_message(error: Any, make_command: Callable[[], Any]) -> str:
             return f"help is not a command: use {PROGRAM} --help, or {PROGRAM} COMMAND --help"
         synonym = next((name for name, words in COMMAND_SYNONYMS.items() if match[1] in words), None)
         message = message if synonym is None else f"{match[0]}. Did you mean '{synonym}'?"
-    return f"{message}; see '{place} --help'"
+    return f"{message}; see '{path} --help'"
 
 
-def _suggest(option: str, command: Any, place: str, make_command: Callable[[], Any]) -> str | None:
-    """Suggest a replacement for an option that ``command``, called as ``place``, does not have; None if there is none.
+def _suggest(option: str, command: Any, path: str, make_command: Callable[[], Any]) -> str | None:
+    """Suggest a replacement for an option that ``command``, called as ``path``, does not have; None if there is none.
 
-    The suggestion is ``--set`` or ``--hint`` if the name is that of a setting without an option of its own, the option
-    that other programs call so, an option with a similar name, or the command that has the option.
+    The suggestion is ``--set`` or ``--hint`` if a setting without an option of its own has this name. Otherwise it is
+    the option that has this name in other programs, an option with a similar name, or the command that has the option.
     """
     name = option.lstrip("-").replace("-", "_")
     names = {str(parameter.name): parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
@@ -162,15 +162,21 @@ def _suggest(option: str, command: Any, place: str, make_command: Callable[[], A
     if name in FORMAT_WORDS and "output" in names:
         example = ", such as -o x.spz" if command.name in ("compact", LOOK) else ""
         return f"{option} is not an option: the ending of -o sets the format{example}"
-    extended = [known for known in names if len(name) > 2 and known.startswith(name)]
-    near = [known for known in synonyms if known in names] or (extended if len(extended) == 1 else [])
-    near = near or find_near_names(name, names, least=_LEAST_SIMILARITY)
-    if near and not name.startswith("no_"):
-        return f"{option} is not an option: use {names[near[0]]}"
+    similar = _find_similar(name, names, synonyms)
+    if similar is not None and not name.startswith("no_"):
+        return f"{option} is not an option: use {names[similar]}"
     owner = None if positive in names else _owner({name, positive, *synonyms}, make_command())
     if owner is not None and hasattr(command, "commands"):
         return f"{option} comes after the name of a command or scene"
-    return None if owner is None else f"{option} is not an option of {place}: use {PROGRAM} {owner}"
+    return None if owner is None else f"{option} is not an option of {path}: use {PROGRAM} {owner}"
+
+
+def _find_similar(name: str, names: Collection[str], synonyms: Sequence[str]) -> str | None:
+    """Return a synonym among ``names``, or else the only name that begins with ``name``, or a similar name."""
+    listed = [synonym for synonym in synonyms if synonym in names]
+    longer = [known for known in names if len(name) > 2 and known.startswith(name)]
+    similar = listed or (longer if len(longer) == 1 else []) or find_near_names(name, names, least=_LEAST_SIMILARITY)
+    return similar[0] if similar else None
 
 
 def _owner(names: set[str], group: Any) -> str | None:

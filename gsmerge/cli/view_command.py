@@ -53,9 +53,9 @@ def view(args: opt.Args) -> None:
         pair = read_before_after(args, files)
         say_notes(pair.notes, quiet=args.silent)
         sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
-        results, cameras, gains, more = _compact_sizes(pair, args.sizes, progress) if args.sizes else ({}, {}, {}, [])
+        results, cameras, gains, result_sizes = _compact_sizes(pair, args.sizes or (), progress)
         data = collect(
-            pair.title, pair.scene, pair.gaussians | results, [*sizes, *more], pair.held_out,
+            pair.title, pair.scene, pair.gaussians | results, [*sizes, *result_sizes], pair.held_out,
             cameras=pair.cameras | cameras, new_gains=file_gains(pair.plys) | gains, light=args.light,
             progress=progress,
         )  # fmt: skip
@@ -83,6 +83,8 @@ def _compact_sizes(
 
     Without files AFTER, the share nearest to the default comes first, since the page opens with it.
     """
+    if not shares:
+        return {}, {}, {}, []
     from gsmerge.compaction.compact import compact
     from gsmerge.io.formats.ply import file_bytes
     from gsmerge.settings.budget import parse_share
@@ -91,9 +93,9 @@ def _compact_sizes(
     results: dict[str, Gaussians] = {}
     cameras: dict[str, Cameras] = {}
     gains: dict[str, tuple[float, float]] = {}
-    usual = min(shares, key=lambda share: abs(parse_share(share) - parse_share(SHARE)), default="")
-    first = None if pair.plys else usual
-    for share in sorted(shares, key=lambda share: (share != first, parse_share(share))):
+    nearest = min(shares, key=lambda share: abs(parse_share(share) - parse_share(SHARE)))
+    first_share = None if pair.plys else nearest
+    for share in sorted(shares, key=lambda share: (share != first_share, parse_share(share))):
         name = share.replace("%", " %")
         progress(f"compact to {name}", 0, 0)
         result = compact(pair.load.scene, budget=share, fill=True)

@@ -37,7 +37,7 @@ class FileCheck:
     path: str
     kind: str  # "Gaussians", "cameras", "networks" or "Feature Gaussians"; "" if the file cannot be read
     count: int = 0  # Number of Gaussians, Feature Gaussians, views of cameras, or parameters of networks
-    layout: str = ""  # Layout of the columns, or of the camera file
+    layout: str = ""  # Layout of the columns, or format of the camera file
     file_bytes: int = 0
     problems: tuple[str, ...] = ()  # One sentence each, without a full stop
     notes: tuple[str, ...] = ()  # Unusual content that is not wrong, and content that was not read
@@ -83,13 +83,18 @@ def holds_scene(path: Path) -> bool:
 
 
 def list_damage(path: Path) -> list[str]:
-    """List problems that reading a file does not show: bytes after its content, and wrong checksums of its parts."""
+    """List problems that reading a file does not reveal: bytes after its content, and wrong checksums of its parts."""
     suffix = path.suffix.lower()
     if os.path.isdir(path):
         return [f"{file.name}: {problem}" for file in list_plys(path) for problem in list_damage(file)]
-    problem = damaged_member(path) if suffix in ARCHIVES else spz.problem_at_end(path) if suffix == ".spz" else None
-    surplus = ply.bytes_after_rows(path) if suffix == ".ply" else 0
-    return [problem] if problem else [f"{surplus:,} bytes after the last row, which are not read"] if surplus else []
+    problem = None
+    if suffix in ARCHIVES:
+        problem = damaged_member(path)
+    elif suffix == ".spz":
+        problem = spz.problem_at_end(path)
+    elif suffix == ".ply" and (surplus := ply.bytes_after_rows(path)):
+        problem = f"{surplus:,} bytes after the last row, which are not read"
+    return [problem] if problem else []
 
 
 def _read(path: Path) -> FileCheck:
@@ -124,7 +129,7 @@ def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileChe
 
 
 def _read_cameras(path: Path) -> FileCheck:
-    """Read the cameras of a file, of all its scenes if it has several."""
+    """Read the cameras of a file; if it has several scenes, read the cameras of all."""
     count = 0
     for cameras in read_all_cameras(path):
         count += len(cameras)

@@ -42,15 +42,18 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import PicturedScene, Scene, StrPath
 
-_OPAQUE = 0.995  # opacity from which on the optical depth is capped
-_SATURATED = 1e-6  # distance of an opacity to 0 or 1 up to which float32 changes its logit
+_OPAQUE = 0.995  # the optical depth is capped from this opacity on
+_SATURATED = 1e-6  # float32 changes the logit of an opacity that is nearer to 0 or 1 than this
 _OWN = "gsmerge"  # name of the exporter of files that gsmerge wrote
 _FILE_KEYS = (
     "path", "layout", "format", "count", "bytes_by_attribute", "extra_columns", "extra_elements", "sh_degree",
     "opacity_encoding", "num_nonfinite", "num_empty", "num_clipped_scales", "num_zero_quats",
 )  # fmt: skip
+_UNKNOWN_KEYS = (
+    "camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement", "num_unseen",
+)  # None unless the views are known  # fmt: skip
 _CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
-_REPEATED = "read as: "  # notes that repeat a line of their own
+_REPEATED = "read as: "  # begins notes that repeat another line
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}
 
 
@@ -136,7 +139,7 @@ def _photo_notes(scene: Scene) -> list[str]:
 
 
 def _measure_agreement(scene: Scene) -> Agreement | None:
-    """Measure how far views confirm each other's depth; None without views or Gaussians."""
+    """Measure the share of depth that other views confirm; None without views or Gaussians."""
     return confirm_depths(canonicalise(scene)[0]) if len(scene) and len(scene.gaussians) else None
 
 
@@ -157,19 +160,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         "exporter": _OWN if is_result else "not known before the cameras fit",
         "notes": file_notes(ply.info),
         **dict.fromkeys(("num_views", "width", "height", "per_pixel", "num_missing", "num_sky_views"), 0),
-        **dict.fromkeys(
-            (
-                "camera_format",
-                "rows",
-                "alignment",
-                "alignment_problem",
-                "sight",
-                "compact",
-                "auto",
-                "agreement",
-                "num_unseen",
-            )
-        ),
+        **dict.fromkeys(_UNKNOWN_KEYS),
         "coverage": [],
         "new_views": None if expected is None else asdict(expected),
     }
@@ -197,7 +188,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
 
 
 def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
-    """Describe a scene that was read: its views, what they see, and the result that ``compact`` would make."""
+    """Describe a scene that was read: its views, their coverage, and the result that ``compact`` would make."""
     scene, sight, num_sky_views = load.scene, None, 0
     if len(scene):
         gaussians = scene.gaussians
@@ -205,8 +196,8 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
         means = gaussians.means[np.isfinite(gaussians.means).all(1)]
         num_sky_views = len(sky_regions(means, scene.cameras, images))
-    once = without_repeats(scene)[0]  # each view once, as in a run
-    agreement = _measure_agreement(once)
+    distinct = without_repeats(scene)[0]  # each view once, as in a run
+    agreement = _measure_agreement(distinct)
     doubts = [unlike_captures(scene.gaussians), None if agreement is None else agreement.doubt]
     facts: dict[str, Any] = {
         "notes": [*load.notes, *views_notes(scene), *_photo_notes(scene), *filter(None, doubts)],
@@ -216,12 +207,11 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         "sight": sight and asdict(sight),
         "num_sky_views": num_sky_views,
         "compact": estimate(scene, CompactOptions()),
-        "auto": _describe_auto(once, agreement),
+        "auto": _describe_auto(distinct, agreement),
         "agreement": agreement and agreement.to_dict(),
     }
-    if (
-        is_result and len(scene) and load.recovery is None
-    ):  # with pixels, Gaussians of overlapping views hide each other
+    # In a scene with pixels, Gaussians of overlapping views hide each other
+    if is_result and len(scene) and load.recovery is None:
         facts["num_unseen"] = int((count_views_in_world(scene.gaussians, scene.cameras) == 0).sum())
     if not is_result:
         is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)
@@ -231,11 +221,11 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
 
 def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
     """Describe the document of :func:`inspect` in lines of text."""
-    parts = ", ".join(f"{name} {human_bytes(size)}" for name, size in scene["bytes_by_attribute"].items())
-    ignored, size = _ignored(scene), scene["extents"]
-    low, high = (" ".join(f"{value:.4g}" for value in size[key]) for key in ("box_low", "box_high"))
+    attributes = ", ".join(f"{name} {human_bytes(size)}" for name, size in scene["bytes_by_attribute"].items())
+    ignored, extent = _ignored(scene), scene["extents"]
+    low, high = (" ".join(f"{value:.4g}" for value in extent[key]) for key in ("box_low", "box_high"))
     lines = [
-        f"file       {scene['path']}: {human_bytes(scene['bytes'])} ({parts})",
+        f"file       {scene['path']}: {human_bytes(scene['bytes'])} ({attributes})",
         f"layout     {scene['layout']}, {scene['format']}; opacity stored {_ENCODINGS[scene['opacity_encoding']]}",
         f"marks      {'; '.join(scene['marks'])}" if scene["marks"] else "",
         f"exporter   {scene['exporter']}",
@@ -244,8 +234,9 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_empty']:,} empty,"
         f" {scene['num_transparent']:,} transparent,"
         f" {scene['num_opaque']:,} opaque, {scene['num_saturated']:,} of opacity 0 or 1",
-        f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.3g} % beyond ten times that box",
-        f"floaters   about {round(size['share_floaters'] * scene['count']):,}: isolated, or beyond that;"
+        f"extent     {low}  to  {high}  (1 % to 99 %);"
+        f" {100 * extent['share_outliers']:.3g} % beyond ten times that box",
+        f"floaters   about {round(extent['share_floaters'] * scene['count']):,}: isolated, or beyond that;"
         " compact --drop floaters leaves them out",
         f"unseen     {scene['num_unseen']:,}: hidden or outside all views; --drop unseen leaves them out"
         if scene["num_unseen"]
@@ -253,8 +244,8 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"sky        in {scene['num_sky_views']} photos; compact --drop sky leaves it out"
         if scene["num_sky_views"]
         else "",
-        f"scales     median {size['scale_median']:.3g}, largest {size['scale_max']:.3g} in a scene of"
-        f" {size['diagonal']:.3g}; {100 * size['share_huge']:.3g} % above a tenth of it",
+        f"scales     median {extent['scale_median']:.3g}, largest {extent['scale_max']:.3g} in a scene of"
+        f" {extent['diagonal']:.3g}; {100 * extent['share_huge']:.3g} % above a tenth of it",
         f"cameras    {_describe_cameras(scene)}",
         f"images     {scene['images'] or 'none found'}",
         *_alignment_lines(scene),
@@ -300,7 +291,7 @@ def _describe_cameras(scene: Mapping[str, Any]) -> str:
 
 
 def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe which row belongs to which pixel, and how far off the rows are; or say why that is unknown."""
+    """Describe the order of the rows and their distances from their pixels; or say why these are unknown."""
     alignment, problem = scene["alignment"], scene["alignment_problem"]
     if problem is not None and scene["compact"] is None:
         return []  # the error says why
@@ -320,7 +311,7 @@ def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe which shares of pixels or Gaussians the views show, and name the view that shows least."""
+    """Describe the shares of pixels or Gaussians that the views show, and name the view with the least share."""
     views, sight = scene["coverage"], scene["sight"]
     if not views or sight is None:
         return []
@@ -331,14 +322,14 @@ def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
     key, unit = ("share_of_pixels", "pixels") if pixelwise else ("share_of_gaussians", "Gaussians")
     shares = [view[key] for view in views]
     low, high = f"{100 * min(shares):.0f}", f"{100 * max(shares):.0f}"
-    each = f"{high} % of the {unit} in every view"
+    range_text = f"{high} % of the {unit} in every view"
     if low != high:
-        each = f"{low} to {high} % of the {unit} per view, least in {views[shares.index(min(shares))]['name']}"
-    return [f"coverage   {each}; {100 * sight['share_seen']:.0f} % of the Gaussians lie in some picture{colors}"]
+        range_text = f"{low} to {high} % of the {unit} per view, least in {views[shares.index(min(shares))]['name']}"
+    return [f"coverage   {range_text}; {100 * sight['share_seen']:.0f} % of the Gaussians lie in some picture{colors}"]
 
 
 def _agreement_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe for which share of the pixels other views confirm the depth."""
+    """Describe the share of pixels whose depth other views confirm."""
     agreement = scene["agreement"]
     if agreement is None:
         return []

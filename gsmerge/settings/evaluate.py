@@ -8,7 +8,7 @@ from gsmerge.runtime import MOST_THREADS
 from gsmerge.settings.setting import Settings, setting
 
 NETS = ("vgg", "alex")
-MAX_ZOOM = 16.0  # the least is its inverse; beyond these, pictures have no pixels left or fill the memory
+MAX_ZOOM = 16.0  # the least zoom is its inverse; outside this range pictures have no pixels or fill the memory
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from gsmerge.settings.setting import Settings, setting
 Fit = Literal["full", "none"]
 STEPS = 320  # of the full fit
 LONG_STEPS = 600  # runs of at least so many steps gain from a little dropout
-USUAL_SHARE = 0.044  # Gaussians per pixel; a quarter of the pixels shows so many well
+USUAL_SHARE = 0.044  # Gaussians per pixel; photos with a quarter of the pixels suffice for this number
 TOO_FEW_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all their Gaussians
 
@@ -39,8 +39,9 @@ class Tuning:
     # needles when a viewer enlarges them. 0: no limit
     min_scale: float = 0.5
     # A Gaussian is large if its three sigma reach `long_share` of the width of the nearest photo. Once a run
-    # has grown, a large Gaussian is at most `max_ratio` times as long as its second axis, since longer ones show
-    # as strokes from other viewpoints. Before, long Gaussians help a small number of them to find their places
+    # has grown, a large Gaussian is at most `max_ratio` times as long as its second axis, since longer Gaussians show
+    # as strokes from other viewpoints. Earlier there is no such limit, since few Gaussians find their places better
+    # while they may be long
     long_share: float = 0.25
     max_ratio: float = 3.0
     average_share: float = 0.2  # Share of the steps, the last ones, over which the parameters are averaged
@@ -49,14 +50,14 @@ class Tuning:
     # grows from 0, since the gradients of edges mean little before the edges lie in their places
     edge_weight: float = 2.4
     # Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024):
-    # what the photos do not need fades, instead of standing in front of other views
+    # Gaussians that the photos do not need fade, instead of hiding surfaces in other views
     opacity_reg: float = 0.03
     # Weight in the loss of the mean size, in units of each Gaussian's size at its start. Fewer Gaussians
     # overlap then, and a step takes a third less time
     scale_reg: float = 0.01
     outside_every: int = 7  # Steps from one outside view to the next, see gsmerge.fit.outside
-    # Share of the steps before the first outside view, 1 for none. Early on, Gaussians that hang in gaps
-    # help the others
+    # Share of the steps before the first outside view, 1 for none. Early in a run, Gaussians in gaps help
+    # the other Gaussians
     outside_from: float = 0.15
     iterations: int = 6  # Conjugate-gradient steps of the colour fit
     prior_weight: float = 0.03  # Weight of the colours before the colour fit, relative to visibility

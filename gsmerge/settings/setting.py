@@ -41,10 +41,10 @@ class Setting:
     neutral: tuple[Any, ...] = ()  # values besides the default with which it decides nothing
     replaces: bool = False  # true: it replaces the closed formulas of the stages
     in_batches: bool = True  # false: batches of views take its default only
-    # Of a group of settings: "superpixels" if they decide how views become superpixels, "views" if they act on the
-    # views otherwise
+    # For a group of settings: "superpixels" if they decide how views become superpixels, "views" if they have another
+    # effect on views
     acts_on: Literal["", "views", "superpixels"] = ""
-    common: bool = False  # true: every method uses it, baselines too
+    common: bool = False  # True if every method uses it, baselines too
     # Not empty: values other than the default need the whole scene, and messages call the setting by its "name", or
     # by name and "value"
 
@@ -78,14 +78,14 @@ class Setting:
     @property
     def kinds(self) -> list[Any]:
         """Types that a value may have."""
-        kinds = [kind for kind in _parts(self.kind) if get_origin(kind) is not Literal]
+        kinds = [kind for kind in _types(self.kind) if get_origin(kind) is not Literal]
         return [kind for kind in kinds if kind is NoneType] if self.choices else kinds
 
     @property
     def words(self) -> tuple[Any, ...]:
         """The possible values that are listed one by one."""
         listed = self.choices() if callable(self.choices) else self.choices
-        literals = [kind for kind in _parts(self.kind) if get_origin(kind) is Literal]
+        literals = [kind for kind in _types(self.kind) if get_origin(kind) is Literal]
         return (*listed, *(word for kind in literals for word in get_args(kind)))
 
     def fits(self, value: Any) -> bool:
@@ -96,7 +96,7 @@ class Setting:
 
     def _fits(self, value: Any) -> bool:
         is_bool = type(value).__name__.startswith("bool")  # of Python or NumPy, which is not imported here
-        for kind in _parts(self.kind):
+        for kind in _types(self.kind):
             if get_origin(kind) is Literal:
                 fits = value in get_args(kind)
             elif kind is bool:
@@ -117,7 +117,7 @@ class Setting:
         return all(bool(holds(value, limit)) for limit, holds in limits if is_number and limit is not None)
 
     def values(self, *, null: bool = True) -> str:
-        """Describe the possible values: choices, a range, or a type; ``null``: mention None too."""
+        """Describe the possible values: choices, a range, or a type; if ``null``, also None."""
         kinds = [kind for kind in self.kinds if kind is not NoneType]
         texts = [self._describe_range(kind) if kind in (int, float) else KIND_NAMES.get(kind, "") for kind in kinds]
         texts += [str(word) for word in self.words]
@@ -156,7 +156,7 @@ class Setting:
             self._check(value)
 
     def _check(self, value: Any) -> None:
-        is_text = not self.choices and set(_parts(self.kind)) <= {str, NoneType}
+        is_text = not self.choices and set(_types(self.kind)) <= {str, NoneType}
         if is_text and not isinstance(value, str | NoneType):
             raise ValueError(f"{self.name}: expected a text, got {value!r}")
         is_checked_later = any(kind not in (int, float, bool, NoneType) for kind in self.kinds)  # by its class
@@ -201,12 +201,12 @@ def settings_of(options: type) -> dict[str, Setting]:
 
 @cache
 def flat_settings(options: type) -> dict[str, Setting]:
-    """Return all settings by flat name; those of a stage stand in place of the stage."""
+    """Return all settings by flat name; the settings of a stage replace the stage."""
     flat: dict[str, Setting] = {}
     for name, declared in settings_of(options).items():
         if not declared.internal:
             inner = flat_settings(declared.kind) if declared.is_group else {name: declared}
-            flat |= {name: replace(one, acts_on=one.acts_on or declared.acts_on) for name, one in inner.items()}
+            flat |= {key: replace(entry, acts_on=entry.acts_on or declared.acts_on) for key, entry in inner.items()}
     return flat
 
 
@@ -216,10 +216,14 @@ def names_of(options: type, condition: Callable[[Setting], Any]) -> tuple[str, .
 
 
 def piece_settings(options: type, *, trial: bool = False) -> dict[str, Any]:
-    """Return the values that a run on a piece of a scene needs, by flat name; ``trial``: a run on some views to try."""
+    """Return the values that a run on a piece of a scene needs, by flat name.
+
+    ``trial`` stands for a run that tries settings on some of the views.
+    """
     declared = flat_settings(options)
     values = {
-        name: one.in_trial if trial and one.in_trial is not SAME else one.in_piece for name, one in declared.items()
+        name: entry.in_trial if trial and entry.in_trial is not SAME else entry.in_piece
+        for name, entry in declared.items()
     }
     return {name: value for name, value in values.items() if value is not SAME}
 
@@ -229,9 +233,9 @@ def change_settings(options: T, values: Mapping[str, Any]) -> T:
     changes: dict[str, Any] = {}
     for name, declared in settings_of(type(options)).items():
         names = flat_settings(declared.kind) if declared.is_group and not declared.internal else {name}
-        chosen = {name: values[name] for name in names if name in values}
-        if chosen:
-            changes[name] = change_settings(getattr(options, name), chosen) if declared.is_group else values[name]
+        new_values = {key: values[key] for key in names if key in values}
+        if new_values:
+            changes[name] = change_settings(getattr(options, name), new_values) if declared.is_group else values[name]
     changed: T = replace(options, **changes)  # type: ignore[type-var]
     return changed
 
@@ -250,19 +254,19 @@ def find_near_names(word: str, names: Iterable[Any], count: int = 1, least: floa
     from difflib import get_close_matches
 
     lower = {str(name).lower(): name for name in names}
-    return [lower[near] for near in get_close_matches(word.lower(), lower, count, least)]
+    return [lower[match] for match in get_close_matches(word.lower(), lower, count, least)]
 
 
 def suggest_name(word: Any, names: Iterable[Any]) -> str:
     """Return "; perhaps NAME", the end of a message about an unknown word, or "" if no name resembles it."""
-    return "".join(f"; perhaps {near}" for near in find_near_names(word, names)) if isinstance(word, str) else ""
+    return "".join(f"; perhaps {name}" for name in find_near_names(word, names)) if isinstance(word, str) else ""
 
 
-def _parts(kind: Any) -> list[Any]:
+def _types(kind: Any) -> list[Any]:
     """List the possible types of a value, or of the elements of a list."""
     if get_origin(kind) in (Union, UnionType):
-        return [part for member in get_args(kind) for part in _parts(member)]
-    return _parts(get_args(kind)[0]) if get_origin(kind) is tuple else [kind]
+        return [inner for member in get_args(kind) for inner in _types(member)]
+    return _types(get_args(kind)[0]) if get_origin(kind) is tuple else [kind]
 
 
 def _number(value: float | None) -> str:
