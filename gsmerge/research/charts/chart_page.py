@@ -16,6 +16,7 @@ from gsmerge.settings.compact import OURS
 MAX_SCENES = 6  # most scenes with pictures on the page
 MAX_RESULTS = 5  # most pictures of a view in addition to the photo and the input
 COSTS = ("Gaussians", "Kept", "File", "Seconds", "ms/view")
+MEDIA = {".jpg": "image/jpeg", ".png": "image/png"}  # media types of pictures
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows
 
 
@@ -39,7 +40,7 @@ def make_page(
         words=words + (f"; {len(failed)} failed" if failed else ""),
         part=PARTS[results.part],
         doubt=results.caveat,
-        results=_results(results),
+        results=_mean_table(results),
         figures=[(figure, data_uri(drawings[figure.name], "image/svg+xml")) for figure in figures],
         views=_views(results, folder),
         max_error=MAX_ERROR,
@@ -50,11 +51,13 @@ def make_page(
 
 
 def _interval(value: Interval, digits: int) -> str:
+    """Write a mean, with the half width of its interval if there are enough scenes."""
     half = value.high - value.mean
     return f"{value.mean:.{digits}f}" + (f" ± {half:.{digits}f}" if value.count >= MIN_SCENES else "")
 
 
 def _mean(group: Sequence[RunRecord], name: str) -> float | None:
+    """Average a value over the records that have it; None if none has it."""
     values = [value for record in group if (value := record.value(name)) is not None]
     return sum(values) / len(values) if values else None
 
@@ -63,8 +66,8 @@ def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:,.{digits}f}"
 
 
-def _results(results: Results) -> Table:
-    """Average over the scenes by method, settings and size."""
+def _mean_table(results: Results) -> Table:
+    """Make the table of means over the scenes, with a row for each method, settings and size."""
     intervals = {
         (metric, line.name, point.label): point.y
         for metric in results.metrics
@@ -91,20 +94,19 @@ def _results(results: Results) -> Table:
 
 
 def _views(results: Results, folder: Path) -> list[tuple[str, list[tuple[str, str]], int]]:
-    """List views with their title, named pictures of input and results, and the number of gsmerge's own pictures."""
+    """List views with their title, their named pictures, and the index of the picture of gsmerge's own result."""
     views = []
     for scene in list(dict.fromkeys(record.scene for record in results.runs))[:MAX_SCENES]:
         records = [r for r in results.runs if r.scene == scene and r.views_asked == results.views and r.pictures]
         typical = own_first(r for r in records if results.is_typical(r))[:MAX_RESULTS]
-        chosen = [*(r for r in records if r.method == INPUT), *typical]
-        for i, view in enumerate(chosen[0].pictures if chosen else ()):
+        compared = [*(r for r in records if r.method == INPUT), *typical]
+        for i, view in enumerate(compared[0].pictures if compared else ()):
             files = [("photo", picture_path(folder, f"{scene}/photo", i, "photo"))]
-            files += [(results.name(r), picture_path(folder, r.output, i, "render")) for r in chosen]
-            files += [(f"error of {results.name(r)}", picture_path(folder, r.output, i, "error")) for r in chosen]
-            kinds = {".jpg": "image/jpeg", ".png": "image/png"}
-            layers = [(name, data_uri(path.read_bytes(), kinds[path.suffix])) for name, path in files if path.is_file()]
-            right = next((i for i, (name, _) in enumerate(layers) if name.startswith(OURS)), len(layers) - 1)
-            views += [(f"{scene}, {view}", layers, right)] if len(layers) > 1 else []
+            files += [(results.name(r), picture_path(folder, r.output, i, "render")) for r in compared]
+            files += [(f"error of {results.name(r)}", picture_path(folder, r.output, i, "error")) for r in compared]
+            layers = [(name, data_uri(path.read_bytes(), MEDIA[path.suffix])) for name, path in files if path.is_file()]
+            own = next((i for i, (name, _) in enumerate(layers) if name.startswith(OURS)), len(layers) - 1)
+            views += [(f"{scene}, {view}", layers, own)] if len(layers) > 1 else []
     return views
 
 

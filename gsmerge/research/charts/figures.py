@@ -20,13 +20,14 @@ from gsmerge.io import atomic_output
 from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results
 from gsmerge.research.charts.measure_run import INPUT
 
-MAX_LINES = 12  # most lines of a figure; if there are more, one line for each method is drawn
+MAX_LINES = 12  # most lines of a figure; with more lines, only one line for each method is drawn
+MAX_NAMED = 8  # most scenes that a caption names
 
 PANEL_WIDTH, SINGLE_WIDTH, HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
 KEY_WIDTH, KEY_LINE = 2.3, 0.135  # width of the legend, and height of its lines, inches
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7B4173", "#8C6D31")  # Okabe, Ito 2008
 MARKERS = "osD^vPX"  # their number is coprime to the number of colours
-DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # each cycle through the colours takes the next one
+DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # each cycle through the colours takes the next dash
 RC: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.grid": True,
@@ -98,17 +99,24 @@ def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[
         for point in line.points
     ]
     head = ("Panel", "Line", "Point", x_label, "Mean", "Low", "High")
-    scenes = sorted({scene for line in panels[0].lines for point in line.points for scene in point.by_scene})
-    over = f"{', '.join(scenes[:8])}{', ...' if len(scenes) > 8 else ''}"
-    words = f"Scene: {over}; one scene has no intervals."
-    if len(scenes) > 1:
-        words = f"Means over {len(scenes)} scenes ({over}); bands, from three scenes on: 95 % t intervals of the"
-        words += " differences between settings, without those between scenes."
-    kept = choose_lines(panels[0])
-    if any(line.name not in kept for panel in panels for line in panel.lines):
-        words += " One line for each method; the table has all."
-        panels = [replace(panel, lines=tuple(line for line in panel.lines if line.name in kept)) for panel in panels]
-    return Figure(name, title, f"{caption} {words}", x_label, head, tuple(rows), tuple(panels), log)
+    description = _describe_scenes(panels[0])
+    names = choose_lines(panels[0])
+    if any(line.name not in names for panel in panels for line in panel.lines):
+        description += " One line for each method; the table has all."
+        panels = [replace(panel, lines=tuple(line for line in panel.lines if line.name in names)) for panel in panels]
+    return Figure(name, title, f"{caption} {description}", x_label, head, tuple(rows), tuple(panels), log)
+
+
+def _describe_scenes(panel: Panel) -> str:
+    """Describe the scenes and the intervals of a panel for the caption."""
+    scenes = sorted({scene for line in panel.lines for point in line.points for scene in point.by_scene})
+    listed = f"{', '.join(scenes[:MAX_NAMED])}{', ...' if len(scenes) > MAX_NAMED else ''}"
+    if len(scenes) <= 1:
+        return f"Scene: {listed}; one scene has no intervals."
+    return (
+        f"Means over {len(scenes)} scenes ({listed}); bands, from three scenes on: 95 % t intervals of the"
+        " differences between settings, without those between scenes."
+    )
 
 
 def _numbers(interval: Interval) -> list[str]:
@@ -149,6 +157,7 @@ def _against(results: Results, cost: str, name: str, words: tuple[str, str, str]
 
 
 def _over_views(results: Results) -> Figure | None:
+    """Plot quality against the number of input views."""
     panels = _quality_panels(results, results.by_views, level=False)
     panels = [panel for panel in panels if any(line.is_own for line in panel.lines)]
     caption = (
@@ -186,8 +195,8 @@ def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
     styles: dict[str, Style] = {INPUT: {"color": "#555555", "ls": (0, (2, 2)), "marker": "s", "lw": 1.0, "zorder": 2}}
     for i, (name, is_own) in enumerate(line for line in names if line[0] != INPUT):
         dash = DASHES[i // len(COLORS) % len(DASHES)]
-        look = {"color": COLORS[i % len(COLORS)], "ls": dash, "marker": MARKERS[i % len(MARKERS)]}
-        styles[name] = {**look, "lw": 1.5 if is_own else 1.1, "zorder": 4 + is_own}
+        marks = {"color": COLORS[i % len(COLORS)], "ls": dash, "marker": MARKERS[i % len(MARKERS)]}
+        styles[name] = {**marks, "lw": 1.5 if is_own else 1.1, "zorder": 4 + is_own}
     return styles
 
 
@@ -237,6 +246,7 @@ def _plain(name: str) -> str:
 
 
 def _draw_line(axes: Axes, line: Line, style: Style) -> None:
+    """Draw a line, with a band of intervals if there are enough scenes."""
     x, y = [p.x for p in line.points], [p.y.mean for p in line.points]
     low, high = [p.y.low for p in line.points], [p.y.high for p in line.points]
     if min(p.y.count for p in line.points) >= MIN_SCENES and low != high:

@@ -1,4 +1,4 @@
-"""Make the jobs of a batch from a grid of settings: every combination of the listed values on every scene."""
+"""Make the jobs of a batch from a grid of settings. Every combination of the listed values runs on every scene."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ MAX_NAME = 100  # most characters of a run in names of files
 
 @dataclass(frozen=True)
 class SettingsGrid(Settings):
-    """Lists of values for settings; every combination is run. Other settings are those of the defaults or a recipe."""
+    """Lists of values for settings; every combination is run. Other settings come from the defaults or a recipe."""
 
     method: tuple[str, ...] = setting((OURS,), "Methods: gsmerge and baselines.", filled=True, unique=True)
     k: tuple[int, ...] = setting((), "Gaussians per superpixel: 1 to 8.", unique=True)
@@ -86,21 +86,21 @@ def parse_grid(pairs: Sequence[str], fixed: Mapping[str, Any] | None = None) -> 
 def list_settings(grid: SettingsGrid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
     """List (method, settings) of every run on one scene, the unmerged input first; also notes on combinations left out.
 
-    Only settings that differ from the defaults are listed. The defaults of gsmerge are those of a fixed recipe, if
-    there is one; lists take precedence over it. Baselines lack most settings. They run once per size, or once if they
-    keep all Gaussians.
+    Only settings that differ from the defaults are listed. A fixed recipe replaces the defaults of gsmerge, and lists
+    take precedence over the recipe. Baselines lack most settings. They run once per size, or once if they keep all
+    Gaussians.
     """
     sizes: list[dict[str, Any]] = [{name: size} for name in SIZES for size in getattr(grid, name)]
     lists, fixed = [getattr(grid, name) or (None,) for name in SETTINGS], grid.fixed
     defaults = CompactOptions().to_dict()
-    defaults_of_gsmerge = {**defaults, **RECIPES.get(str(fixed.get("recipe")), {})}
+    recipe_defaults = {**defaults, **RECIPES.get(str(fixed.get("recipe")), {})}
     runs = {describe(INPUT, {}, None): (INPUT, dict[str, Any]())}
     repeated = 0
     for method, *values, size in product(grid.method, *lists, sizes or [{}]):
-        names, usual = (SETTINGS, defaults_of_gsmerge) if method == OURS else (FITTED.get(method, ()), defaults)
+        names, usual = (SETTINGS, recipe_defaults) if method == OURS else (FITTED.get(method, ()), defaults)
         settings = {} if method in (INPUT, *ONE_SIZE) else dict(size)
-        chosen = zip(SETTINGS, values, strict=True)
-        settings |= {name: value for name, value in chosen if name in names and value not in (None, usual[name])}
+        listed = zip(SETTINGS, values, strict=True)
+        settings |= {name: value for name, value in listed if name in names and value not in (None, usual[name])}
         settings |= fixed if method == OURS else {}
         label = describe(method, settings, None)
         repeated += label in runs
@@ -182,26 +182,31 @@ def make_jobs(
     """
     combinations, notes = list_settings(grid)
     counts = [None if count == ALL else int(count) for count in grid.views]
-    chosen = [
+    grid_points = [
         (method, settings, count, _options_of(method, settings, seed))
         for count, (method, settings) in product(counts, combinations)
     ]
     jobs: list[Job] = []
     for source in sources:
-        most = source.num_views or math.inf
-        limit = most - 1 if None in counts else most  # the run with all views is listed already
-        runs = [choice for choice in chosen if (choice[2] or 0) <= limit]
-        if len(runs) < len(chosen):
-            few = len(chosen) - len(runs)
-            notes.append(f"{source.name} has fewer views than asked for, or as many as all: {few} run(s) left out")
+        num_views = source.num_views or math.inf
+        limit = num_views - 1 if None in counts else num_views  # the run with all views is listed already
+        runs = [point for point in grid_points if (point[2] or 0) <= limit]
+        if len(runs) < len(grid_points):
+            num_skipped = len(grid_points) - len(runs)
+            problem = f"{source.name} has fewer views than asked for, or as many as all"
+            notes.append(f"{problem}: {num_skipped} run(s) left out")
         num_gaussians, num_rest = estimate_counts(scene_plys(source.path))
         for method, settings, views, options in runs:
             label = describe(method, settings, views)
-            name = re.sub(r"[^\w.%+=, -]", "_", label)[:MAX_NAME]  # valid in file systems and shells
-            name = name if name == label else f"{name} {digest({'label': label})[:6]}"
-            output = f"{source.name}/{name}"
+            output = f"{source.name}/{_file_name(label)}"
             record = RunRecord(source.name, label, output, source.sha256, method, settings, views, command)
             run = ChartRun(record, options, measured, source.targets, source.target_images)
-            share = min(1.0, (views or most) / most) if source.num_views else 1.0
+            share = min(1.0, (views or num_views) / num_views) if source.num_views else 1.0
             jobs.append(Job(str(source.path), (output,), run, round(share * num_gaussians), num_rest))
     return jobs, notes
+
+
+def _file_name(label: str) -> str:
+    """Make a name that is valid in file systems and shells; a changed or shortened label gets a hash."""
+    name = re.sub(r"[^\w.%+=, -]", "_", label)[:MAX_NAME]
+    return name if name == label else f"{name} {digest({'label': label})[:6]}"

@@ -96,8 +96,9 @@ def mean_interval(values: Sequence[float]) -> Interval:
 def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
     """Compute confidence intervals of the columns of ``values [scenes, conditions]``, with scene differences removed.
 
-    Scenes differ by several dB, but conditions by tenths. So plain intervals would hide the effect of conditions. Here
-    the mean of every scene is subtracted first (Cousineau 2005), and the interval is corrected for that (Morey 2008).
+    Scenes differ by several dB, but conditions by tenths. So plain intervals would hide the effect of conditions.
+    Here the mean of every scene is subtracted first (Cousineau 2005), and the interval is corrected for that (Morey
+    2008).
     """
     num_scenes, num_conditions = values.shape
     if num_conditions == 1 or num_scenes == 1:
@@ -255,7 +256,10 @@ def _mean_cost(points: ByScene) -> float:
 
 
 def _intervals(columns: Sequence[ByScene]) -> list[Interval]:
-    """Compute an interval for each column without scene differences; its width is 0 if columns differ in scenes."""
+    """Compute an interval for each column, with scene differences removed.
+
+    If columns differ in their scenes, intervals have the width 0.
+    """
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
         return paired_intervals(np.array(values, np.float64))

@@ -40,7 +40,7 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 
 VALIDATION = 2**32  # replaces the step in the seed of the random numbers of validation
 Row = dict[str, float]  # a row of the table of losses
-Scores = list[tuple[float, float, float]]  # for each window: PSNR (dB) without and with networks, share merged
+Scores = list[tuple[float, float, float]]  # of each window: PSNR (dB) without and with networks, share merged
 Progress = Callable[[int, int, float], None]  # step, steps, loss
 FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
@@ -81,7 +81,7 @@ def _write_picture(path: Path, networks: Networks, example: Example, options: Tr
     """Draw side by side a photo, of a novel view if there is one, and its renders without and with networks."""
     ids = [*example.photo_ids(novel=True), *example.photo_ids(novel=False), 0]
     window = whole_photo(example, ids[0], min(options.levels))
-    renders = [render_window(window, chosen, options)[0] for chosen in (None, networks)]
+    renders = [render_window(window, correcting, options)[0] for correcting in (None, networks)]
     row = torch.cat([window.image, *renders], 1)
     save_picture(path, to_picture(row.numpy()))
 
@@ -153,10 +153,10 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     bound = bind_backbone([*shards, *validation], backbone)
     sources = bound[: len(shards)]
-    chosen = bound[len(shards) :] or sources
-    chosen = [chosen[i] for i in even_views(len(chosen), min(len(chosen), options.validation_examples))]
+    validators = bound[len(shards) :] or sources
+    ids = even_views(len(validators), min(len(validators), options.validation_examples))
     with use_threads(threads):
-        return _train(options, sources, chosen, out, choose_device(device), progress)
+        return _train(options, sources, [validators[i] for i in ids], out, choose_device(device), progress)
 
 
 def choose_device(name: str) -> str:
@@ -203,8 +203,8 @@ def _train(
                 losses = []
                 _save(out, state, rows, head, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
-    most = max(row["psnr_learned"] for row in rows)
-    return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], most, resumed)
+    best_psnr = max(row["psnr_learned"] for row in rows)
+    return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], best_psnr, resumed)
 
 
 def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[str, Any], options: TrainOptions) -> None:
@@ -226,7 +226,7 @@ def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[st
 
 
 def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[Row]]:
-    """Read the step and the table of losses of the run in the folder; those of a new run if there is none."""
+    """Read the step and the table of losses of the run in the folder; step 0 and no rows if there is no run."""
     path = out / "state.safetensors"
     if not path.exists():
         return 0, []
@@ -238,11 +238,12 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
 
 
 def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, step: int) -> Tensor:
-    """Take one step; return its loss."""
+    """Take one step on the mean gradient of all crops; return its loss."""
     parameters = list(state.networks.parameters())
     streams.move_to(step)
 
-    def work(crop: int) -> Tensor:
+    def crop_gradients(crop: int) -> Tensor:
+        """Compute the gradients of one crop in one vector, with the loss as its last element."""
         rng = np.random.default_rng([options.seed, step, crop])
         example = streams.draw(step, crop, rng)
         example = draw_views(example, options, rng)
@@ -251,12 +252,13 @@ def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, 
         window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)
         with torch.enable_grad():
             loss = window_loss(state.networks, window, options, step, rng)
-            parts = [torch.zeros_like(parameter) for parameter in parameters]
+            gradients = [torch.zeros_like(parameter) for parameter in parameters]
             if loss.requires_grad:
-                parts = list(torch.autograd.grad(loss, parameters, materialize_grads=True))
-        return torch.cat([*(part.flatten() for part in parts), loss.detach().to(parts[0])[None]])  # on their device
+                gradients = list(torch.autograd.grad(loss, parameters, materialize_grads=True))
+        loss = loss.detach().to(gradients[0])  # on the device of the networks
+        return torch.cat([*(gradient.flatten() for gradient in gradients), loss[None]])
 
-    mean = torch.stack(parallel_map(work, range(options.crops))).sum(0) / options.crops
+    mean = torch.stack(parallel_map(crop_gradients, range(options.crops))).sum(0) / options.crops
     sizes = [parameter.numel() for parameter in parameters]
     gradients, loss = mean.split([sum(sizes), 1])
     for parameter, gradient in zip(parameters, gradients.split(sizes), strict=True):
@@ -295,8 +297,8 @@ def load_state(path: Path, state: TrainingState) -> dict[str, Any]:
                 for name, parameter, mean in state.pairs():
                     parameter.copy_(file.get_tensor(f"weight.{name}"))
                     mean.copy_(file.get_tensor(f"mean.{name}"))
-                    kept = (file.get_tensor(f"{kind}.{name}") for kind in ("first", "second"))
-                    first, second = (tensor.to(parameter.device) for tensor in kept)
+                    moments = (file.get_tensor(f"{kind}.{name}") for kind in ("first", "second"))
+                    first, second = (moment.to(parameter.device) for moment in moments)
                     step = torch.tensor(float(facts["step"]))
                     state.optimizer.state[parameter] = {"step": step, "exp_avg": first, "exp_avg_sq": second}
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:

@@ -1,9 +1,9 @@
 """Compute losses: renders compared with photos, and regularizers.
 
-A window of a photo is rendered from all Feature Gaussians that reach into it, each run through all networks (paper
-section 4.6). Pixels that the scene does not cover have no loss, so that networks need not guess them. LPIPS is that of
-:mod:`gsmerge.measure.lpips`, differentiable by torch. In early training regularizers hold Gaussians near the moments of
-the groups, which are the paper's teacher, and keep siblings apart.
+All Feature Gaussians that reach into a window of a photo run through all networks, and the window is rendered from them
+(paper section 4.6). Pixels that the scene does not cover have no loss, so networks need not guess them. LPIPS has the
+values of :mod:`gsmerge.measure.lpips`, and torch can differentiate it. In early training regularizers hold Gaussians
+near the moments of their groups, which are the paper's teacher, and keep siblings apart.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg")
         return image.new_zeros(())
     layers, kernels = read_layers(net), _kernels(net)
     with torch.no_grad():
-        features = list(_unit_features(reference, layers, kernels))
-    seen = torch.where(mask[..., None], image, reference)
-    compared = [torch.from_numpy(layer.weights) for layer in layers if layer.weights is not None]
+        reference_features = list(_unit_features(reference, layers, kernels))
+    visible = torch.where(mask[..., None], image, reference)
+    layer_weights = [torch.from_numpy(layer.weights) for layer in layers if layer.weights is not None]
     distance = torch.zeros((), dtype=torch.float64)
-    units = _unit_features(seen, layers, kernels)
-    for weights, unit, other in zip(compared, units, features, strict=True):
-        distance = distance + ((unit - other).square().mean((1, 2)) @ weights).double()
+    image_features = _unit_features(visible, layers, kernels)
+    for weights, features, expected in zip(layer_weights, image_features, reference_features, strict=True):
+        distance = distance + ((features - expected).square().mean((1, 2)) @ weights).double()
     return distance
 
 
@@ -76,8 +76,8 @@ def window_loss(
 ) -> Tensor:
     """Compute the loss of a window: its renders on a random background against the photo, plus regularizers.
 
-    It is the mean over all levels if they are trained jointly. The weight of the diversification is relative to the
-    photometric loss, since its own scale, that of volumes, has no meaning for the weight.
+    If all levels are trained jointly, the loss is the mean over the levels. The weight of the diversification is
+    relative to the photometric loss, because the scale of the diversification, which comes from volumes, is arbitrary.
     """
     crop, background = window.crop, rng.random(3, dtype=np.float32)
     levels = options.levels if options.joint else (crop.k,)

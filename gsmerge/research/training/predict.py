@@ -18,6 +18,7 @@ from torch.nn.functional import normalize
 from gsmerge.arrays import Array, as_array, as_tensor
 from gsmerge.networks.apply import NetworkContext, prepare_children, run_heads
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
+from gsmerge.networks.cross_view_stats import NUM_STATS
 from gsmerge.networks.options import CORRECTED, PART
 from gsmerge.networks.tensors import (
     gaussian_sizes,
@@ -38,11 +39,12 @@ from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
 
 TINY = 1e-12  # world units
+CONSTANT = slice(6, 8)  # columns of a group that have no gradient: its summed weights and its number of members
 MIN_GAP = 1e-3  # least difference of two squared scales in the gradient of axes, over the largest squared scale
 
 
 def features_to_tensors(features: FeatureGaussians) -> FeatureGaussians:
-    """Convert those columns of Feature Gaussians to tensors that networks change."""
+    """Convert the columns of Feature Gaussians that networks change to tensors."""
     columns: dict[str, Array] = {name: as_tensor(getattr(features, name)) for name in CORRECTED}
     return replace(features, **columns)
 
@@ -87,23 +89,23 @@ def differentiate_base(features: FeatureGaussians) -> Gaussians:
 
 def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
     """Compute the networks' inputs for groups, differentiable; ``inputs`` are the same as arrays."""
-    chosen = torch.from_numpy(viewmats[inputs.views]).float()
-    base, frames = differentiate_base(features), _differentiate_frames(features.means, chosen, inputs.frames)
+    group_viewmats = torch.from_numpy(viewmats[inputs.views]).float()
+    base, frames = differentiate_base(features), _differentiate_frames(features.means, group_viewmats, inputs.frames)
     sizes = gaussian_sizes(base.scales).clamp_min(TINY)
     pixels = torch.from_numpy(inputs.footprints).clamp_min(TINY)
     covars = frames.transpose(1, 2) @ features.covars @ frames / sizes.square()[:, None, None]
-    places = rotate_vectors(chosen[:, :3, :3], features.means) + chosen[:, :3, 3]
+    positions = rotate_vectors(group_viewmats[:, :3, :3], features.means) + group_viewmats[:, :3, 3]
     numbers = [
         _log_scales(base.scales, pixels),
         _logits(base.opacities)[:, None],
         _log_ratio(features.masses, pixels**3)[:, None],
         _log_ratio(features.extinctions, pixels**2)[:, None],
-        torch.from_numpy(inputs.group[:, 6:8]),
+        torch.from_numpy(inputs.group[:, CONSTANT]),
         SH_C0 * features.sh0[:, 0],
         torch.asinh(torch.stack([covars[:, i, j] for i in range(3) for j in range(i, 3)], 1)),
-        (places[:, :2] / places[:, 2:].clamp_min(1e-6)).clamp(-3, 3),
+        (positions[:, :2] / positions[:, 2:].clamp_min(1e-6)).clamp(-3, 3),
     ]
-    group = torch.cat([torch.cat(numbers, 1).nan_to_num(), torch.from_numpy(inputs.group[:, 19:])], 1)
+    group = torch.cat([torch.cat(numbers, 1).nan_to_num(), torch.from_numpy(inputs.group[:, -NUM_STATS:])], 1)
     return replace(inputs, features=features, base=base, frames=frames, sizes=sizes, group=group)
 
 
@@ -116,8 +118,11 @@ def _differentiate_frames(means: Tensor, viewmats: Tensor, values: np.ndarray) -
     away = normalize(means - centres, dim=1)
     across = viewmats[:, 0, :3] - (viewmats[:, 0, :3] * away).sum(1, keepdim=True) * away
     right = normalize(across, dim=1)
-    turned = torch.stack([right, torch.linalg.cross(away, right), away], 2)
-    return torch.where((across.norm(dim=1) > 1e-3)[:, None, None], frames + turned - turned.detach(), frames)
+    computed = torch.stack([right, torch.linalg.cross(away, right), away], 2)
+    is_stable = (across.norm(dim=1) > 1e-3)[:, None, None]
+    return torch.where(
+        is_stable, frames + computed - computed.detach(), frames
+    )  # the values of frames, with a gradient
 
 
 def differentiate_tokens(
@@ -125,16 +130,18 @@ def differentiate_tokens(
 ) -> Tensor:
     """Make tokens ``[n,13]`` like :func:`gsmerge.networks.tokens.part_tokens`, differentiable."""
     g, owner_ids = group_features, torch.from_numpy(owners)
-    chosen = parts[torch.from_numpy(ids)]
+    selected = parts[torch.from_numpy(ids)]
     back = g.frames[owner_ids].transpose(1, 2)
     pixels = torch.from_numpy(g.footprints)[owner_ids].clamp_min(TINY)
-    local = rotate_vectors(back, chosen.means - g.base.means[owner_ids]) / g.sizes[owner_ids, None]
-    ordered = chosen.scales.sort(-1).values.clamp_min(TINY)
-    normals = quat_to_rotmat(chosen.quats).gather(2, chosen.scales.argmin(1)[:, None, None].expand(-1, 3, 1))[..., 0]
+    local = rotate_vectors(back, selected.means - g.base.means[owner_ids]) / g.sizes[owner_ids, None]
+    ordered = selected.scales.sort(-1).values.clamp_min(TINY)
+    normals = quat_to_rotmat(selected.quats).gather(2, selected.scales.argmin(1)[:, None, None].expand(-1, 3, 1))[
+        ..., 0
+    ]
     facing = rotate_vectors(back, normals)
     flat = -(1 - ordered[:, 0] / ordered[:, 1]) * facing[:, 2].sign()
-    colors = SH_C0 * (chosen.sh0 - g.base.sh0[owner_ids])[:, 0]
-    numbers = [torch.asinh(local), _log_scales(ordered, pixels), _logits(chosen.opacities)[:, None], colors]
+    colors = SH_C0 * (selected.sh0 - g.base.sh0[owner_ids])[:, 0]
+    numbers = [torch.asinh(local), _log_scales(ordered, pixels), _logits(selected.opacities)[:, None], colors]
     tokens = torch.cat([*numbers, flat[:, None] * facing], 1)
     assert tokens.shape[1] == PART
     return tokens.nan_to_num()

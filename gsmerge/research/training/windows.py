@@ -56,8 +56,8 @@ class Window:
     @property
     def camera(self) -> Cameras:
         """Camera that sees only the window."""
-        c = box_camera(self.crop.example.photos, self.photo, self.box)
-        return Cameras(c["viewmat"][None], c["K"][None], c["width"], c["height"])
+        camera = box_camera(self.crop.example.photos, self.photo, self.box)
+        return Cameras(camera["viewmat"][None], camera["K"][None], camera["width"], camera["height"])
 
     @property
     def image(self) -> Tensor:
@@ -71,8 +71,8 @@ class Window:
         return torch.from_numpy(self._part(self.crop.example.mask(self.photo)))
 
     def _part(self, picture: np.ndarray) -> np.ndarray:
-        b = self.box
-        return np.ascontiguousarray(picture[b.top : b.top + b.height, b.left : b.left + b.width])
+        box = self.box
+        return np.ascontiguousarray(picture[box.top : box.top + box.height, box.left : box.left + box.width])
 
 
 def sample_window(
@@ -85,24 +85,33 @@ def sample_window(
     any.
     """
     k = levels[int(rng.integers(len(levels)))]
-    num_views = len(example.cameras)
-    kinds = [rng.permutation(num_views), num_views + rng.permutation(len(example.photos) - num_views)]
-    order = np.concatenate(kinds[::-1] if rng.random() < novel else kinds)
-    photo, pixels = int(order[0]), np.zeros(0, np.int64)
-    for photo in map(int, order):
-        pixels = np.flatnonzero(example.mask(photo))
-        if len(pixels):
-            break
+    photo, pixels = _draw_photo(example, novel, rng)
     pixel = int(pixels[rng.integers(len(pixels))]) if len(pixels) else 0
     height, width = example.images.shape[1:3]
     w, h = min(side, width), min(side, height)
-    left, top = (max(0, at - part // 2) for at, part in ((pixel % width, w), (pixel // width, h)))
+    left, top = max(0, pixel % width - w // 2), max(0, pixel // width - h // 2)
     box = Box(min(left, width - w), min(top, height - h), w, h)  # moved inside the photo
     rows = _rows(example, photo, box)
     while len(rows) > most and box.halved() != box:
         box = box.halved()
         rows = _rows(example, photo, box)
     return Window(photo, box, Crop(example, k, rows))
+
+
+def _draw_photo(example: Example, novel: float, rng: np.random.Generator) -> tuple[int, np.ndarray]:
+    """Draw a photo that the example's views cover in part; return its number and the indices of covered pixels.
+
+    ``novel`` is the probability that novel views are tried first. Without covered pixels the last photo is returned.
+    """
+    num_views = len(example.cameras)
+    own_photos, novel_photos = rng.permutation(num_views), num_views + rng.permutation(len(example.photos) - num_views)
+    order = np.concatenate([novel_photos, own_photos] if rng.random() < novel else [own_photos, novel_photos])
+    photo, pixels = int(order[0]), np.zeros(0, np.int64)
+    for photo in map(int, order):
+        pixels = np.flatnonzero(example.mask(photo))
+        if len(pixels):
+            break
+    return photo, pixels
 
 
 def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
