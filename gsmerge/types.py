@@ -360,11 +360,6 @@ class Scene:
         own = ", of pixels" if self.has_own_pixels else ""
         return f"Scene({len(self.gaussians):,} Gaussians, {views}{images}{own})"
 
-    @staticmethod
-    def of(gaussians: Gaussians, cameras: Cameras) -> Scene:
-        """Make a scene of Gaussians and cameras alone; views are named by their numbers."""
-        return Scene(gaussians, cameras, None, None, tuple(f"view {view}" for view in range(len(cameras))))
-
     def numpy(self) -> Scene:
         """Return the same scene with NumPy arrays and images in [0, 1]; ValueError for images of another range."""
         names = [name for name in PER_PIXEL if getattr(self, name) is not None]

@@ -65,7 +65,7 @@ class _Words:
         params = self.get_params(ctx)  # type: ignore[attr-defined]
         names = {name for param in params for name in param.opts}
         for word in words[: words.index("--") if "--" in words else None]:
-            if f"-{word.partition('=')[0]}" in names and not word.startswith("--"):
+            if re.match("-[^-]", word) and f"-{word.partition('=')[0]}" in names:
                 raise UsageError(f"{word}: expected two dashes, -{word}")
         try:
             rest: list[str] = super().parse_args(ctx, args)  # type: ignore[misc]
