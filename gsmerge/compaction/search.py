@@ -197,9 +197,7 @@ class CountSearch:
 
 def psnr_by_count(candidates: Sequence[Candidate]) -> dict[int, float]:
     """Return the deciding PSNR (dB) of each candidate by its count, in the order of the candidates."""
-    return {
-        candidate.count: candidate.deciding_psnr or 0.0 for candidate in candidates if candidate.count is not None
-    }
+    return {candidate.count: candidate.deciding_psnr or 0.0 for candidate in candidates if candidate.count is not None}
 
 
 def add_target(plan: Plan, prepared: Prepared) -> Plan:

@@ -103,6 +103,11 @@ def test_what_to_type_instead(words: str, suggestion: str, run: Run) -> None:
     assert suggestion in outcome.err
 
 
+@pytest.mark.parametrize("word", ["o", "q", "h"])
+def test_a_letter_of_an_option_is_a_value(word: str, run: Run) -> None:
+    assert_refused(run("compact", "nowhere.ply", "-o", word), 3, "nowhere.ply")
+
+
 @pytest.mark.parametrize("option", ["--verbose", "--gpu", "--zzz", "-v", "--no-overwrite"])
 def test_nothing_near_is_no_guess(option: str, run: Run) -> None:
     assert_refused(run("compact", "x.ply", option), 2, "", f"No such option: {option}; see 'gsmerge compact --help'")

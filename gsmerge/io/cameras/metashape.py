@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.camera_file import check_count, make_similarity
 from gsmerge.io.cameras.camera_source import CameraSource, number_errors
@@ -20,25 +21,35 @@ _ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component
 
 def list_cameras(source: CameraSource) -> list[Entry]:
     """List the cameras of the largest component, each with its sensor."""
-    root, cameras = _largest_component(source.path)
-    with number_errors(source.path, "expected sensors with 'calibration', and cameras with 'transform'"):
-        sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
-        used = {camera.get("sensor_id") for camera in cameras}
-        values = {sensor_id: _sensor_values(sensors[sensor_id]) for sensor_id in used}
-        return [
-            Entry(
-                {"transform": np.array(camera.findtext("transform", "").split(), np.float64).reshape(4, 4)},
-                values[camera.get("sensor_id")],
-                camera.get("label") or "",
-            )
-            for camera in cameras
-        ]
+    path = source.path
+    root, cameras = _largest_component(path)
+    sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
+    values: dict[str | None, dict[str, Any]] = {}  # by the id of the sensor
+    entries = []
+    for camera in cameras:
+        name, sensor_id = camera.get("label") or "", camera.get("sensor_id")
+        if sensor_id not in sensors:
+            raise SceneError(path, f"view {name}: expected the id of one of the sensors, found {sensor_id!r}")
+        if sensor_id not in values:
+            expected = "expected a 'calibration' with a 'resolution' and the number 'f'"
+            with number_errors(path, f"sensor {sensor_id}: {expected}"):
+                values[sensor_id] = _sensor_values(sensors[sensor_id])
+        with number_errors(path, f"view {name}: expected 16 numbers in 'transform'"):
+            pose = np.array(camera.findtext("transform", "").split(), np.float64).reshape(4, 4)
+        entries.append(Entry({"transform": pose}, values[sensor_id], name))
+    return entries
 
 
 def _sensor_values(sensor: Element) -> dict[str, Any]:
     """Return size, intrinsics and lens of a sensor: its adjusted calibration, if there is one."""
-    calibration = max(sensor.findall("calibration"), key=lambda entry: entry.get("class") == "adjusted")
-    size = [*calibration.findall("resolution"), *sensor.findall("resolution")][0].attrib
+    calibrations = sensor.findall("calibration")
+    if not calibrations:
+        raise ValueError("no calibration")
+    calibration = max(calibrations, key=lambda entry: entry.get("class") == "adjusted")
+    sizes = [*calibration.findall("resolution"), *sensor.findall("resolution")]
+    if not sizes:
+        raise ValueError("no resolution")
+    size = sizes[0].attrib
     numbers = {child.tag: float(child.text or "") for child in calibration if child.tag != "resolution"}
     values: dict[str, Any] = {key: numbers[key] for key in ("cx", "cy", "k1", "k2", "k3", "k4") if key in numbers}
     # p1 and p2 are OpenCV's p2 and p1

@@ -22,6 +22,10 @@ def list_shots(source: CameraSource) -> list[Entry]:
         largest = max(source.json, key=lambda entry: len(entry["shots"]))
         shots, cameras = dict(largest["shots"]), largest["cameras"]
         check_count(source.path, len(shots))
+        for name, shot in shots.items():
+            if shot["camera"] not in cameras:
+                problem = f"view {name}: expected one of the 'cameras' in 'camera', found {shot['camera']!r}"
+                raise SceneError(source.path, problem)
         entries = [Entry(shot, cameras[shot["camera"]], name) for name, shot in shots.items()]
         if not all(isinstance(entry.shared, dict) for entry in entries):
             raise TypeError("found a camera that is no object")

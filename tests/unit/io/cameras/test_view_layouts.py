@@ -321,9 +321,9 @@ def test_lenses_are_read(
         ("Metashape", "transform", "turn", "", "at least one"),
         ("Metashape", "<calibration", "<c", "", "mismatched"),
         ("Metashape", "<f>42", "<k4>0.1</k4><f>42", "view 0.png", "k4"),
-        ("Metashape", "resolution", "r", "", "sensors"),
-        ("Metashape", 'sensor_id="0"', 'sensor_id="7"', "", "'7'"),
-        ("Metashape", "</transform>", " 1</transform>", "", 17),
+        ("Metashape", "resolution", "r", "", "no resolution"),
+        ("Metashape", 'sensor_id="0"', 'sensor_id="7"', "view 0.png", "'7'"),
+        ("Metashape", "</transform>", " 1</transform>", "view 0.png", 17),
         ("Metashape", 'type="frame"', 'type="spherical"', "view 0.png", "SPHERICAL"),
     ],
 )  # fmt: skip
