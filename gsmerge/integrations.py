@@ -164,14 +164,13 @@ def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]
 
 
 def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) -> dict[str, Any]:
-    """Convert the Gaussians of gsplat's ``simple_trainer.py`` and the views that they are trained on, in its own frame.
+    """Convert the Gaussians of gsplat's ``simple_trainer.py`` and its training views, in the frame of the trainer.
 
     Args:
         splats: The trainer's ``splats``, or those of one of its checkpoints: ``means``, ``quats`` wxyz of any length,
             ``scales`` as logarithms, ``opacities`` as logits, ``sh0``, ``shN``.
-        dataset: The trainer's ``trainset``: for each view ``camtoworld [4,4]``, ``K [3,3]`` in pixels, ``image
-        [H,W,3]``
-            in [0, 255].
+        dataset: The trainer's ``trainset``. Each view has ``camtoworld [4,4]``, ``K [3,3]`` in pixels, and ``image
+            [H,W,3]`` in [0, 255].
 
     Raises:
         SceneError: If an entry is missing, such as ``sh0`` if colours depend on the photo, or if photos differ in size.
@@ -186,7 +185,7 @@ def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) 
     if num_sizes > 1:
         problem = f"expected photos of one size, found {num_sizes} sizes"
         raise SceneError("dataset", problem, "pass photos of one size")
-    c2w, Ks, photos = (np.stack(columns) for columns in zip(*views, strict=True))
+    c2w, Ks, photos = (np.stack(arrays) for arrays in zip(*views, strict=True))
     return {
         **{name: like(column, splats["means"]) for name, column in columns.items()},
         "images": (photos / np.float32(_BYTES)).astype(np.float32), "Ks": Ks.astype(np.float64),

@@ -1,7 +1,7 @@
 """Run a batch: make the result of every job that is not done, and record how each ended.
 
 The run may be killed at any moment. A result is written completely or not at all, and is recorded right after. A killed
-process also leaves a file that marks its result as begun. It shows that a result without a record is from a batch.
+process also leaves a file that marks its result as begun. This file shows that a batch made a result without a record.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gsmerge.report import file_sha256, finite
 from gsmerge.runtime.memory import free_memory
 from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.threads import available_threads
-from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, Lost, RayPool, WorkerPool
+from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, LostProcess, RayPool, WorkerPool
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory, for all scenes that run at the same time by default
 
@@ -115,7 +115,7 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
             pool = RayPool(cluster, concurrency.threads, jobs=concurrency.jobs)
         stack.enter_context(closing(pool))
 
-        def each_call(jobs: Sequence[Job], *, wait: bool) -> Iterator[Call]:
+        def make_calls(jobs: Sequence[Job], *, wait: bool) -> Iterator[Call]:
             for job in jobs:
                 active[job.output] = job
                 yield Call(job, (job, run, wait), job.memory)
@@ -123,9 +123,9 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
         remaining, wait = jobs, False
         while remaining:
             busy: list[Job] = []
-            for job, outcome in pool.run(make_result, each_call(remaining, wait=wait)):
+            for job, outcome in pool.run(make_result, make_calls(remaining, wait=wait)):
                 del active[job.output]
-                line = record_loss(job, run, outcome.reason) if isinstance(outcome, Lost) else outcome
+                line = record_loss(job, run, outcome.reason) if isinstance(outcome, LostProcess) else outcome
                 if line is None:
                     busy.append(job)
                 else:

@@ -276,7 +276,8 @@ def _join(
     num_members = np.concatenate([state.num_members, np.diff(features.starts)])
     join_context = _JoinContext(
         networks=context.networks, members=members, cameras=cameras, seed=context.seed, samples=samples,
-        part_views=np.concatenate([state.views, views]), part_members=num_members, part_weights=np.asarray(parts.weights),
+        part_views=np.concatenate([state.views, views]), part_members=num_members,
+        part_weights=np.asarray(parts.weights),
     )  # fmt: skip
     merged = merge(parts, _match_parts(parts, len(state), options), join_context)
     part_saliency = np.concatenate([state.saliency, saliency])

@@ -28,7 +28,7 @@ _MAX_MODEL = 40  # letters of a camera model's name
 def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
     """Read the cameras of a file by its layout; SceneError with file, view and key if a value is missing or wrong."""
     entries = layout.views(source) if callable(layout.views) else _list_entries(source, layout.views)
-    shared: dict[int, dict[str, Any]] = {}  # by id; converted once, because it may be large and views many
+    shared: dict[int, dict[str, Any]] = {}  # values that views share, by id; converted once, since they may be large
     cameras: list[tuple[Path, str, np.ndarray, dict[str, Any]]] = []
     for i, entry in enumerate(entries):
         path, name = entry.path or source.path, entry.name or _find_name(entry.values, layout.name) or f"view {i}"
@@ -40,7 +40,7 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
             values = shared[id(entry.shared)] | _camera_values(layout, entry.values)
             cameras.append((path, name, layout.pose.read(entry.values), values))
     has_intrinsics = any(key in values for *_, values in cameras for key in ("K", *_FOCAL))
-    size_of = cache(image_size)  # of photos that many views may name
+    size_of = cache(image_size)  # many views may name the same photo
     views = []
     for path, name, pose, values in cameras:
         with number_errors(path, f"view {name}: expected numbers"):
