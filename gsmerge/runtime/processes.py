@@ -32,15 +32,15 @@ class Worker:
         self.count = 0
 
     def read_result(self) -> Any:
-        """Return the result of the current call, or LostProcess if the process has ended; raise the exception of the call."""
+        """Return the result of the current call; raise its exception; return LostProcess if the process has ended."""
         try:
-            is_result, value = self.pipe.recv()
+            succeeded, answer = self.pipe.recv()
         except (EOFError, OSError):
             self.process.join(END_SECONDS)
             return LostProcess(_describe_exit(self.process))
-        if not is_result:
-            raise value
-        return value
+        if not succeeded:
+            raise answer  # the exception of the call
+        return answer
 
     def stop(self, *, now: bool) -> None:
         """End the process, either ``now`` or when it notices that the pipe is closed."""
@@ -132,7 +132,7 @@ def run_worker(pipe: Connection) -> None:
         while True:
             function, arguments = pipe.recv()
             try:
-                answer = True, function(*arguments)
+                reply = True, function(*arguments)  # as read_result expects
             except Exception as error:
-                answer = False, error
-            pipe.send(answer)
+                reply = False, error
+            pipe.send(reply)

@@ -25,7 +25,7 @@ T = TypeVar("T")
 CONNECT_TIMEOUT = 10.0  # seconds to reach a cluster
 RETRIES = 5  # repetitions of a call whose process or node was lost
 SMALL_STORE = 100 << 20  # bytes of shared objects on a cluster of this machine
-CALLS_PER_PROCESS = 200  # then a new process replaces it, so that memory leaks of libraries cannot add up
+CALLS_PER_PROCESS = 200  # a process is then replaced, so that memory leaks of libraries cannot add up
 
 
 class Call(NamedTuple):
@@ -50,8 +50,8 @@ class WorkerPool(ABC):
     def run(self, function: Callable[..., Any], calls: Iterable[Call]) -> Iterator[tuple[Any, Any]]:
         """Make calls of a picklable function; take the next call when a process is free.
 
-        Yields key and result of each call as it ends; the result is :class:`LostProcess` if the process died. Raises the
-        exception of a failed call.
+        Yields key and result of each call as it ends; the result is a :class:`LostProcess` if the process died. Raises
+        the exception of a failed call.
         """
         waiting, num_running = iter(calls), 0
         while True:

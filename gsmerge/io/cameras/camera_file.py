@@ -302,7 +302,7 @@ def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> CameraFile:
-    """Give cameras without a size twice their principal point as their size, if it clearly differs from the photos' size.
+    """Set the size of cameras without a size to twice their principal point, if photos have clearly another size.
 
     ``size`` is (width, height) of the photos. The new size must have the shape of the photos. Fractional sides are
     rounded to multiples of ``PATCH``, since the inputs of networks have such sides.
