@@ -169,15 +169,18 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     mark(begun)
     out = run.folder / job.output
     out.parent.mkdir(parents=True, exist_ok=True)
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as caught_warnings:
         warnings.simplefilter("default")
         document, written = job.call.run(files, out, run.threads)
-    document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
-    facts = [
-        {"path": name.as_posix(), "sha256": file_sha256(run.folder / name), "bytes": (run.folder / name).stat().st_size}
-        for name in (Path(os.path.relpath(path, run.folder)) for path in written)
-    ]
+    document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught_warnings))
+    facts = [_describe_file(run.folder, path) for path in written]
     return record(DONE, job.scene, job.output, key=key, files=facts, report=finite(document))
+
+
+def _describe_file(folder: Path, path: Path) -> dict[str, Any]:
+    """Return the path of a file relative to the output folder, its hash and its size in bytes."""
+    path = folder / (name := Path(os.path.relpath(path, folder)))
+    return {"path": name.as_posix(), "sha256": file_sha256(path), "bytes": path.stat().st_size}
 
 
 @lru_cache(maxsize=1)
@@ -206,7 +209,7 @@ def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
 
 
 def _clean(job: Job, run: Run, begun: Path) -> None:
-    """Remove the files that a killed process left; keep the mark if the result exists, since it may lack a record."""
+    """Remove the unfinished files of a killed process; keep the mark if the result exists and so may lack a record."""
     if begun.exists():
         paths = [run.folder / name for name in job.outputs]
         for folder in {path.parent for path in paths}:
@@ -216,7 +219,7 @@ def _clean(job: Job, run: Run, begun: Path) -> None:
 
 
 def mark(begun: Path) -> None:
-    """Write the file that marks a result as begun, with the process number, so that it is known to be from a batch."""
+    """Write the file that marks a result as begun, with the process id. It shows that the result is from a batch."""
     with begun.open("wb") as file:
         file.write(f"{os.getpid()}\n".encode())
         file.flush()

@@ -140,11 +140,10 @@ def link_file(source: Path, target: Path) -> None:
     """Replace the file ``target`` by a hard link to ``source``, else by a symbolic link, else by a copy."""
     os.unlink(target)
     real = os.path.realpath(source)
-    for make in (
-        (os.link,) if sys.platform == "win32" else (os.link, os.symlink)
-    ):  # Windows allows symbolic links to few users
+    # Windows allows symbolic links to few users
+    for link in (os.link,) if sys.platform == "win32" else (os.link, os.symlink):
         with suppress(OSError, NotImplementedError):
-            make(real, target)
+            link(real, target)
             return
     shutil.copyfile(real, target)
 

@@ -228,8 +228,8 @@ def same_shape(size: Size, other: Size) -> bool:
 def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     """Decode the brightness ``[h,w]`` uint8 of a mask, times its opacity; 255 is white.
 
-    In a picture whose values are all 0 and 1, or fractions of 1, white is 1. The limit of memory is that of the mask's
-    bytes and those of its ``photo`` together, since masks compress to very few bytes.
+    White is 1 if no value of the picture exceeds 1. The bytes of the mask and of its ``photo`` together limit the
+    memory, since masks compress to very few bytes.
     """
     budget = _photo_budget(path, *([] if photo is None else [photo]))
 

@@ -29,8 +29,8 @@ def move_to_gaussians(source: CameraSource, views: list[StoredView]) -> list[Sto
 
     ``input_frame_idx.txt`` lists the frames. ``scene_scale.txt`` and ``pos_avg_inv.txt`` have the map X' = scene_scale
     (pos_avg_inv X) from the cameras' world to the Gaussians' world. The files are beside the Gaussians, or were copied
-    beside the cameras. Some versions write only the list of frames; the map is then computed from the frames. SceneError if a file has wrong
-    numbers, or a frame does not exist.
+    beside the cameras. Some versions write only the list of frames; the map is then computed from the frames.
+    SceneError if a file has wrong numbers, or a frame does not exist.
     """
     folder = source.path.parent
     if source.folder is not None and not (folder / FRAMES_FILE).is_file() and (source.folder / FRAMES_FILE).is_file():

@@ -146,8 +146,8 @@ class ViewLayout:
         views: Key of the list of views; "" if the file itself is the list; or a function that lists them.
         name: Key of the image's name. Views without a name are called "view 0", "view 1" and so on.
         size: Keys of width and height in pixels, or the key of a list [height, width]; "" if the file has no size.
-        unit: Unit of the intrinsics: pixels, the image's width and height, or its larger side. If intrinsics in "pixels"
-            are small enough, they count as shares of width and height, see :func:`make_camera_file`.
+        unit: Unit of the intrinsics: pixels, the image's width and height, or its larger side. Small intrinsics in
+            "pixels" count as shares of width and height, see :func:`make_camera_file`.
         origin: The point of the image from which the principal point is measured: the upper left corner or the middle.
         lens: Key of the camera model, with the coefficients k1, k2 and so on beside it; "" for pinholes.
         models: The program's names of camera models -> COLMAP's names; equal names are left out.
