@@ -37,7 +37,7 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
         SceneError: If a field is missing, or it holds several scenes.
     """
     gaussians = _field("prediction", prediction, "gaussians")
-    rotations = _one("rotations", gaussians.rotations, 2)
+    rotations = _unbatch("rotations", gaussians.rotations, 2)
     photos = as_array(_field("prediction", prediction, "processed_images"))
     viewmats = as_array(_field("prediction", prediction, "extrinsics")).astype(np.float64)
     scale = getattr(prediction, "scale_factor", None)
@@ -45,8 +45,8 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
         viewmats[..., :3, 3] /= float(scale)
     return {
         **_gaussians(gaussians, sh_degree),
-        "scales": _one("scales", gaussians.scales, 2),
-        # The same rotations with other signs. The model's z is never negative, as if it were a w that comes last
+        "scales": _unbatch("scales", gaussians.scales, 2),
+        # The same rotations with other signs. The model writes z >= 0, as if the last number were w
         "quats": rotations * (1 - 2 * (rotations[:, :1] < 0)),
         "images": _as_floats(photos),
         "viewmats": viewmats,
@@ -72,8 +72,8 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
     """
     return {
         **_gaussians(gaussians, sh_degree),
-        "scales": _one("scales", gaussians.scales, 2),
-        "quats": _one("rotations", gaussians.rotations, 2)[:, [3, 0, 1, 2]],
+        "scales": _unbatch("scales", gaussians.scales, 2),
+        "quats": _unbatch("rotations", gaussians.rotations, 2)[:, [3, 0, 1, 2]],
         **_family_views(poses, "extrinsic", "intrinsic", images),
         "order": "none",
     }
@@ -88,8 +88,7 @@ def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0)
 
     Args:
         output: Output of the encoder: Gaussians with ``means``, ``covariances``, ``harmonics [1,n,3,k]`` and
-        ``opacities``, or
-            a dictionary that has them as ``gaussians``.
+            ``opacities``, or a dictionary with these Gaussians under ``gaussians``.
         context: Context of the batch: ``extrinsics [1,V,4,4]`` camera to world, ``intrinsics [1,V,3,3]`` divided by the
             image's size, ``image [1,V,3,H,W]`` in [0, 1].
         sh_degree: Harmonics above this degree are left out, as in its files.
@@ -98,7 +97,7 @@ def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0)
         SceneError: If a field is missing, or it holds several scenes.
     """
     gaussians = output["gaussians"] if isinstance(output, Mapping) else output
-    covariances = _one("covariances", _field("gaussians", gaussians, "covariances"), 3)
+    covariances = _unbatch("covariances", _field("gaussians", gaussians, "covariances"), 3)
     scales, quats = _axes(as_array(covariances).astype(np.float64))
     return {
         **_gaussians(gaussians, sh_degree),
@@ -124,22 +123,24 @@ def ffgs(output: Any, images: Array | None = None, cameras: Any = None, *, sh_de
     """
     gaussians = _field("output", output, "gaussians")
     cameras = getattr(output, "cameras", None) if cameras is None else cameras
-    opacities = _one("opacities", _field("gaussians", gaussians, "opacities"), 1)
-    used = opacities != 0  # the other rows only pad the batch
-    rows = {name: _one(name, _field("gaussians", gaussians, name), 2)[used] for name in ("means", "scales", "quats")}
+    opacities = _unbatch("opacities", _field("gaussians", gaussians, "opacities"), 1)
+    used = opacities != 0  # rows with an opacity of 0 only pad the batch
+    rows = {
+        name: _unbatch(name, _field("gaussians", gaussians, name), 2)[used] for name in ("means", "scales", "quats")
+    }
     if gaussians.sh_degree is None:
-        colors = {"colors": _one("colors", gaussians.colors, 2)[used]}
+        colors = {"colors": _unbatch("colors", gaussians.colors, 2)[used]}
     else:
-        harmonics = _one("colors", gaussians.colors, 3)[used]
+        harmonics = _unbatch("colors", gaussians.colors, 3)[used]
         colors = {"sh0": harmonics[:, :1], "shN": harmonics[:, 1 : (sh_degree + 1) ** 2]}
     arguments = {**rows, **colors, "opacities": opacities[used], "order": "none"}
     if cameras is None:
         return arguments
-    c2w = as_array(_one("c2w", cameras.c2w, 3)).astype(np.float64)
-    arguments |= {"viewmats": invert(c2w), "Ks": as_array(_one("pixel_k", cameras.pixel_k, 3)).astype(np.float64)}
+    c2w = as_array(_unbatch("c2w", cameras.c2w, 3)).astype(np.float64)
+    arguments |= {"viewmats": invert(c2w), "Ks": as_array(_unbatch("pixel_k", cameras.pixel_k, 3)).astype(np.float64)}
     if images is None:
         return arguments | {"shape": (len(c2w), *cameras.image_shape)}
-    return arguments | {"images": _as_floats(as_array(_one("images", images, 4)).transpose(0, 2, 3, 1))}
+    return arguments | {"images": _as_floats(as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1))}
 
 
 def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]:
@@ -155,23 +156,22 @@ def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]
     """
     splats: Any = _item("predictions", predictions, "splats")
     shapes = {"means": (-1, 3), "scales": (-1, 3), "quats": (-1, 4), "opacities": (-1,), "sh": (-1, 1, 3)}
-    columns = {name: _first(name, _item("splats", splats, name)).reshape(shape) for name, shape in shapes.items()}
-    c2w = as_array(_one("camera_poses", _item("predictions", predictions, "camera_poses"), 3)).astype(np.float64)
-    Ks = as_array(_one("camera_intrs", _item("predictions", predictions, "camera_intrs"), 3)).astype(np.float64)
-    photos = as_array(_one("images", images, 4)).transpose(0, 2, 3, 1)
+    columns = {name: _only(name, _item("splats", splats, name)).reshape(shape) for name, shape in shapes.items()}
+    c2w = as_array(_unbatch("camera_poses", _item("predictions", predictions, "camera_poses"), 3)).astype(np.float64)
+    Ks = as_array(_unbatch("camera_intrs", _item("predictions", predictions, "camera_intrs"), 3)).astype(np.float64)
+    photos = as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1)
     columns["sh0"] = columns.pop("sh")
     return {**columns, "images": _as_floats(photos), "viewmats": invert(c2w), "Ks": Ks, "order": "none"}
 
 
 def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) -> dict[str, Any]:
-    """Convert the Gaussians of gsplat's ``simple_trainer.py`` and the views that they are trained on, in its own frame.
+    """Convert the Gaussians of gsplat's ``simple_trainer.py`` and its training views, in the frame of the trainer.
 
     Args:
         splats: The trainer's ``splats``, or those of one of its checkpoints: ``means``, ``quats`` wxyz of any length,
             ``scales`` as logarithms, ``opacities`` as logits, ``sh0``, ``shN``.
-        dataset: The trainer's ``trainset``: for each view ``camtoworld [4,4]``, ``K [3,3]`` in pixels, ``image
-        [H,W,3]``
-            in [0, 255].
+        dataset: The trainer's ``trainset``. Each view has ``camtoworld [4,4]``, ``K [3,3]`` in pixels, and ``image
+            [H,W,3]`` in [0, 255].
 
     Raises:
         SceneError: If an entry is missing, such as ``sh0`` if colours depend on the photo, or if photos differ in size.
@@ -186,7 +186,7 @@ def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) 
     if num_sizes > 1:
         problem = f"expected photos of one size, found {num_sizes} sizes"
         raise SceneError("dataset", problem, "pass photos of one size")
-    c2w, Ks, photos = (np.stack(columns) for columns in zip(*views, strict=True))
+    c2w, Ks, photos = (np.stack(arrays) for arrays in zip(*views, strict=True))
     return {
         **{name: like(column, splats["means"]) for name, column in columns.items()},
         "images": (photos / np.float32(_BYTES)).astype(np.float32), "Ks": Ks.astype(np.float64),
@@ -194,30 +194,30 @@ def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) 
     }  # fmt: skip
 
 
-def _first(name: str, values: Any) -> Any:
-    """Return the only element of a list or of the first axis; SceneError if there is not exactly one."""
+def _only(name: str, values: Any) -> Any:
+    """Return the only element of a list or of the first axis; SceneError for any other number of elements."""
     if len(values) != 1:
         raise SceneError(name, f"expected a batch of one scene, found {len(values)}", "pass one scene")
     return values[0]
 
 
-def _field(owner: str, value: Any, name: str) -> Any:
+def _field(owner_name: str, owner: Any, name: str) -> Any:
     """Return a field of an object; SceneError if it is missing or None."""
-    content = getattr(value, name, None)
-    if content is None:
+    field = getattr(owner, name, None)
+    if field is None:
         remedy = "run the model with infer_gs=True" if name == "gaussians" else ""
-        raise SceneError(owner, f"expected a field {name}, found none", remedy)
-    return content
+        raise SceneError(owner_name, f"expected a field {name}, found none", remedy)
+    return field
 
 
-def _item(owner: str, values: Mapping[str, Array], name: str) -> Array:
+def _item(mapping_name: str, values: Mapping[str, Array], name: str) -> Array:
     """Return an entry of a mapping; SceneError if it is missing."""
     if name not in values:
-        raise SceneError(owner, f"expected an entry {name!r}, found {', '.join(map(repr, values.keys()))}")
+        raise SceneError(mapping_name, f"expected an entry {name!r}, found {', '.join(map(repr, values.keys()))}")
     return values[name]
 
 
-def _one(name: str, values: Array, num_axes: int) -> Array:
+def _unbatch(name: str, values: Array, num_axes: int) -> Array:
     """Remove the axis of a batch of one scene; SceneError if the batch has another size."""
     if values.ndim == num_axes:
         return values
@@ -228,19 +228,19 @@ def _one(name: str, values: Array, num_axes: int) -> Array:
 
 def _gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
     """Return means, opacities and harmonics, which these models store channel-major."""
-    harmonics = _one("harmonics", _field("gaussians", gaussians, "harmonics"), 3)
+    harmonics = _unbatch("harmonics", _field("gaussians", gaussians, "harmonics"), 3)
     rows = harmonics.swapaxes(1, 2)[:, : (sh_degree + 1) ** 2]
     opacities = _field("gaussians", gaussians, "opacities")
-    means = _one("means", _field("gaussians", gaussians, "means"), 2)
+    means = _unbatch("means", _field("gaussians", gaussians, "means"), 2)
     return {"means": means, "opacities": opacities, "sh0": rows[:, :1], "shN": rows[:, 1:]}
 
 
 def _family_views(poses: Mapping[str, Array], extrinsics: str, intrinsics: str, images: Array) -> dict[str, np.ndarray]:
     """Convert views of the pixelSplat family: camera to world, intrinsics relative to image size, channels first."""
-    c2w = as_array(_one(extrinsics, _item("poses", poses, extrinsics), 3)).astype(np.float64)
-    photos = as_array(_one("images", images, 4)).transpose(0, 2, 3, 1)
+    c2w = as_array(_unbatch(extrinsics, _item("poses", poses, extrinsics), 3)).astype(np.float64)
+    photos = as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1)
     sizes = np.array([photos.shape[2], photos.shape[1], 1.0])
-    Ks = as_array(_one(intrinsics, _item("poses", poses, intrinsics), 3)).astype(np.float64) * sizes[:, None]
+    Ks = as_array(_unbatch(intrinsics, _item("poses", poses, intrinsics), 3)).astype(np.float64) * sizes[:, None]
     return {"images": _as_floats(photos), "viewmats": invert(c2w), "Ks": Ks}
 
 
@@ -252,12 +252,12 @@ def _as_floats(photos: np.ndarray) -> np.ndarray:
 def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
     """Scale intrinsics to the size of the photos.
 
-    After Depth Anything 3 has written COLMAP files, its intrinsics are those of the original photo size. The principal
-    point is in the middle at both sizes.
+    After Depth Anything 3 has written COLMAP files, its intrinsics belong to the original size of the photos. The
+    principal point is in the middle at both sizes.
     """
     factors = np.array([photos.shape[-2], photos.shape[-3]]) / (2 * Ks[:, (0, 1), 2])
-    scaled = np.abs(factors - 1).min() > _OTHER_SIZE
-    return Ks * np.concatenate([factors, np.ones((len(Ks), 1))], 1)[:, :, None] if scaled else Ks
+    is_other_size = np.abs(factors - 1).min() > _OTHER_SIZE
+    return Ks * np.concatenate([factors, np.ones((len(Ks), 1))], 1)[:, :, None] if is_other_size else Ks
 
 
 def _axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -75,10 +75,10 @@ def find_named_scenes(arguments: Sequence[str], out: Path) -> Iterator[NamedScen
 
 def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> Iterator[NamedScene]:
     """Yield the scenes; SceneError if there are none."""
-    first = next(scenes, None)
-    if first is None:
+    first_scene = next(scenes, None)
+    if first_scene is None:
         raise SceneError(argument, f"expected scenes {where}, found none", _remedy(Path(argument)))
-    yield first
+    yield first_scene
     yield from scenes
 
 
@@ -92,7 +92,7 @@ def _remedy(folder: Path) -> str:
 
 @dataclass
 class _Search:
-    """Search of one argument, which enters each folder once, even if several links lead to it."""
+    """Search of one argument; it enters each folder once, even if several links lead to it."""
 
     skip: str  # real path of the output folder, which is not searched
     seen: set[str] = field(default_factory=set)  # real paths of the folders entered so far
@@ -111,13 +111,13 @@ class _Search:
             self.num_empty = 0 if scenes else self.num_empty
             yield from ((scene, folder) for scene in scenes)
 
-    def folders(self, first: Path) -> Iterator[tuple[Path, list[str] | None, list[str]]]:
+    def folders(self, top: Path) -> Iterator[tuple[Path, list[str] | None, list[str]]]:
         """Yield a folder and all folders below it, each with the names in it and a list of its folders' names.
 
         The names are None if the folder cannot be read. A folder is not entered if the caller removes its name from the
         list.
         """
-        stack = [(first, os.path.realpath(first))]
+        stack = [(top, os.path.realpath(top))]
         while stack:
             folder, real = stack.pop()
             if real == self.skip or real in self.seen:
@@ -142,7 +142,10 @@ class _Search:
 
 
 def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
-    """List the scenes in a folder with these names that is no scene itself; the folder if it has vanished since."""
+    """List the scenes in a folder that is no scene itself; the folder if it cannot be read any more.
+
+    ``names``: files and folders in the folder.
+    """
     if SCENE_NAMES.isdisjoint(names) and not any(name.endswith(SCENE_SUFFIXES) for name in names):
         return []
     with suppress(OSError):
@@ -187,14 +190,13 @@ def _expand(pattern: str, search: _Search) -> Iterator[str]:
     if "**" not in parts:
         yield from glob.iglob(pattern)
         return
-    place = parts.index("**")
-    tail = parts[place + 1 :]
-    inner = _Search(search.skip)
-    for base in glob.iglob(os.path.join(*parts[:place])) if place else (os.curdir,):
-        for folder, entries, _ in inner.folders(Path(base)):
+    head, tail = parts[: parts.index("**")], parts[parts.index("**") + 1 :]
+    tree = _Search(search.skip)
+    for base in glob.iglob(os.path.join(*head)) if head else (os.curdir,):
+        for folder, entries, _ in tree.folders(Path(base)):
             names = [str(folder)] if entries is None or not tail else []
             names += _expand(os.path.join(glob.escape(str(folder)), *(tail or ("*",))), search)
-            inner.num_empty = 0 if names else inner.num_empty
+            tree.num_empty = 0 if names else tree.num_empty
             yield from names
 
 

@@ -174,8 +174,7 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
         if real in inputs or real in results:
             continue
         inputs.add(real)
-        first = output_name(options, scene, len(jobs))
-        outputs = (first, *(level_output(Path(first), i).as_posix() for i in range(1, options.settings.budget.levels)))
+        outputs = _output_names(options, scene, len(jobs))
         for name in map(os.path.normcase, outputs):  # on Windows A.ply and a.ply are one file
             if name in owners:
                 raise UsageError(
@@ -183,11 +182,8 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
                     f" {scene}; distinguish them with --name, such as '{{parent}}-{{stem}}.ply'"
                 )
             owners[name] = str(scene)
-        patterns = {name: getattr(options, name) for name in PLACES}
-        places: dict[str, Any] = {
-            name: path if path == NONE else fill_template(path, scene) for name, path in patterns.items()
-        }
-        jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), **places, within=within))
+        paths = _paths_beside(options, scene)
+        jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), **paths, within=within))
     for name in owners:
         if os.path.realpath(out / name) in inputs:
             raise UsageError(f"{out / name}: is one of the scenes and would be replaced; name another --output")
@@ -200,6 +196,19 @@ def _check_place(option: str, place: str | None) -> None:
         return
     remedy = f"for one beside each scene pass --{option} '{{parent}}/{place}'"
     raise SceneError(place, "no such file or folder", "" if os.path.isabs(place) else remedy)
+
+
+def _output_names(options: BatchOptions, scene: Path, index: int) -> tuple[str, ...]:
+    """Return the names of a scene's result and of its coarser levels in the output folder."""
+    name = output_name(options, scene, index)
+    levels = range(1, options.settings.budget.levels)
+    return name, *(level_output(Path(name), level).as_posix() for level in levels)
+
+
+def _paths_beside(options: BatchOptions, scene: Path) -> dict[str, Any]:
+    """Return the paths of a scene's cameras, photos and masks by option, with its names filled into patterns."""
+    patterns = {name: getattr(options, name) for name in PLACES}
+    return {name: pattern if pattern == NONE else fill_template(pattern, scene) for name, pattern in patterns.items()}
 
 
 def output_name(options: BatchOptions, scene: Path, index: int) -> str:

@@ -1,7 +1,7 @@
 """Run a batch: make the result of every job that is not done, and record how each ended.
 
 The run may be killed at any moment. A result is written completely or not at all, and is recorded right after. A killed
-process also leaves a file that marks its result as begun. It shows that a result without a record is from a batch.
+process also leaves a file that marks its result as begun. This file shows that a batch made a result without a record.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gsmerge.report import file_sha256, finite
 from gsmerge.runtime.memory import free_memory
 from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.threads import available_threads
-from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, Lost, RayPool, WorkerPool
+from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, LostProcess, RayPool, WorkerPool
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory, for all scenes that run at the same time by default
 
@@ -115,7 +115,7 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
             pool = RayPool(cluster, concurrency.threads, jobs=concurrency.jobs)
         stack.enter_context(closing(pool))
 
-        def each_call(jobs: Sequence[Job], *, wait: bool) -> Iterator[Call]:
+        def make_calls(jobs: Sequence[Job], *, wait: bool) -> Iterator[Call]:
             for job in jobs:
                 active[job.output] = job
                 yield Call(job, (job, run, wait), job.memory)
@@ -123,9 +123,9 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
         remaining, wait = jobs, False
         while remaining:
             busy: list[Job] = []
-            for job, outcome in pool.run(make_result, each_call(remaining, wait=wait)):
+            for job, outcome in pool.run(make_result, make_calls(remaining, wait=wait)):
                 del active[job.output]
-                line = record_loss(job, run, outcome.reason) if isinstance(outcome, Lost) else outcome
+                line = record_loss(job, run, outcome.reason) if isinstance(outcome, LostProcess) else outcome
                 if line is None:
                     busy.append(job)
                 else:
@@ -169,15 +169,18 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     mark(begun)
     out = run.folder / job.output
     out.parent.mkdir(parents=True, exist_ok=True)
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as caught_warnings:
         warnings.simplefilter("default")
         document, written = job.call.run(files, out, run.threads)
-    document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
-    facts = [
-        {"path": name.as_posix(), "sha256": file_sha256(run.folder / name), "bytes": (run.folder / name).stat().st_size}
-        for name in (Path(os.path.relpath(path, run.folder)) for path in written)
-    ]
+    document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught_warnings))
+    facts = [_describe_file(run.folder, path) for path in written]
     return record(DONE, job.scene, job.output, key=key, files=facts, report=finite(document))
+
+
+def _describe_file(folder: Path, path: Path) -> dict[str, Any]:
+    """Return the path of a file relative to the output folder, its hash and its size in bytes."""
+    path = folder / (name := Path(os.path.relpath(path, folder)))
+    return {"path": name.as_posix(), "sha256": file_sha256(path), "bytes": path.stat().st_size}
 
 
 @lru_cache(maxsize=1)
@@ -206,7 +209,7 @@ def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
 
 
 def _clean(job: Job, run: Run, begun: Path) -> None:
-    """Remove the files that a killed process left; keep the mark if the result exists, since it may lack a record."""
+    """Remove the unfinished files of a killed process; keep the mark if the result exists and so may lack a record."""
     if begun.exists():
         paths = [run.folder / name for name in job.outputs]
         for folder in {path.parent for path in paths}:
@@ -216,7 +219,7 @@ def _clean(job: Job, run: Run, begun: Path) -> None:
 
 
 def mark(begun: Path) -> None:
-    """Write the file that marks a result as begun, with the process number, so that it is known to be from a batch."""
+    """Write the file that marks a result as begun, with the process id. It shows that the result is from a batch."""
     with begun.open("wb") as file:
         file.write(f"{os.getpid()}\n".encode())
         file.flush()

@@ -1,7 +1,8 @@
 """Write one or several files completely or not at all.
 
 Each file is first written under a temporary name in its folder. When all files are on the disk, all are renamed. The
-temporary name has the process and its machine, so that a later process can remove the files of a killed one.
+temporary name contains the process id and a hash of the machine. A later process can thus remove the files of a killed
+process.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import uuid
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import groupby, takewhile
 from pathlib import Path, PurePath
@@ -32,9 +34,9 @@ _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
 _MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps, since names have at most 255
 _STALE_SECONDS = 7 * 86400  # age at which a file of another machine is stale; its processes are not visible here
-_SYNCHRONIZE, _NO_PROCESS = 0x100000, 87  # an access right and an error code of Windows
+_SYNCHRONIZE, _NO_PROCESS = 0x100000, 87  # Windows: an access right, and the error code of an unknown process
 _BOOT = "/proc/sys/kernel/random/boot_id"
-_TEMPORARY = re.compile(r"\.gsmerge-(?P<place>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
+_TEMPORARY = re.compile(r"\.gsmerge-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
 _RESERVED = re.compile(r"(?is)(con|prn|aux|nul|com\d|lpt\d) *(\..*)?|.*[<>:\"|?*\x00-\x1f].*|(?!\.\.?$).*[ .]")
 
 AddOutput = Callable[[Path], Path]  # adds a file to :func:`atomic_outputs`, and returns the temporary file to write
@@ -55,25 +57,45 @@ def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
-    """Write several files and rename all of them at the end; if the block fails, none is left.
+    """Write several files and rename all of them at the end; if the block fails, no file remains.
 
     Yields a function that adds a file and returns its temporary file, as in :func:`atomic_output`. If the process is
     killed or the disk fails between two renames, each file is complete, either old or new. Files in deeper folders are
     renamed first, and their names are on the disk before the next folder is renamed. Therefore an index above them
     never names a missing file.
     """
-    made: dict[str, tuple[Path, Path]] = {}  # temporary file -> path that was asked for, path after links
-    folders: list[Path] = []  # that were made
+    outputs = _Outputs(overwrite)
+    try:
+        yield outputs.add
+        outputs.rename()
+    except (SceneError, OSError) as error:
+        renamed_error = outputs.name_error(error)
+        if renamed_error is None:
+            raise
+        raise renamed_error from error
+    finally:
+        outputs.remove_rest()
 
-    def add(path: Path) -> Path:
+
+@dataclass(frozen=True)
+class _Outputs:
+    """The files of one call of :func:`atomic_outputs`."""
+
+    overwrite: bool
+    # Temporary file -> path as the caller gave it, and path after links
+    paths: dict[str, tuple[Path, Path]] = field(default_factory=dict)
+    new_folders: list[Path] = field(default_factory=list)  # parents before their children
+
+    def add(self, path: Path) -> Path:
+        """Make the temporary file of an output and return it; a temporary file of an outer block is its own."""
         if str(path) in _written:
             return path
-        folders.extend(_make_folder(path.parent))
-        _refuse(path, overwrite)
+        self.new_folders.extend(_make_folder(path.parent))
+        _refuse(path, self.overwrite)
         target = Path(os.path.realpath(path)) if path.is_symlink() else path
         _remove_stale_once(target.parent.absolute())
         temporary = temporary_path(target)
-        made[str(temporary)] = path, target
+        self.paths[str(temporary)] = path, target
         _written.add(str(temporary))
         try:
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -81,42 +103,47 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
             raise SceneError(path, f"cannot be written ({error.strerror})", "choose another folder") from error
         return temporary
 
-    try:
-        yield add
-        for temporary in made:
+    def rename(self) -> None:
+        """Wait until all files are on the disk, and rename them, deepest folders first."""
+        for temporary in self.paths:
             _flush(temporary)
-        for folder in {folder.parent for folder in folders}:
+        for folder in {folder.parent for folder in self.new_folders}:
             _flush_names(folder)
-        deepest_first = sorted(made.items(), key=lambda item: (-len(item[1][0].parts), item[1][1].parent))
-        _rename_all([(temporary, target) for temporary, (_, target) in deepest_first], overwrite=overwrite)
-    except SceneError as error:
-        if error.path not in made:
-            raise
-        path = made[error.path][0]  # the temporary name means nothing to the caller
-        raise SceneError(path, error.problem, error.remedy) from error
-    except OSError as error:
-        if not made or (error.errno not in _DISK_ERRORS and error.filename not in made):
-            raise
-        path = made.get(str(error.filename), next(iter(made.values())))[0]
+        files = [(temporary, path, target) for temporary, (path, target) in self.paths.items()]
+        files.sort(key=lambda file: (-len(file[1].parts), file[2].parent))
+        _rename_all([(temporary, target) for temporary, _, target in files], overwrite=self.overwrite)
+
+    def name_error(self, error: SceneError | OSError) -> SceneError | None:
+        """Return an error that names the caller's path instead of a temporary file; None for any other error."""
+        if isinstance(error, SceneError):
+            if error.path not in self.paths:
+                return None
+            return SceneError(self.paths[error.path][0], error.problem, error.remedy)
+        if not self.paths or (error.errno not in _DISK_ERRORS and error.filename not in self.paths):
+            return None
+        path, _ = self.paths.get(str(error.filename), next(iter(self.paths.values())))
         remedy = "close what has it open" if sys.platform == "win32" and isinstance(error, PermissionError) else ""
-        raise SceneError(path, f"could not be written ({error.strerror})", remedy) from error
-    finally:
-        for temporary in made:
+        return SceneError(path, f"could not be written ({error.strerror})", remedy)
+
+    def remove_rest(self) -> None:
+        """Remove temporary files that were not renamed, and new folders without files."""
+        for temporary in self.paths:
             with suppress(OSError):
                 os.unlink(temporary)
-        for folder in reversed(folders):
+        for folder in reversed(self.new_folders):
             with suppress(OSError):  # a folder with files is not removed
                 os.rmdir(folder)
-        _written.difference_update(made)
+        _written.difference_update(self.paths)
 
 
 def link_file(source: Path, target: Path) -> None:
     """Replace the file ``target`` by a hard link to ``source``, else by a symbolic link, else by a copy."""
     os.unlink(target)
     real = os.path.realpath(source)
-    for make in (os.link,) if sys.platform == "win32" else (os.link, os.symlink):  # most users may not make those there
+    # Windows allows symbolic links to few users
+    for link in (os.link,) if sys.platform == "win32" else (os.link, os.symlink):
         with suppress(OSError, NotImplementedError):
-            make(real, target)
+            link(real, target)
             return
     shutil.copyfile(real, target)
 
@@ -194,11 +221,11 @@ def _flush(path: str | Path) -> None:
 def temporary_path(path: Path) -> Path:
     """Return a temporary name in the folder of ``path``, with its suffix, a hash of the machine and the process id."""
     suffix = path.suffix if len(os.fsencode(path.suffix)) <= _MAX_SUFFIX else ""
-    return path.with_name(f".gsmerge-{_place()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
+    return path.with_name(f".gsmerge-{_machine_hash()}-{os.getpid()}-{secrets.token_hex(4)}{suffix}")
 
 
 @cache
-def _place() -> str:
+def _machine_hash() -> str:
     """Return a hash of the machine and the container, in which process ids are unique.
 
     Host names and ids of name spaces are often equal in different containers. Therefore Linux's random boot id is used
@@ -215,16 +242,16 @@ def remove_stale(folder: Path) -> None:
     with suppress(OSError), os.scandir(folder) as entries:  # another process may remove them, or rights may be missing
         for entry in list(entries):
             match = _TEMPORARY.fullmatch(entry.name)
-            if match is not None and _is_stale(entry, match["place"], int(match["pid"])):
+            if match is not None and _is_stale(entry, match["machine"], int(match["pid"])):
                 os.unlink(entry.path)
 
 
 _remove_stale_once = cache(remove_stale)  # once per folder and process, since listing a large folder takes long
 
 
-def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:
+def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
     """Return whether the process that wrote a temporary file has ended, or a file of another machine is old."""
-    if place != _place():
+    if machine != _machine_hash():
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS
     if sys.platform == "win32":  # where a signal 0 would end the process
         kernel = ctypes.WinDLL("kernel32", use_last_error=True)

@@ -82,7 +82,7 @@ def _parse_matrix(table: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.
     cosine = max(abs(float((rotation[:, i] * rotation[:, j]).sum())) for i, j in ((0, 1), (0, 2), (1, 2)))
     if cosine > SHEAR:
         raise ValueError(f"matrix: expected axes at right angles, found a cosine of {cosine:.3g} between two of them")
-    # A mirrored cube is the same as one that is not
+    # Mirroring does not change a cube, so the matrix becomes a rotation
     rotation[:, 2] *= np.sign((np.cross(rotation[:, 0], rotation[:, 1]) * rotation[:, 2]).sum())
     return matrix[:3, 3], scales, rotation
 

@@ -19,7 +19,7 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", "
 OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of unread formats
 FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content == FILM)
 _CUT = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
-_MAX_PARTS = 16  # last parts of a path that are compared with names: the file's name and folders above it
+_MAX_PARTS = 16  # parts at the end of a path that names are compared with: the file's name and folders above it
 _NAME_FOLDER = "name the folder of the photos with --images, or of held-out views with --target-images"
 _HIDDEN = ".@"  # first characters of hidden folders, such as .thumb and @eaDir
 ImageSource = StrPath | Sequence[StrPath]
@@ -48,8 +48,8 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
         problem = f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing}"
         raise SceneError(root, problem, "add the missing images, or name another folder with --images")
     if len(set(paths)) < len(set(names)):  # layers of one view have the same name
-        twice = Counter(paths).most_common(1)[0][0]
-        problem = f"expected a different image for each camera, found {twice.name} for two of them"
+        ((repeated, _),) = Counter(paths).most_common(1)
+        problem = f"expected a different image for each camera, found {repeated.name} for two of them"
         raise SceneError(root, problem, "give each image the name of its camera")
     return paths
 
@@ -79,15 +79,16 @@ def _find_matches(by_ending: dict[str, list[Path]], name: str) -> list[Path]:
 def propose_images(root: Path, files: Sequence[Path], names: Sequence[str], pixels: PixelCount) -> list[Path | None]:
     """Propose one of ``files`` below a folder for each name; None if no file has the name.
 
-    Of several files, one whose whole path is in the name is preferred, then one that is not in a hidden folder, then
-    that with the most ``pixels``.
+    If several files have the name, a file is preferred if its whole path is in the name, then if it is not in a hidden
+    folder, then if it has more ``pixels``.
     """
     by_ending = _by_ending(root, files)
 
     def rank(path: Path, name: str) -> tuple[bool, bool, int]:
-        inside = path.relative_to(root) if path.is_relative_to(root) else path
-        is_whole = any(ending in (str(inside), str(inside.with_suffix(""))) for ending in _endings(PurePosixPath(name)))
-        return not is_whole, any(part[0] in _HIDDEN for part in inside.parts), -pixels(path)
+        relative = path.relative_to(root) if path.is_relative_to(root) else path
+        whole_paths = str(relative), str(relative.with_suffix(""))
+        has_whole_path = any(ending in whole_paths for ending in _endings(PurePosixPath(name)))
+        return not has_whole_path, any(part[0] in _HIDDEN for part in relative.parts), -pixels(path)
 
     def choose(name: str) -> Path | None:
         matches = _find_matches(by_ending, name)
@@ -121,8 +122,8 @@ def match_masks(folder: Path, names: Sequence[str], option: str = "--masks") -> 
         problem = f"expected masks with the names of the photos, such as {PurePath(names[0]).stem}.png, found {found}"
         raise SceneError(folder, problem, remedy)
     unused = [file.relative_to(folder).as_posix() for file in files if file not in masks]
-    some = ", ".join(unused[:3]) + ", ..." * (len(unused) > 3)
-    note = f"{option.removeprefix('--')}: {len(unused)} pictures in {folder} have the name of no photo: {some}"
+    examples = ", ".join(unused[:3]) + ", ..." * (len(unused) > 3)
+    note = f"{option.removeprefix('--')}: {len(unused)} pictures in {folder} have the name of no photo: {examples}"
     return masks, [note] if unused else []
 
 
@@ -183,8 +184,8 @@ def find_image(folder: Path, name: str, remedy: str = _NAME_FOLDER) -> Path | No
     """
     path = os.path.normpath(os.path.join(folder, name))
     candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]
-    image = next((Path(c) for c in candidates if os.path.isfile(c)), None)
-    forms = (Path.absolute, Path.resolve)
-    if image is not None and not any(form(image).is_relative_to(form(folder)) for form in forms):
+    image = next((Path(candidate) for candidate in candidates if os.path.isfile(candidate)), None)
+    full_paths = (Path.absolute, Path.resolve)
+    if image is not None and not any(full(image).is_relative_to(full(folder)) for full in full_paths):
         raise SceneError(folder, f"expected cameras that name photos in this folder, found the name {image}", remedy)
     return image

@@ -125,9 +125,9 @@ def decode_images(paths: Sequence[Path]) -> PhotoArrays:
 
 def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
     """Raise SceneError if the photos of a scene take more memory together than the bytes of their files allow."""
-    num_bytes, most = _CHANNELS * len(paths) * size[0] * size[1], _FREE_PHOTOS + _PHOTOS_PER_BYTE * file_bytes
-    if num_bytes > most:
-        problem = f"expected photos of at most {most / 1e6:,.0f} MB together from files of {file_bytes:,} bytes"
+    num_bytes, max_bytes = _CHANNELS * len(paths) * size[0] * size[1], _FREE_PHOTOS + _PHOTOS_PER_BYTE * file_bytes
+    if num_bytes > max_bytes:
+        problem = f"expected photos of at most {max_bytes / 1e6:,.0f} MB together from files of {file_bytes:,} bytes"
         found = f"found {len(paths):,} of {size[0]} x {size[1]}, {num_bytes / 1e6:,.0f} MB"
         raise SceneError(paths[0].parent, f"{problem}, {found}", "reduce their size, or leave some out")
 
@@ -146,11 +146,8 @@ def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size)
         if path is None:
             return np.zeros((size[1], size[0], 3), np.uint8)
         photo = np.ascontiguousarray(turn_picture(decode_image(path, sizes[path]), turns[view]))
-        return (
-            photo
-            if photo.shape[1::-1] == size
-            else resize_to((photo.shape[1], photo.shape[0]), size).photos([photo])[0]
-        )
+        photo_size = photo.shape[1], photo.shape[0]
+        return photo if photo_size == size else resize_to(photo_size, size).photos([photo])[0]
 
     if _CHANNELS * size[0] * size[1] * len(paths) > _AT_ONCE:
         return PhotoReader(len(paths), size, decode)
@@ -171,8 +168,8 @@ def decode_small(path: Path, side: int) -> np.ndarray:
     photo = _decode(path, data, (width, height), divisor if data[:2].tobytes() == _JPEG else 1)
     ratio = max(photo.shape[:2]) / (2 * side)
     if ratio > 1:
-        small = round(photo.shape[1] / ratio), round(photo.shape[0] / ratio)
-        photo = cv2.resize(photo, tuple(max(1, each) for each in small), interpolation=cv2.INTER_AREA)
+        small_size = max(1, round(photo.shape[1] / ratio)), max(1, round(photo.shape[0] / ratio))
+        photo = cv2.resize(photo, small_size, interpolation=cv2.INTER_AREA)
     return np.multiply(photo, np.float32(1 / 255), dtype=np.float32)
 
 
@@ -231,8 +228,8 @@ def same_shape(size: Size, other: Size) -> bool:
 def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     """Decode the brightness ``[h,w]`` uint8 of a mask, times its opacity; 255 is white.
 
-    In a picture whose values are all 0 and 1, or fractions of 1, white is 1. The limit of memory is that of the mask's
-    bytes and those of its ``photo`` together, since masks compress to very few bytes.
+    White is 1 if no value of the picture exceeds 1. The bytes of the mask and of its ``photo`` together limit the
+    memory, since masks compress to very few bytes.
     """
     budget = _photo_budget(path, *([] if photo is None else [photo]))
 
@@ -291,9 +288,9 @@ def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
 
 
 def _decoder_bytes(image: Image.Image) -> float:
-    """Return the bytes per pixel that a decoder takes besides its output, as measured.
+    """Return the measured bytes per pixel that a decoder needs besides its output.
 
-    They hold the frames of a WebP, a strip of a TIFF and its RGBA, or the coefficients of a progressive JPEG.
+    These bytes hold the frames of a WebP, a strip of a TIFF and its RGBA, or the coefficients of a progressive JPEG.
     """
     if image.format == "WEBP":
         return _MOVING_WEBP_BYTES if getattr(image, "is_animated", False) else _WEBP_BYTES
@@ -514,7 +511,7 @@ def encode_indexed(indices: np.ndarray, colors: np.ndarray) -> bytes:
 
     With up to 16 colours, two pixels share a byte.
     """
-    (height, width), bits = indices.shape, 4 if len(colors) <= 16 else 8
+    (height, width), bits = indices.shape, 4 if len(colors) <= 16 else 8  # bits of an index
     opacities = colors[:, 3].copy() if colors.shape[1] > 3 else np.full(len(colors), 255, np.uint8)
     opacities[0] = 0
     if bits == 4:
@@ -559,16 +556,16 @@ class PhotoTransform:
         return replace(cameras, Ks=matmul(matrix, cameras.Ks), width=self.width, height=self.height)
 
     def photos(self, images: PhotoArrays) -> PhotoArrays:
-        """Transform c uint8 photos ``[h,w,3]``."""
+        """Resize and crop the uint8 photos ``[h,w,3]``."""
 
-        def one(_: int, image: np.ndarray) -> np.ndarray:
+        def transform(_: int, image: np.ndarray) -> np.ndarray:
             height, width = image.shape[:2]
             size = round(width * self.scale_x), round(height * self.scale_y)
             shrinks = size[0] * size[1] < width * height
-            whole = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-            return np.ascontiguousarray(whole[self.top : self.top + self.height, self.left : self.left + self.width])
+            resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+            return np.ascontiguousarray(resized[self.top : self.top + self.height, self.left : self.left + self.width])
 
-        return change_photos(images, one, (self.width, self.height))
+        return change_photos(images, transform, (self.width, self.height))
 
 
 def limit_size(size: Size, side: int) -> Size:
@@ -588,7 +585,7 @@ def resize_to(size: Size, to: Size) -> PhotoTransform:
 def resize_and_crop(size: Size, to: Size, scale: float | None = None) -> PhotoTransform:
     """Make the transform that resizes photos in proportion and crops them at the centre to the size ``to``.
 
-    ``scale``: of both sides; None: the smallest one that covers ``to``.
+    ``scale``: scale of both sides; None: the smallest scale at which the photo covers ``to``.
     """
     if scale is None:
         scale = max(to[0] / size[0], to[1] / size[1])

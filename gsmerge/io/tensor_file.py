@@ -1,4 +1,4 @@
-"""Read safetensors files into memory; a mapped file that becomes shorter would end the process without a message."""
+"""Read safetensors files into memory, not mapped: a mapped file that becomes shorter would end the process."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ def read_tensors(
     budget = read_budget(path)
     try:
         with path.open("rb") as file:
-            size = file.read(_HEADER_SIZE)
-            num_bytes = int.from_bytes(size, "little")
-            if not 0 < num_bytes <= budget.file_bytes:
+            length_bytes = file.read(_HEADER_SIZE)
+            length = int.from_bytes(length_bytes, "little")
+            if not 0 < length <= budget.file_bytes:
                 raise ValueError("no header of a safetensors file")
-            head = file.read(num_bytes)
-            budget.check_memory(_ARRAY_MEMORY * head.count(b"{") + _COPIES * budget.file_bytes, "arrays")
-            header = parse_json(head.decode("utf-8"), budget)
+            header_bytes = file.read(length)
+            budget.check_memory(_ARRAY_MEMORY * header_bytes.count(b"{") + _COPIES * budget.file_bytes, "arrays")
+            header = parse_json(header_bytes.decode("utf-8"), budget)
             metadata = (header.get("__metadata__") if isinstance(header, dict) else None) or {}
             if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
                 raise ValueError("metadata that is not text")
             del header
             tensors = {
                 name: np.frombuffer(tensor["data"], _TYPES[tensor["dtype"]]).reshape(tensor["shape"])
-                for name, tensor in (deserialize(size + head + file.read()) if arrays else ())
+                for name, tensor in (deserialize(length_bytes + header_bytes + file.read()) if arrays else ())
             }
     except (SafetensorError, OSError, ValueError, KeyError, MemoryError) as error:  # KeyError: of a type not in _TYPES
         reason = f"numbers of type {error.args[0]}" if isinstance(error, KeyError) else str(error)

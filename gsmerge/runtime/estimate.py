@@ -1,8 +1,8 @@
 """Estimate the seconds and bytes of a run before it starts, within a factor of about two.
 
-The costs are mean processor seconds of whole runs, on any settings. The forecast of a run that has started,
-``gsmerge/compaction/forecast.py``, has costs of its own: it measures the seconds itself and only needs the ratios of
-the costs between the parts of one run, which it needs more exactly.
+The costs are mean processor seconds of whole runs, on any settings. ``gsmerge/compaction/forecast.py`` forecasts a run
+that has started, and has separate costs. It measures the seconds itself, and only needs the ratios of costs between the
+parts of one run, but more exactly.
 """
 
 from __future__ import annotations
@@ -95,8 +95,8 @@ def memory_bytes(pixels: int, *, num_rest: int = 0, num_elsewhere: int = 0) -> i
     ``pixels``: number of pixels or Gaussians of the scene, or of the block in memory. ``num_rest``: columns of higher
     harmonics. ``num_elsewhere``: number of Gaussians outside the block.
     """
-    each = BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL
-    return BYTES_FIXED + round(each * pixels + BYTES_ELSEWHERE * num_elsewhere)
+    pixel_bytes = BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL
+    return BYTES_FIXED + round(pixel_bytes * pixels + BYTES_ELSEWHERE * num_elsewhere)
 
 
 def memory_problem(needed: int) -> str | None:

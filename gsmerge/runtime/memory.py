@@ -16,12 +16,12 @@ from weakref import WeakSet
 import numpy as np
 
 LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")  # of control groups 2 and 1
-# Parameters of glibc and our values, see mallopt(3). An array of 32 MiB or more gets pages of its own, which are
-# returned when it is deleted. Of other freed memory a process keeps up to 256 MiB for further arrays. With the
-# defaults, clearing new pages for each array took a tenth of the time to make a page of `gsmerge view`.
+# Parameters of glibc with their values, see mallopt(3). An array of 32 MiB or more gets separate pages, which are
+# returned when it is deleted. A process keeps up to 256 MiB of other freed memory for further arrays. With the default
+# values, clearing new pages for each array took a tenth of the time of `gsmerge view` for a page.
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 MAPPED_BYTES = 1 << 28  # arrays of this size or more are mapped from files
-_own_pages: WeakSet[mmap.mmap] = WeakSet()  # only these may be freed; private pages of others would lose their values
+_own_pages: WeakSet[mmap.mmap] = WeakSet()  # may be freed; private pages of other code would lose their values
 
 
 def peak_memory() -> int:
@@ -86,7 +86,7 @@ def release_memory() -> None:
 
 
 def make_array(shape: tuple[int, ...], dtype: type[np.generic], mapped_bytes: int | None = None) -> np.ndarray:
-    """Make an uninitialised array; map a large one from an unnamed temporary file, if the disk has room.
+    """Make an uninitialised array; map a large array from an unnamed temporary file, if the disk has room.
 
     ``mapped_bytes``: size in bytes from which an array is large; at most ``MAPPED_BYTES``, which is also the default.
 
@@ -116,14 +116,14 @@ def free_pages(arrays: Iterable[np.ndarray]) -> None:
 
 def gather(array: np.ndarray, *ids: np.ndarray) -> np.ndarray:
     """Copy ``array[ids]``, with only a part of a mapped array in memory at a time; sorted ids need the least memory."""
-    parts = -(-array.nbytes // MAPPED_BYTES)
-    if parts <= 1:
+    num_parts = -(-array.nbytes // MAPPED_BYTES)
+    if num_parts <= 1:
         return array[ids]
-    values = []
-    for part in zip(*(np.array_split(index, parts) for index in ids), strict=True):
-        values.append(array[part])
+    copies = []
+    for part_ids in zip(*(np.array_split(axis_ids, num_parts) for axis_ids in ids), strict=True):
+        copies.append(array[part_ids])
         free_pages([array])
-    return np.concatenate(values)
+    return np.concatenate(copies)
 
 
 def human_share(share: float, digits: int = 2) -> str:

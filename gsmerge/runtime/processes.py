@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from gsmerge.runtime.work import CALLS_PER_PROCESS, Call, Lost, WorkerPool
+from gsmerge.runtime.work import CALLS_PER_PROCESS, Call, LostProcess, WorkerPool
 
 LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 END_SECONDS = 10.0  # time that a process gets to end by itself
@@ -32,15 +32,15 @@ class Worker:
         self.count = 0
 
     def read_result(self) -> Any:
-        """Return the result of the current call, or Lost if the process has ended; raise the exception of the call."""
+        """Return the result of the current call; raise its exception; return LostProcess if the process has ended."""
         try:
-            is_result, value = self.pipe.recv()
+            succeeded, answer = self.pipe.recv()
         except (EOFError, OSError):
             self.process.join(END_SECONDS)
-            return Lost(_describe_exit(self.process))
-        if not is_result:
-            raise value
-        return value
+            return LostProcess(_describe_exit(self.process))
+        if not succeeded:
+            raise answer  # the exception of the call
+        return answer
 
     def stop(self, *, now: bool) -> None:
         """End the process, either ``now`` or when it notices that the pipe is closed."""
@@ -78,8 +78,8 @@ class ProcessPool(WorkerPool):
             result = worker.read_result()
             ended.append((worker.key, result))
             worker.key = None
-            if isinstance(result, Lost) or worker.count >= CALLS_PER_PROCESS:
-                worker.stop(now=isinstance(result, Lost))
+            if isinstance(result, LostProcess) or worker.count >= CALLS_PER_PROCESS:
+                worker.stop(now=isinstance(result, LostProcess))
                 self.workers.remove(worker)
         return ended
 
@@ -132,7 +132,7 @@ def run_worker(pipe: Connection) -> None:
         while True:
             function, arguments = pipe.recv()
             try:
-                answer = True, function(*arguments)
+                reply = True, function(*arguments)  # as read_result expects
             except Exception as error:
-                answer = False, error
-            pipe.send(answer)
+                reply = False, error
+            pipe.send(reply)

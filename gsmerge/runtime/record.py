@@ -106,8 +106,8 @@ def stage(name: str) -> Iterator[None]:
 
 def list_some(items: Sequence[str], separator: str = ", ") -> str:
     """List the first items for a note, and the number of further ones."""
-    more = f" and {len(items) - MAX_NAMED} more" if len(items) > MAX_NAMED else ""
-    return separator.join(items[:MAX_NAMED]) + more
+    rest = f" and {len(items) - MAX_NAMED} more" if len(items) > MAX_NAMED else ""
+    return separator.join(items[:MAX_NAMED]) + rest
 
 
 def note(text: str) -> None:
@@ -126,8 +126,8 @@ def choose(**choices: Any) -> None:
 def add_seconds(seconds: Mapping[str, float]) -> None:
     """Add the wall time of stages to the current record, by name."""
     record = current_record()
-    for name, value in seconds.items():
-        record.seconds[name] = record.seconds.get(name, 0.0) + value
+    for name, stage_seconds in seconds.items():
+        record.seconds[name] = record.seconds.get(name, 0.0) + stage_seconds
 
 
 def adopt(part: Record) -> None:

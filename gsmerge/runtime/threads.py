@@ -1,10 +1,10 @@
 """One thread pool for the whole package.
 
 A kernel runs on one thread and releases the GIL. This module runs kernels in parallel over views or bands of an image.
-So there is one barrier per pass over the views instead of one per loop, and no thread spins. A result cannot depend on
-the number of threads, since every item is computed on its own and results are returned in order. While a pool is in
-use, OpenCV and torch are limited to one thread each, so that the three do not compete for cores; torch is limited only
-if other code has imported it.
+Therefore a pass over the views has one barrier, instead of one per loop, and no thread spins. A result cannot depend on
+the number of threads, since every item is computed separately and results are returned in order. While a pool is in
+use, OpenCV and torch are limited to one thread each, so that they do not compete with the pool for cores. Torch is
+limited only if other code has imported it.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from gsmerge.runtime import MOST_THREADS
 THREADS = "GSMERGE_THREADS"  # environment variable: the default number of threads
 T = TypeVar("T")
 R = TypeVar("R")
-AT_ONCE = 12  # results of in_turn that are in memory at the same time
+AT_ONCE = 12  # number of results of in_turn in memory at the same time
 
 
 class _Pool:
-    """Threads that wait for work; handing it over takes a tenth of the time that an executor with futures needs."""
+    """Threads that wait for work; they start it in a tenth of the time that an executor with futures needs."""
 
     def __init__(self, count: int) -> None:
         self.work = SimpleQueue[Callable[[], None] | None]()
@@ -95,7 +95,7 @@ def work_alone() -> None:
 def use_threads(count: int | None = None) -> Iterator[int]:
     """Let :func:`parallel_map` use ``count`` threads (None: all processors) inside the block.
 
-    A block inside another keeps the outer one's threads. Raises ValueError if ``count`` is below 1.
+    A block inside another block uses the threads of the outer block. Raises ValueError if ``count`` is below 1.
     """
     if count is not None and count < 1:
         raise ValueError(f"expected at least 1 thread, got {count}")
@@ -164,7 +164,7 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     with use_threads() as count:
         if count == 1 or len(items) < 2 or _local.pool is None or _local.inside:
             return [function(item) for item in items]
-        return _share(_local.pool, function, items, min(count, len(items)) - 1)
+        return _compute_on_pool(_local.pool, function, items, min(count, len(items)) - 1)
 
 
 def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -173,45 +173,45 @@ def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     Use it for large results, one per view, that are only summed up. Memory then does not grow with the number of views.
     """
     items = list(items)
-    for first in range(0, len(items), AT_ONCE):
-        yield from parallel_map(function, items[first : first + AT_ONCE])
+    for start in range(0, len(items), AT_ONCE):
+        yield from parallel_map(function, items[start : start + AT_ONCE])
 
 
-def _share(pool: _Pool, function: Callable[[T], R], items: list[T], helpers: int) -> list[R]:
-    """Compute the items on this thread and on ``helpers`` threads of the pool; a free thread takes the next item.
+def _compute_on_pool(pool: _Pool, function: Callable[[T], R], items: list[T], num_helpers: int) -> list[R]:
+    """Compute the items on this thread and on ``num_helpers`` threads of the pool; a free thread takes the next item.
 
-    A thread that comes too late to take an item is not waited for. After an error, the thread takes all remaining items
+    The call does not wait for a thread that took no item. After an error, the thread takes all remaining items
     without computing them. If several items fail, the error of the first item is raised, whichever thread is quicker.
     """
     results: list[R] = [None] * len(items)  # type: ignore[list-item]
     indices = itertools.count()  # its next() is atomic
-    errors: dict[int, BaseException] = {}  # by index; all items before a failed one have been started
-    ends: SimpleQueue[int] = SimpleQueue()  # number of items that each thread took
+    errors: dict[int, BaseException] = {}  # by index; all items before a failed item have been started
+    counts: SimpleQueue[int] = SimpleQueue()  # number of items that each thread took
 
     def work() -> None:
-        taken, failed = 0, False
+        num_taken, has_failed = 0, False
         for index in indices:
             if index >= len(items):
                 break
-            taken += 1
+            num_taken += 1
             try:
-                if not failed:
+                if not has_failed:
                     results[index] = function(items[index])
             except BaseException as error:
-                errors[index], failed = error, True
-        if taken:
-            ends.put(taken)
+                errors[index], has_failed = error, True
+        if num_taken:
+            counts.put(num_taken)
 
-    for _ in range(helpers):
+    for _ in range(num_helpers):
         pool.work.put(work)
     _local.inside = True
     try:
         work()
     finally:
         _local.inside = False
-    remaining = len(items)
-    while remaining:
-        remaining -= ends.get()
+    num_left = len(items)
+    while num_left:
+        num_left -= counts.get()
     if errors:
         raise errors.pop(min(errors))
     return results

@@ -21,7 +21,7 @@ class Part:
     """
 
     before: float = 0.0
-    fit: float = 0.0  # of all its fits together
+    fit: float = 0.0  # cost of all its fits together
     after: float = 0.0
     num_fits: int = 1
 
@@ -119,12 +119,12 @@ class Forecast:
         if self._part is None:
             return None if self._end is None else max(0.0, self._end - self.clock())
         part, later = self._part, self._parts
-        fits = part.fit * (1 - self._share) + sum(each.fit for each in later)
-        rates = {kind: self._seconds[kind] / cost if cost else 0.0 for kind, cost in self._costs.items()}
-        fit_rate, rate = rates[True], rates[False] or rates[True]
-        own_cost = part.after if self._share else part.before + part.after
-        later_cost = sum(each.before + each.after for each in later)
-        if (fits and not fit_rate) or (own_cost + later_cost > 0 and not rate):
+        fit_cost = part.fit * (1 - self._share) + sum(later_part.fit for later_part in later)
+        rates = {is_fit: self._seconds[is_fit] / cost if cost else 0.0 for is_fit, cost in self._costs.items()}
+        fit_rate, stage_rate = rates[True], rates[False] or rates[True]  # seconds per cost
+        part_cost = part.after if self._share else part.before + part.after
+        later_cost = sum(later_part.before + later_part.after for later_part in later)
+        if (fit_cost and not fit_rate) or (part_cost + later_cost > 0 and not stage_rate):
             return None  # not measured yet
         spent = self.clock() - self._begun if self._step is None else 0.0
-        return fit_rate * fits + max(0.0, rate * own_cost - spent) + rate * later_cost
+        return fit_rate * fit_cost + max(0.0, stage_rate * part_cost - spent) + stage_rate * later_cost

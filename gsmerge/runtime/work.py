@@ -25,7 +25,7 @@ T = TypeVar("T")
 CONNECT_TIMEOUT = 10.0  # seconds to reach a cluster
 RETRIES = 5  # repetitions of a call whose process or node was lost
 SMALL_STORE = 100 << 20  # bytes of shared objects on a cluster of this machine
-CALLS_PER_PROCESS = 200  # then a new process replaces it, so that memory leaks of libraries cannot add up
+CALLS_PER_PROCESS = 200  # a process is then replaced, so that memory leaks of libraries cannot add up
 
 
 class Call(NamedTuple):
@@ -36,7 +36,7 @@ class Call(NamedTuple):
     memory: int = 0  # bytes that the call may need
 
 
-class Lost(NamedTuple):
+class LostProcess(NamedTuple):
     """Result of a call whose process or node was lost."""
 
     reason: str
@@ -50,18 +50,18 @@ class WorkerPool(ABC):
     def run(self, function: Callable[..., Any], calls: Iterable[Call]) -> Iterator[tuple[Any, Any]]:
         """Make calls of a picklable function; take the next call when a process is free.
 
-        Yields key and result of each call as it ends; the result is :class:`Lost` if the process died. Raises the
-        exception of a failed call.
+        Yields key and result of each call as it ends; the result is a :class:`LostProcess` if the process died. Raises
+        the exception of a failed call.
         """
-        waiting, active = iter(calls), 0
+        waiting, num_running = iter(calls), 0
         while True:
-            while active < self.capacity and (call := next(waiting, None)) is not None:
+            while num_running < self.capacity and (call := next(waiting, None)) is not None:
                 self.submit(function, call)
-                active += 1
-            if not active:
+                num_running += 1
+            if not num_running:
                 return
             ended = self.wait()
-            active -= len(ended)
+            num_running -= len(ended)
             yield from ended
 
     @abstractmethod
@@ -134,18 +134,18 @@ class Work:
     ) -> Iterator[tuple[T, Record]]:
         """Make ``count`` calls of a picklable function; yield result and record of each call, in order.
 
-        A cluster makes as many calls at once as it has processors for; this process makes one after the other.
+        A cluster makes several calls at once, limited by its processors; this process makes one after the other.
         """
         if self.cluster is not None:
             yield from self._run_on_cluster(self.cluster, title, function, count, calls)
             return
-        place = 0
-        for arguments in calls:  # enumerate would keep the arguments in memory until the next ones are made
-            place += 1  # noqa: SIM113
-            with record_part(title=f"block {place} of {count}: {title}") as record:
-                value = function(*arguments)
+        number = 0
+        for arguments in calls:  # enumerate would keep the arguments in memory until the next arguments are made
+            number += 1  # noqa: SIM113
+            with record_part(title=f"block {number} of {count}: {title}") as record:
+                result = function(*arguments)
             del arguments
-            yield value, record
+            yield result, record
 
     def _run_on_cluster(
         self, cluster: Cluster, title: str, function: Callable[..., T], count: int, calls: Iterable[tuple[Any, ...]]
@@ -153,17 +153,17 @@ class Work:
         resources = cluster.needs(self.threads or max(1, cluster.processors // count), self.memory)
         pool, results = RayPool(cluster, max(1, int(resources["num_cpus"]))), dict[int, Any]()
 
-        def each_call() -> Iterator[Call]:
-            for place, arguments in enumerate(calls):
-                yield Call(place, (pool.threads, function, *arguments), self.memory)
+        def make_calls() -> Iterator[Call]:
+            for number, arguments in enumerate(calls):
+                yield Call(number, (pool.threads, function, *arguments), self.memory)
 
-        for place, value in pool.run(_call_in_part, each_call()):
-            if isinstance(value, Lost):
-                raise UsageError(f"engine ray: {title}: {value.reason}; perhaps out of memory, try more blocks")
-            results[place] = value
+        for number, result in pool.run(_call_in_part, make_calls()):
+            if isinstance(result, LostProcess):
+                raise UsageError(f"engine ray: {title}: {result.reason}; perhaps out of memory, try more blocks")
+            results[number] = result
             report_progress(f"{title}: {len(results)} of {count} blocks", len(results), count)
-        for place in range(len(results)):
-            yield results.pop(place)
+        for number in range(len(results)):
+            yield results.pop(number)
 
 
 def _call_in_part(threads: int, function: Callable[..., T], *arguments: Any) -> tuple[T, Record]:
@@ -200,14 +200,14 @@ class RayPool(WorkerPool):
         return [(self.keys.pop(ref), self._result(ref)) for ref in ready]
 
     def _result(self, ref: Any) -> Any:
-        """Return the result of a call, or Lost; raise the exception of a failed call."""
+        """Return the result of a call, or LostProcess; raise the exception of a failed call."""
         try:
             return self.ray.get(ref)
         except self.ray.exceptions.RayTaskError as error:
             raise error.cause if isinstance(error.cause, Exception) else error from None
         except self.ray.exceptions.RayError as error:
             text = " ".join(str(error).split())[:200]
-            return Lost(f"its process or node was lost {RETRIES + 1} times ({type(error).__name__}: {text})")
+            return LostProcess(f"its process or node was lost {RETRIES + 1} times ({type(error).__name__}: {text})")
 
     def close(self) -> None:
         """Cancel the calls that have not ended."""

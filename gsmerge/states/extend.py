@@ -116,16 +116,16 @@ def extend(
 def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
     """Compare the world of new views with that of earlier Gaussians: ``SAME``, ``ANOTHER`` or ``NOT_KNOWN``.
 
-    In the same world the pictures show those earlier Gaussians that the batch's Gaussians, at ``means``, do not hide.
-    In another world the colours differ from the pictures as much as from random pixels.
+    In the same world the pictures show the earlier Gaussians, except where the batch's Gaussians, at ``means``, hide
+    them. In another world the colours differ from the pictures as much as from random pixels.
     """
     if not len(views):
         return NOT_KNOWN
     rows, hiding = np.isfinite(np.asarray(before.means)).all(1), means[np.isfinite(means).all(1)]
     pictures = photo_array(views.images)
     check = check_cameras(before, rows, views.cameras, pictures, SAMPLE_GAUSSIANS, foremost=True, hiding=hiding)
-    reach = CERTAIN * check.ratio_error
-    if check.num_compared < ENOUGH or not abs(check.color_ratio - WORLD_RATIO) > reach:
+    margin = CERTAIN * check.ratio_error
+    if check.num_compared < ENOUGH or not abs(check.color_ratio - WORLD_RATIO) > margin:
         return NOT_KNOWN
     return SAME if check.color_ratio < WORLD_RATIO else ANOTHER
 
@@ -138,33 +138,33 @@ def refuse_other_world(world: str, options: ExtendOptions) -> None:
 
 
 def _keep_pictures(prepared: Prepared) -> Scene:
-    """Return the given views, each once, with their pictures and without Gaussians."""
-    given, none = prepared.input_scene, prepared.input_scene.gaussians[:0]
-    if prepared.reference.placed:  # these views do not belong to the scene
-        return Scene(none, given.cameras, None, None, given.names)
-    once = np.unique(camera_kinds(given.cameras), return_index=True)[1]
-    views, places = sorted(once.tolist()), prepared.repeated
-    images = prepared.scene.images[[places[view] for view in views]]
-    cameras = in_float64(given.cameras[views])
-    return Scene(none, cameras, images, None, tuple(given.names[view] for view in views))
+    """Return the input's views, each once, with their pictures and without Gaussians."""
+    input_scene, no_gaussians = prepared.input_scene, prepared.input_scene.gaussians[:0]
+    if prepared.reference.placed:  # placed views do not belong to the scene
+        return Scene(no_gaussians, input_scene.cameras, None, None, input_scene.names)
+    first_views = np.unique(camera_kinds(input_scene.cameras), return_index=True)[1]
+    views = sorted(first_views.tolist())
+    images = prepared.scene.images[[prepared.repeated[view] for view in views]]
+    cameras = in_float64(input_scene.cameras[views])
+    return Scene(no_gaussians, cameras, images, None, tuple(input_scene.names[view] for view in views))
 
 
-def _join_views(first: Scene, second: Scene) -> Scene:
-    """Concatenate views at the size of the first ones; a name that is already in use gets a number in front."""
-    if len(second) == 0 or len(first) == 0:
-        return first if len(second) == 0 else second
-    size = first.cameras.width, first.cameras.height
-    assert first.images is not None
-    assert second.images is not None
-    images, cameras = second.images, second.cameras
+def _join_views(before: Scene, batch: Scene) -> Scene:
+    """Append a batch's views at the size of the views before; a name that is already in use gets a number in front."""
+    if len(batch) == 0 or len(before) == 0:
+        return before if len(batch) == 0 else batch
+    size = before.cameras.width, before.cameras.height
+    assert before.images is not None
+    assert batch.images is not None
+    images, cameras = batch.images, batch.cameras
     if images.shape[2:0:-1] != size:
         images = shrink_pictures(images, *size)
         cameras = resize_cameras(cameras, *size)
     return replace(
-        first,
-        cameras=concat_cameras(first.cameras, cameras),
-        images=np.concatenate([first.images, images]),
-        names=number_names(first.names, second.names),
+        before,
+        cameras=concat_cameras(before.cameras, cameras),
+        images=np.concatenate([before.images, images]),
+        names=number_names(before.names, batch.names),
     )
 
 
@@ -178,9 +178,10 @@ def number_names(before: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, 
 
 
 def choose_far(cameras: Cameras, count: int) -> list[int]:
-    """Choose at most ``count`` views, in rising order: the first, then always the one farthest from those chosen.
+    """Choose at most ``count`` views, in rising order: the first view, then always the view farthest from all chosen.
 
-    A distance is that of the centres, as a share of their widest extent, plus that of the directions.
+    The distance of two views is the distance of their centres, as a share of the widest extent of all centres, plus the
+    distance of their directions.
     """
     if len(cameras) <= count:
         return list(range(len(cameras)))

@@ -57,8 +57,8 @@ def extend_file(
     """Add a batch of views to the state in a file, or to a new file; return report (plain JSON types) and new state.
 
     The file is replaced at the end, but not if anything fails or another process has changed the file. If two processes
-    end together, the second waits for the first and then notices its change. A batch that the state already has is left
-    out, with a note. ``settings``: see :class:`gsmerge.Compactor`. ``seconds_before``: wall time by name of the
+    end together, the second waits for the first and then notices its change. A batch is left out, with a note, if the
+    state already has it. ``settings``: see :class:`gsmerge.Compactor`. ``seconds_before``: wall time by name of the
     caller's earlier steps. ``dry_run``: write nothing. ``tried``: the state of an earlier dry run, used in place of the
     file's. Raises SceneError if a file cannot be read or written, if it was changed in the meantime, or if the batch
     seems to be in another world; UsageError if a setting is unknown, out of range, or impossible for the state or the
@@ -71,37 +71,43 @@ def extend_file(
         raise UsageError(str(error)) from error
     state = tried or (None if identity is None else load_state(path))
     sha256 = content_hash(list_files(files))
-    known = [] if state is None else [batch.get("sha256") for batch in state.about["batches"]]
     document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}, "dry_run": dry_run}
-    if state is not None and sha256 in known:
-        note = f"{files.ply}: left out, since the same files are batch {known.index(sha256) + 1} of {path.name} already"
+    number = None if state is None else _find_batch(state, sha256)
+    if state is not None and number is not None:
+        note = f"{files.ply}: left out, since the same files are batch {number} of {path.name} already"
         return document | {"left_out": True, "state": _describe_file(path, state), "notes": [note]}, state
-    with _replaced(path, identity, dry_run=dry_run) as temporary:
-        loaded = perf_counter()
+    with _replace_file(path, identity, dry_run=dry_run) as temporary:
+        load_end = perf_counter()
         load = read_input(files, opacity=opacity, hints=hints)
-        read = perf_counter()
+        read_end = perf_counter()
         try:
             state, report = extend_state(state, load.scene, settings, progress=progress)
         except SceneError as error:
             raise (SceneError(files.ply, error.problem, error.remedy) if error.path == BATCH else error) from error
         state = _note_source(state, sha256, load.comments)
-        done = perf_counter()
+        extend_end = perf_counter()
         if temporary is not None:
             save_state(temporary, state, overwrite=True)
-    seconds = {**(seconds_before or {}), "load": loaded - start, "read": read - loaded, **report.seconds}
-    seconds["other"] = done - read - sum(report.seconds.values())
-    numbers = {name: value for name, value in asdict(report).items() if name not in ("seconds", "notes", "options")}
+    seconds = {**(seconds_before or {}), "load": load_end - start, "read": read_end - load_end, **report.seconds}
+    seconds["other"] = extend_end - read_end - sum(report.seconds.values())
+    facts = {name: fact for name, fact in asdict(report).items() if name not in ("seconds", "notes", "options")}
     document["input"] |= load.recognised
     document |= {
-        **numbers,
+        **facts,
         "left_out": False,
         "state": _describe_file(path, state),
         "options": dict(report.options),
-        **seconds_document(seconds | {"write": perf_counter() - done}),
+        **seconds_document(seconds | {"write": perf_counter() - extend_end}),
         "peak_memory_bytes": peak_memory(),
         "notes": [*load.notes, *report.notes],
     }
     return document, state
+
+
+def _find_batch(state: State, sha256: str) -> int | None:
+    """Return the number, from 1, of the batch with this hash of its files; None if there is none."""
+    hashes = [batch.get("sha256") for batch in state.about["batches"]]
+    return hashes.index(sha256) + 1 if sha256 in hashes else None
 
 
 def remove_batch(path: Path, number: int, *, dry_run: bool = False) -> dict[str, Any]:
@@ -112,7 +118,7 @@ def remove_batch(path: Path, number: int, *, dry_run: bool = False) -> dict[str,
     """
     identity, before = _file_identity(path), load_state(path)
     state = remove(before, number)
-    with _replaced(path, identity, dry_run=dry_run) as temporary:
+    with _replace_file(path, identity, dry_run=dry_run) as temporary:
         if temporary is not None:
             save_state(temporary, state, overwrite=True)
     return {
@@ -134,17 +140,17 @@ def _note_source(state: State, sha256: str, comments: Sequence[str]) -> State:
 
 
 @contextmanager
-def _replaced(path: Path, identity: tuple[int, int, int] | None, *, dry_run: bool) -> Iterator[Path | None]:
+def _replace_file(path: Path, identity: tuple[int, int, int] | None, *, dry_run: bool) -> Iterator[Path | None]:
     """Yield a temporary file that replaces ``path`` after the block; None in a dry run.
 
-    SceneError if ``path`` then no longer has this ``identity``.
+    SceneError if the identity of ``path`` after the block is not ``identity``.
     """
     if dry_run:
         yield None
         return
-    with ExitStack() as until_renamed, atomic_output(path, overwrite=True) as temporary:
+    with ExitStack() as locks, atomic_output(path, overwrite=True) as temporary:
         yield temporary
-        until_renamed.enter_context(lock_folder(path.resolve().parent))
+        locks.enter_context(lock_folder(path.resolve().parent))  # until the file is renamed
         if _file_identity(path) != identity:
             raise SceneError(path, "was changed by another process in the meantime, and is not replaced", "run again")
 
@@ -220,14 +226,15 @@ def decode_file(
     facts = {"path": str(path), "bytes": path.stat().st_size, "num_groups": len(features), "num_gaussians": num_input}
     document: dict[str, Any] = {**document_head(), "input": facts | {"batches": batches}, "k": options.k}
     if dry_run:
-        most = options.max_k * len(features)
-        return document | {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}, "notes": []}
-    read = perf_counter()
-    chosen, names = output_format(out, levels=True, cameras=True), features.names
-    cameras_path = viewer_cameras_path(out) if viewer_cameras and not chosen.cameras else None
+        max_count = options.max_k * len(features)
+        output = {"path": str(out), "num_gaussians_at_most": max_count}
+        return document | {"dry_run": True, "output": output, "notes": []}
+    read_end = perf_counter()
+    format_, names = output_format(out, levels=True, cameras=True), features.names
+    cameras_path = viewer_cameras_path(out) if viewer_cameras and not format_.cameras else None
     with atomic_outputs(overwrite=overwrite) as add:
-        first = add(out)
-        gaussians, done = decode_features(features, options), perf_counter()
+        temporary = add(out)
+        gaussians, decode_end = decode_features(features, options), perf_counter()
         if len(gaussians) == 0:
             raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
         cameras, photos = features.frame.leave_cameras(features.cameras), name_photos(None, names)
@@ -235,12 +242,13 @@ def decode_file(
         contents = Contents(
             [gaussians], [RESULT_COMMENT], cameras, photos, scene_title(path), normals=normals, apart=site
         )
-        (files,) = chosen.write(add, out, first, contents).values()
+        (files,) = format_.write(add, out, temporary, contents).values()
         num_bytes = sum(file.stat().st_size for file in files)
         if cameras_path is not None:
             add_views(add, cameras_path, cameras, names, overwrite=overwrite)
-    chosen.finish(out)
-    seconds = {**(seconds_before or {}), "read": read - start, "decode": done - read, "write": perf_counter() - done}
+    format_.finish(out)
+    seconds = {**(seconds_before or {}), "read": read_end - start, "decode": decode_end - read_end}
+    seconds["write"] = perf_counter() - decode_end
     return document | {
         "output": {"path": str(out), "bytes": num_bytes, "num_gaussians": len(gaussians)},
         "ratio": len(gaussians) / max(num_input, 1),

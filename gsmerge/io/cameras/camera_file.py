@@ -19,9 +19,10 @@ from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath
 
-# Limits of numbers in poses and intrinsics, sides and focal lengths; no camera is beyond them, and later steps overflow
+# Limits of numbers in poses and intrinsics, sides and focal lengths. No camera exceeds them, and larger numbers would
+# overflow in later steps
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6
-_MAX_COEFFICIENT = 1e6  # of a lens; the effect of smaller coefficients is checked when photos are undistorted
+_MAX_COEFFICIENT = 1e6  # of a lens; undistorting photos checks the effect of smaller coefficients
 _MAX_FOCAL_SIDES, _MAX_CENTRE_SIDES = 1e5, 1e3  # largest focal length and principal point, in longer sides of the image
 _MAX_ROTATION_ERROR = 0.02  # of the entries of R R^T
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
@@ -29,8 +30,8 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) 
 # A principal point is in the middle if twice it differs by at most these pixels from the image's size
 CENTRED_PX = 1e-3
 PATCH = 14  # sides of vision transformers' inputs are multiples of it
-_OTHER_SIZE = 0.1  # sides of another size differ at least by this share
-_WHOLE = 1e-3  # a side is a whole number up to these pixels
+_OTHER_SIZE = 0.1  # sizes are different if their sides differ by at least this share
+_WHOLE = 1e-3  # pixels; tolerance of a side that is a whole number
 MAX_NORMALISED_FOCAL = 10.0  # a longer focal length is in pixels, and no image is that small
 
 # Orders of the Gaussians' rows that a camera file may name
@@ -74,17 +75,17 @@ class CameraFile:
     path: str  # the file or folder
     viewmats: np.ndarray  # ``[c,4,4]`` world to camera, OpenCV axes, float64
     Ks: np.ndarray  # ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5)
-    widths: np.ndarray  # ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it
+    widths: np.ndarray  # ``[c]`` int64, pixels; 0 if unknown, 1 if unknown and the intrinsics are relative to it
     heights: np.ndarray  # the same
     names: tuple[str, ...]  # image names as the file gives them
     source: str  # the format's name
     convention: Convention = W2C_OPENCV  # how the format stores poses
-    images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
-    order: str = "auto"  # order of the Gaussians' rows where the file names it, otherwise "auto"
+    images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty if the file holds no images
+    order: str = "auto"  # order of the Gaussians' rows; "auto" if the file does not name it
     lenses: tuple[Lens | None, ...] = ()  # of each camera, None for a pinhole; empty if all are pinholes
-    # "" if the file has focal lengths; otherwise one sentence about how they were estimated, None until they are
+    # "" if the file has focal lengths; otherwise a sentence about their estimate, or None before they are estimated
     focal: str | None = ""
-    # Size of the photos, and how photos of it are brought to the cameras' size; None until it is found
+    # Size of the photos, and the transform of these photos to the cameras' size; None before the photos are known
     photo_map: tuple[Size, PhotoTransform] | None = None
     # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 for none, if the cameras were estimated from the rows
     pixel_ids: np.ndarray | None = None
@@ -102,17 +103,17 @@ def drop_repeats(file: CameraFile) -> CameraFile:
         (name, viewmat.tobytes(), K.tobytes())
         for name, viewmat, K in zip(file.names, file.viewmats, file.Ks, strict=True)
     ]
-    first = sorted({key: view for view, key in reversed(list(enumerate(keys)))}.values())
-    if len(first) == len(file) or len(file.images) or file.pixel_ids is not None:
+    first_views = sorted({key: view for view, key in reversed(list(enumerate(keys)))}.values())
+    if len(first_views) == len(file) or len(file.images) or file.pixel_ids is not None:
         return file
     return replace(
         file,
-        viewmats=file.viewmats[first],
-        Ks=file.Ks[first],
-        widths=file.widths[first],
-        heights=file.heights[first],
-        names=tuple(file.names[view] for view in first),
-        lenses=tuple(file.lenses[view] for view in first) if file.lenses else (),
+        viewmats=file.viewmats[first_views],
+        Ks=file.Ks[first_views],
+        widths=file.widths[first_views],
+        heights=file.heights[first_views],
+        names=tuple(file.names[view] for view in first_views),
+        lenses=tuple(file.lenses[view] for view in first_views) if file.lenses else (),
     )
 
 
@@ -155,17 +156,9 @@ def make_camera_file(
         views = [view._replace(K=make_pinhole(f, f, 0, 0)) for view, f in zip(views, sides, strict=True)]
     poses, Ks = np.tile(np.eye(4), (len(views), 1, 1)), np.array([view.K for view in views], np.float64)
     for i, view in enumerate(views):
-        pose = np.asarray(view.pose, np.float64)
-        if pose.shape not in ((3, 4), (4, 4)):
-            raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
-        poses[i, :3] = pose[:3]
+        poses[i, :3] = _check_pose(path, view)
         check_camera(path, view.name, poses[i], Ks[i])
-        lens = view.lens or Lens("", "perspective", ())
-        for key, value in zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False):
-            if not abs(value) <= _MAX_COEFFICIENT:  # NaN, too
-                problem = f"expected a lens coefficient {key} within +-{_MAX_COEFFICIENT:g}, found {value:g}"
-                text = f"view {view.name}: {problem} ({lens.name})"
-                raise SceneError(path, text, "correct it, or undistort the images first")
+        _check_lens(path, view)
     for w, h in (view.size for view in views):
         if not (0 <= w <= _MAX_SIDE and 0 <= h <= _MAX_SIDE):
             raise SceneError(path, f"expected a positive image size, found {w:.6g} x {h:.6g}")
@@ -189,6 +182,25 @@ def make_camera_file(
     )
 
 
+def _check_pose(path: StrPath, view: StoredView) -> np.ndarray:
+    """Return the first three rows ``[3,4]`` of a pose; SceneError if it has another shape than 3x4 or 4x4."""
+    pose = np.asarray(view.pose, np.float64)
+    if pose.shape not in ((3, 4), (4, 4)):
+        raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
+    return pose[:3]
+
+
+def _check_lens(path: StrPath, view: StoredView) -> None:
+    """Raise SceneError if a coefficient of a view's lens is too large."""
+    if view.lens is None:
+        return
+    for name, coefficient in zip(COEFFICIENTS[view.lens.model], view.lens.coefficients, strict=False):
+        if not abs(coefficient) <= _MAX_COEFFICIENT:  # also for NaN
+            problem = f"expected a lens coefficient {name} within +-{_MAX_COEFFICIENT:g}, found {coefficient:g}"
+            text = f"view {view.name}: {problem} ({view.lens.name})"
+            raise SceneError(path, text, "correct it, or undistort the images first")
+
+
 def check_count(path: StrPath, count: int) -> None:
     """Raise SceneError if a file has more cameras than the limit, before anything is allocated for each."""
     if count > MAX_VIEWS:
@@ -203,9 +215,9 @@ def missing_intrinsics(path: StrPath, reason: str = "") -> SceneError:
 
 def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
     """Multiply intrinsics that are relative to the image size by that size; an unknown size counts as 1 x 1."""
-    small = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
-    small &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
-    if not small.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
+    is_relative = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
+    is_relative &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
+    if not is_relative.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
         return Ks, sizes
     sizes = [size if min(size) > 0 else (1, 1) for size in sizes]
     return Ks * np.array([(w, h, 1) for w, h in sizes], np.float64)[:, :, None], sizes
@@ -239,12 +251,12 @@ def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -
     """Raise SceneError if intrinsics ``[3,3]`` in pixels do not fit an image of (width, height)."""
     if min(size) <= 1:  # not known
         return
-    for what, value, sides in (
+    for quantity, pixels, max_sides in (
         ("a focal length", max(K[0, 0], K[1, 1]), _MAX_FOCAL_SIDES),
         ("a principal point", np.abs(K[:2, 2]).max(), _MAX_CENTRE_SIDES),
     ):
-        if value > sides * max(size):
-            problem = f"expected {what} that fits an image of {size[0]} x {size[1]}, found {value:g} pixels"
+        if pixels > max_sides * max(size):
+            problem = f"expected {quantity} that fits an image of {size[0]} x {size[1]}, found {pixels:g} pixels"
             raise SceneError(path, f"view {name}: {problem}", "give fx, fy, cx, cy in pixels of that size")
 
 
@@ -290,10 +302,10 @@ def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> CameraFile:
-    """Give cameras without a size the size of which their principal points are the middle, unless the photos have it.
+    """Set the size of cameras without a size to twice their principal point, if photos have clearly another size.
 
-    ``size`` is (width, height) of the photos. Twice the principal points must have the photos' shape. Sides that are no
-    whole numbers are rounded to multiples of ``PATCH``, as which networks choose the sides of their inputs.
+    ``size`` is (width, height) of the photos. The new size must have the shape of the photos. Fractional sides are
+    rounded to multiples of ``PATCH``, since the inputs of networks have such sides.
     """
     if size is None or camera_file.focal is None or _stored_sizes(camera_file) != [(0, 0)]:
         return camera_file
@@ -302,9 +314,9 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
     has_photo_shape = float(ratios.max()) < (1 + _OTHER_SIZE) * float(ratios.min())
     if not has_photo_shape or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > _OTHER_SIZE).all():
         return camera_file
-    unit = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH
-    width, height = (np.full(len(camera_file), unit * round(side / unit)) for side in sides.tolist())
-    return replace(camera_file, widths=width, heights=height)
+    step = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH
+    widths, heights = (np.full(len(camera_file), step * round(side / step)) for side in sides.tolist())
+    return replace(camera_file, widths=widths, heights=heights)
 
 
 @check_arguments
@@ -344,8 +356,8 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
 def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFile, PhotoArrays, list[str]]:
     """Undistort photos, and make their cameras pinholes with the same intrinsics; also return a note.
 
-    SceneError if a lens is not a pinhole and photos are missing or of another shape, or if an undistorted photo would
-    show next to nothing of the photo.
+    SceneError if a lens is not a pinhole and photos are missing or of another shape, or if most of an undistorted photo
+    would lie outside of the photo.
     """
     if not camera_file.lenses:
         return camera_file, photos, []
@@ -361,19 +373,22 @@ def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFil
             raise SceneError(camera_file.path, problem, "give the images as they were taken, or undistort them first")
     Ks = to_cameras(pinholes, size).Ks
     for view, K, lens in zip(camera_file.names, Ks, camera_file.lenses, strict=True):
-        if lens is None:
-            continue
-        small = K * np.array([_GRID / size[0], _GRID / size[1], 1.0])[:, None]
-        maps = _rectify_maps(small, lens, (_GRID, _GRID))
-        share = float(np.all([(m >= -0.5) & (m <= _GRID - 0.5) for m in maps], 0).mean())
-        if share < _MIN_SHARE:
-            values = zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False)
-            found = ", ".join(f"{key} = {value:g}" for key, value in values if value)
-            problem = f"view {view}: expected {lens.name} coefficients of a lens, found {found}, with which"
+        share = 1.0 if lens is None else _share_inside(K, lens, size)
+        if lens is not None and share < _MIN_SHARE:
+            coefficients = zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False)
+            nonzero = ", ".join(f"{key} = {coefficient:g}" for key, coefficient in coefficients if coefficient)
+            problem = f"view {view}: expected {lens.name} coefficients of a lens, found {nonzero}, with which"
             problem += f" {100 * (1 - share):.0f} % of the undistorted photo would lie outside of the photo"
             raise SceneError(camera_file.path, problem, "correct them, or undistort the images first")
-    straight = undistort_photos(photos, Ks, camera_file.lenses)
-    return pinholes, straight, [f"the photos are undistorted ({name}); the intrinsics stay"]
+    undistorted = undistort_photos(photos, Ks, camera_file.lenses)
+    return pinholes, undistorted, [f"the photos are undistorted ({name}); the intrinsics stay"]
+
+
+def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
+    """Return the share of an undistorted photo's pixels that lie within the photo, measured on a grid."""
+    grid_K = K * np.array([_GRID / size[0], _GRID / size[1], 1.0])[:, None]
+    maps = _rectify_maps(grid_K, lens, (_GRID, _GRID))
+    return float(np.all([(axis >= -0.5) & (axis <= _GRID - 0.5) for axis in maps], 0).mean())
 
 
 def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> PhotoArrays:
@@ -418,8 +433,10 @@ def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: 
 def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
     """Describe the mean and the largest of camera moves in words."""
     angles, shifts = ([move[key] for move in moves] for key in ("degrees", "shift"))
-    mean, most = (f"{f(angles):.2g} degrees and {100 * f(shifts):.3g} % of the depth" for f in (np.mean, max))
-    return f"{mean} on average, {most} at most"
+    mean, largest = (
+        f"{reduce(angles):.2g} degrees and {100 * reduce(shifts):.3g} % of the depth" for reduce in (np.mean, max)
+    )
+    return f"{mean} on average, {largest} at most"
 
 
 def make_similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:

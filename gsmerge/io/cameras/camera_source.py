@@ -1,4 +1,4 @@
-"""What readers of camera files take and return: a file whose content is read once, and cameras before conversion."""
+"""Arguments and results of camera readers: a file whose content is read once, and cameras before conversion."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class StoredCameras(NamedTuple):
     views: list[StoredView]
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
     order: str = "auto"  # of the Gaussians' rows
-    convention: Convention | None = None  # that the numbers show; None: that of the format
+    convention: Convention | None = None  # as the numbers show; None: the format's convention
 
 
 @contextmanager

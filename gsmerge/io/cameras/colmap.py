@@ -25,8 +25,8 @@ _NUM_PARAMS = {
 _NAMES = dict(enumerate(_NUM_PARAMS))
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
-_SAME_SHAPE = 0.01  # relative difference between the two sides' ratios up to which images have one shape
-_SMALLER = 0.9  # ratio of the sides below which an image is another, smaller one
+_SAME_SHAPE = 0.01  # images have one shape if the ratios of both sides differ relatively by at most this
+_SMALLER = 0.9  # an image is the model's smaller input if the ratio of the sides is below this
 _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 
 MAX_NAME = 1 << 16  # bytes of an image's name
@@ -35,7 +35,7 @@ _NAME_PART = 64  # bytes of a name that are read at a time
 _MAX_WORDS = 4 + max(_NUM_PARAMS.values())  # in a camera's line
 _MAX_DIGITS = 18  # in a whole number
 _WHOLE = re.compile(rf"[+-]?[0-9]{{1,{_MAX_DIGITS}}}([.]0*)?")
-_NOT_UNIT = 0.05  # four numbers are no quaternion if their length differs more from 1
+_NOT_UNIT = 0.05  # four numbers are no quaternion if their length differs from 1 by more than this
 
 _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
@@ -103,15 +103,15 @@ def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], param
 
 
 def _size_of(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the image size that intrinsics belong to: the stored size, or of WorldMirror 1 that of the model's input.
+    """Return the image size that intrinsics belong to: the stored size, or the size of WorldMirror 1's input.
 
-    WorldMirror 1 writes intrinsics for the model's input beside the size of the photos. The size of the input is twice
-    the principal point; it is smaller than the photos, has their shape, and is whole.
+    WorldMirror 1 writes intrinsics for the model's input, but the size of the photos. The size of the input is twice
+    the principal point. It is a whole number, smaller than the photos, and has their shape.
     """
     sides = 2 * K[:2, 2]
-    x, y = sides / np.maximum(size, 1)
-    same_shape = abs(x - y) <= _SAME_SHAPE * abs(x)
-    is_input = same_shape and x < _SMALLER and (sides == np.rint(sides)).all()
+    ratio_x, ratio_y = sides / np.maximum(size, 1)
+    has_photo_shape = abs(ratio_x - ratio_y) <= _SAME_SHAPE * abs(ratio_x)
+    is_input = has_photo_shape and ratio_x < _SMALLER and (sides == np.rint(sides)).all()
     return (int(sides[0]), int(sides[1])) if is_input else size
 
 

@@ -20,9 +20,9 @@ from gsmerge.types import Cameras, Gaussians
 
 _FOREIGN = ("rigs.bin", "frames.bin")  # files of COLMAP since 3.12, which it would read together with this model
 _PINHOLE = 1  # COLMAP's id of the camera model
-_SEEN = np.dtype([("place", "<f8", 2), ("point", "<i8")])
+_OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<i8")])
 _POINT = np.dtype(
-    [("id", "<u8"), ("mean", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("num_seen", "<u8")]
+    [("id", "<u8"), ("mean", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("num_views", "<u8")]
 )  # two int32 follow for each view that sees the point: the view's id, and the point's index in the view's list
 
 
@@ -59,33 +59,33 @@ def _images(
     viewmats = cameras.viewmats.astype(np.float64)
     quats = rotmat_to_quat(viewmats[:, :3, :3])
     for i, (name, rows) in enumerate(zip(names, seen, strict=True)):
-        points = np.empty(len(rows), _SEEN)
-        points["place"] = project(gaussians.means[rows], cameras[[i]])[0][0]
-        points["point"] = rows + 1
+        observations = np.empty(len(rows), _OBSERVATION)
+        observations["pixel"] = project(gaussians.means[rows], cameras[[i]])[0][0]
+        observations["point"] = rows + 1
         parts.append(struct.pack("<i7di", i + 1, *quats[i], *viewmats[i, :3, 3], camera_ids[i]))
         parts += [
             name.replace("\0", "").encode("utf-8", "replace") + b"\0",
-            struct.pack("<Q", len(points)),
-            points.tobytes(),
+            struct.pack("<Q", len(observations)),
+            observations.tobytes(),
         ]
     return b"".join(parts)
 
 
 def _points(gaussians: Gaussians, seen: Sequence[np.ndarray]) -> bytes:
-    count, each = len(gaussians), _POINT.itemsize
+    count, head_bytes = len(gaussians), _POINT.itemsize
     points = np.zeros(count, _POINT)
     points["id"], points["mean"] = np.arange(1, count + 1), gaussians.means
     points["color"] = np.rint(255 * sh0_to_rgb(gaussians.sh0[:, 0]).clip(0, 1))
     rows = np.concatenate([np.zeros(0, np.int64), *seen])
     views = np.repeat(np.arange(1, len(seen) + 1), [len(part) for part in seen])
-    places = np.concatenate([np.zeros(0, np.int64), *(np.arange(len(part)) for part in seen)])
-    points["num_seen"] = np.bincount(rows, minlength=count)
+    indices = np.concatenate([np.zeros(0, np.int64), *(np.arange(len(part)) for part in seen)])
+    points["num_views"] = np.bincount(rows, minlength=count)
     order = np.argsort(rows, kind="stable")
-    pairs = np.stack([views, places], 1)[order].astype("<i4")
-    ends = 8 * np.cumsum(points["num_seen"].astype(np.int64))
+    pairs = np.stack([views, indices], 1)[order].astype("<i4")
+    ends = pairs.itemsize * 2 * np.cumsum(points["num_views"].astype(np.int64))
     heads, tracks, start = points.tobytes(), pairs.tobytes(), 0
     parts = [struct.pack("<Q", count)]
     for i, end in enumerate(ends.tolist()):
-        parts += [heads[each * i : each * (i + 1)], tracks[start:end]]
+        parts += [heads[head_bytes * i : head_bytes * (i + 1)], tracks[start:end]]
         start = end
     return b"".join(parts)

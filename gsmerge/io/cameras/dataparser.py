@@ -1,4 +1,4 @@
-"""How a program moved its cameras into the Gaussians' world: nerfstudio's file beside the scene, or Metashape's own."""
+"""Read how a program moved its cameras into the Gaussians' world, from a file of nerfstudio or Metashape."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ DATAPARSER = "dataparser_transforms.json"
 def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     """Read the similarities that nerfstudio or Metashape may have applied to the cameras: candidates to be measured.
 
-    Nerfstudio's ``dataparser_transforms.json`` says how cameras were moved into the Gaussians' world: X' = scale
-    (transform [X; 1]). ``transform`` starts from the world of the capture. Poses of a ``transforms.json`` with
-    ``applied_transform`` (and ``applied_scale``) have been moved by that already, so the second candidate undoes it.
-    Metashape's ``.xml`` has the map into its world, which exports apply with or without its scale. Empty if there is no
+    Nerfstudio's ``dataparser_transforms.json`` has the map into the Gaussians' world: X' = scale (transform [X; 1]).
+    ``transform`` starts from the world of the capture. A ``transforms.json`` with ``applied_transform`` (and
+    ``applied_scale``) has poses that were moved by these already, so the second candidate undoes them. Metashape's
+    ``.xml`` has the map into the world of its exports, which apply it with or without its scale. Empty if there is no
     such file. SceneError if a file lacks a rotation, shift and positive scale.
     """
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])

@@ -31,11 +31,10 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
             return None
     with np.errstate(all="ignore"):  # NaN are refused with the cameras
         numbers = {name: np.asarray([row[0] for row in data[name].data], np.float64) for name in present}
-    extrinsic, intrinsic = numbers["extrinsic"], numbers["intrinsic"]
+    extrinsic, intrinsic, size = numbers["extrinsic"], numbers["intrinsic"], numbers.get("image_size", np.zeros(0))
     if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions: focal lengths and size
-        numbers["image_size"] = intrinsic[2:]
-        intrinsic = make_pinhole(*intrinsic[:2], *(intrinsic[2:] / 2)).reshape(-1)
-    size = numbers.get("image_size", np.zeros(0))
+        focal_lengths, size = intrinsic[:2], intrinsic[2:]
+        intrinsic = make_pinhole(*focal_lengths, *(size / 2)).reshape(-1)
     side = round((data["vertex"].count / SHARP_LAYERS) ** 0.5)
     if SHARP_LAYERS * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
         return None
@@ -43,7 +42,7 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
         problem = f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}"
         raise SceneError(source.path, problem)
     pose, K = extrinsic.reshape(-1, 4).copy(), intrinsic.reshape(3, 3)
-    if len(extrinsic) == 12:  # its first versions: the rotation column by column
+    if len(extrinsic) == 12:  # first versions: the rotation column by column
         pose[:, :3] = pose[:, :3].T.copy()
     K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])
     return StoredCameras([StoredView(source.path.stem, pose, K, (side, side))])

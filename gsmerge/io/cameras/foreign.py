@@ -23,9 +23,9 @@ class Foreign(NamedTuple):
 
 
 POSE_FOLDERS = ("pose", "poses")  # each has a file for each view
-# Places of intrinsics beside poses, of which the first that exists is read; a folder has a file for each view
+# Places of intrinsics beside poses; the first existing place is read. A folder has a file for each view
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt", "pred_intrinsics.txt", "intrinsic/intrinsic_color.txt", "intrinsics")
-_DEPTH, _MAX_PATHS = 3, 10_000  # levels of folders that are searched for files of PROGRAMS, and most paths in them
+_DEPTH, _MAX_PATHS = 3, 10_000  # limits of the search for files of PROGRAMS: levels of folders, and paths
 _WRITE = "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
 _MODEL = f"name the COLMAP model that it was made from, or {_WRITE}"
 _NERFSTUDIO = "`ns-process-data {}` of nerfstudio makes a transforms.json of it"
@@ -35,8 +35,8 @@ _REALITY = "RealityScan or RealityCapture", "export its registration as COLMAP, 
 _OPENMVS = "{}InterfaceCOLMAP of OpenMVS make a COLMAP model of it"
 _ODM = "ODM", "name its opensfm/reconstruction.json"
 _OPENMVG = "OpenMVG", "openMVG_main_openMVG2Colmap makes a COLMAP model of it"
-# The first that exists is read. A COLMAP model directly in the folder comes last, because Depth Anything 3 puts one
-# there at the photos' own size
+# The first existing place is read. A COLMAP model directly in the folder comes last, because Depth Anything 3 puts a
+# model there at the photos' own size
 CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
     "cameras.json", "camera_params.json", "sparse/0", "sparse", "colmap/sparse/0", "colmap", "exports/npz/results.npz",
@@ -94,8 +94,8 @@ def starts_like_poses(path: Path) -> bool:
     suffix, text = path.suffix.lower(), read_start(path).decode("latin-1").lower().lstrip()
     if suffix in (".csv", ".txt"):
         return all(re.search(words, text.partition("\n")[0]) for words in (_POSITION, _ROTATION))
-    several = all(len(re.findall(words, text)) > 1 for words in (_POSITION, _ROTATION))
-    return suffix in (".json", ".xml") and (several or re.search(_MATRIX, text) is not None)
+    has_several_words = all(len(re.findall(words, text)) > 1 for words in (_POSITION, _ROTATION))
+    return suffix in (".json", ".xml") and (has_several_words or re.search(_MATRIX, text) is not None)
 
 
 def check_unknown(path: Path) -> None:
@@ -107,7 +107,7 @@ def check_unknown(path: Path) -> None:
 
 
 def check_program(place: Path) -> None:
-    """Raise SceneError if a file, or one below a folder, is of :data:`PROGRAMS`, with the export to use instead."""
+    """Raise SceneError, with the export to use instead, if a path is, or contains, a file of :data:`PROGRAMS`."""
     if (path := find_unread(place)) is not None:
         foreign = next(foreign for foreign in PROGRAMS if _is_of(path, foreign))
         problem = f"expected cameras of a supported format, found those of {foreign.program}"
@@ -115,7 +115,7 @@ def check_program(place: Path) -> None:
 
 
 def find_unread(place: Path) -> Path | None:
-    """Find a file of :data:`PROGRAMS`: the path itself, or a file below a folder that belongs to no scene below it."""
+    """Find a file of :data:`PROGRAMS`: the path itself, or a file below this folder that is in no scene's folder."""
     paths = (path for depth in range(_DEPTH) for path in place.glob("*/" * depth + "[!.]*"))
     files = sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]
     scenes = {p.parent for p in files if p.suffix == ".ply" and p.parent != place and header_content(p) == "Gaussians"}

@@ -27,33 +27,33 @@ def is_long_lrm(source: CameraSource) -> bool:
 def move_to_gaussians(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
     """Select the frames that the model took, and move them into the Gaussians' world.
 
-    The files are beside the Gaussians, or were copied beside the cameras: the chosen frames in
-    ``input_frame_idx.txt``, and the map X' = scene_scale (pos_avg_inv X) from the world of the cameras to that of the
-    Gaussians. Some versions write only the frames; the map is then computed from these. SceneError if a file has wrong
-    numbers, or a frame does not exist.
+    ``input_frame_idx.txt`` lists the frames. ``scene_scale.txt`` and ``pos_avg_inv.txt`` have the map X' = scene_scale
+    (pos_avg_inv X) from the cameras' world to the Gaussians' world. The files are beside the Gaussians, or were copied
+    beside the cameras. Some versions write only the list of frames; the map is then computed from the frames.
+    SceneError if a file has wrong numbers, or a frame does not exist.
     """
     folder = source.path.parent
     if source.folder is not None and not (folder / FRAMES_FILE).is_file() and (source.folder / FRAMES_FILE).is_file():
         folder = source.folder
     ids = _frame_ids(folder / FRAMES_FILE, len(views))
-    chosen = views if ids is None else [views[i] for i in ids]
-    poses = np.array([view.pose for view in chosen]).reshape(-1, 4, 4)
-    move, scale = _numbers(folder / POSE_FILE), _numbers(folder / SCALE_FILE)
-    if ids is not None and chosen and move is None and scale is None:
-        with np.errstate(all="ignore"):  # what overflows is refused with the cameras
+    selected = views if ids is None else [views[i] for i in ids]
+    poses = np.array([view.pose for view in selected]).reshape(-1, 4, 4)
+    to_mean_pose, scale = _numbers(folder / POSE_FILE), _numbers(folder / SCALE_FILE)
+    if ids is not None and selected and to_mean_pose is None and scale is None:
+        with np.errstate(all="ignore"):  # the check of the cameras refuses overflows
             poses = mean_pose_frame(poses).move_viewmats(poses)
     if scale is not None and (scale.size != 1 or not scale[0] > 0):
         raise SceneError(folder / SCALE_FILE, "expected one positive number")
-    if move is not None and move.size != 16:
-        raise SceneError(folder / POSE_FILE, f"expected 16 numbers, found {move.size}")
+    if to_mean_pose is not None and to_mean_pose.size != 16:
+        raise SceneError(folder / POSE_FILE, f"expected 16 numbers, found {to_mean_pose.size}")
     try:
-        with np.errstate(all="ignore"):  # what overflows is refused with the cameras
-            if move is not None:
-                poses = matmul(poses, invert(move.reshape(4, 4)))
+        with np.errstate(all="ignore"):  # the check of the cameras refuses overflows
+            if to_mean_pose is not None:
+                poses = matmul(poses, invert(to_mean_pose.reshape(4, 4)))
             poses[:, :3, 3] *= 1.0 if scale is None else scale[0]
     except np.linalg.LinAlgError as error:
         raise SceneError(folder / POSE_FILE, "expected a matrix that can be inverted") from error
-    return [view._replace(pose=pose) for view, pose in zip(chosen, poses, strict=True)]
+    return [view._replace(pose=pose) for view, pose in zip(selected, poses, strict=True)]
 
 
 def _frame_ids(path: Path, count: int) -> Sequence[int] | None:

@@ -1,4 +1,4 @@
-"""Metashape's ``.xml``: its cameras, and where its world is."""
+"""Read the cameras of Metashape's ``.xml``, and the map to the world of its other exports."""
 
 from __future__ import annotations
 
@@ -41,15 +41,9 @@ def list_cameras(source: CameraSource) -> list[Entry]:
 
 
 def _sensor_values(sensor: Element) -> dict[str, Any]:
-    """Return size, intrinsics and lens of a sensor: its adjusted calibration, if there is one."""
-    calibrations = sensor.findall("calibration")
-    if not calibrations:
-        raise ValueError("no calibration")
-    calibration = max(calibrations, key=lambda entry: entry.get("class") == "adjusted")
-    sizes = [*calibration.findall("resolution"), *sensor.findall("resolution")]
-    if not sizes:
-        raise ValueError("no resolution")
-    size = sizes[0].attrib
+    """Return size, intrinsics and lens of a sensor, from its adjusted calibration if there is one."""
+    calibration = max(sensor.findall("calibration"), key=lambda entry: entry.get("class") == "adjusted")
+    size = [*calibration.findall("resolution"), *sensor.findall("resolution")][0].attrib
     numbers = {child.tag: float(child.text or "") for child in calibration if child.tag != "resolution"}
     values: dict[str, Any] = {key: numbers[key] for key in ("cx", "cy", "k1", "k2", "k3", "k4") if key in numbers}
     # p1 and p2 are OpenCV's p2 and p1
@@ -60,24 +54,25 @@ def _sensor_values(sensor: Element) -> dict[str, Any]:
 
 
 def read_metashape_world(path: Path) -> Similarity | None:
-    """Read the map from the cameras' world to Metashape's, in which its other exports may be; None without one."""
+    """Read the map from the cameras' world to the world of Metashape's other exports; None if the file has none."""
     root, cameras = _largest_component(path)
-    component = cameras[0].get("component_id") if cameras else None
-    places = [*(each for each in root.iter("component") if each.get("id") == component), *root.iter("chunk")]
-    move = next((found for place in places if (found := place.find("transform")) is not None), None)
-    if move is None:
+    component_id = cameras[0].get("component_id") if cameras else None
+    components = [component for component in root.iter("component") if component.get("id") == component_id]
+    transforms = (element.find("transform") for element in (*components, *root.iter("chunk")))
+    transform = next((element for element in transforms if element is not None), None)
+    if transform is None:
         return None
     text = "expected rotation, translation and scale of 'transform' as numbers"
     with number_errors(path, text), np.errstate(all="ignore"):
         R, shift, scale = (
-            np.array(move.findtext(tag, default).split(), np.float64)
+            np.array(transform.findtext(tag, default).split(), np.float64)
             for tag, default in (("rotation", "1 0 0 0 1 0 0 0 1"), ("translation", "0 0 0"), ("scale", "1"))
         )
         return make_similarity(path, np.column_stack([R.reshape(3, 3), shift.reshape(3) / scale]), scale.item())
 
 
 def _largest_component(path: Path) -> tuple[Element, list[Element]]:
-    """Parse a file, and list the cameras that have a pose, of the component that has most of them."""
+    """Parse a file, and list the cameras with a pose of the component with most of these cameras."""
     root = read_xml(path, _ATTRIBUTES)
     cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
     check_count(path, len(cameras))

@@ -23,7 +23,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import check_file, check_pixels, read_budget
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, StoredView, check_count
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, MAX_NORMALISED_FOCAL, ORDERS, StoredView, check_count
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.colmap import read_colmap
 from gsmerge.io.photo_files import PhotoArrays
@@ -33,8 +33,9 @@ _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _L
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
 _MAX_INTRINSIC = 1e12
-_SMALL = 1e-9  # least principal point that is divided by
-_SAME = 1e-5  # relative difference up to which intrinsics of two files are equal
+_SMALL = 1e-9  # smaller principal points are raised to this, because they are divisors
+_EQUAL_INTRINSICS = 1e-5  # relative tolerance
+_MAX_RATIO_DIFFERENCE, _MIN_SIZE_DIFFERENCE = 0.03, 0.1  # relative: of two axes' ratios, and of two sizes
 _MAX_HEADER = 1 << 16  # bytes of an array's header
 _POINTS = "world_points"  # array of the points of all pixels
 _SAMPLE_POINTS = 1000  # points of each view that are compared with the depth maps
@@ -49,11 +50,10 @@ def is_da3(path: Path) -> bool:
 def read_da3(source: CameraSource) -> StoredCameras:
     """Read the cameras (and images, if stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
-    Intrinsics that are divided by the size, or for another image size than the depth maps (as after a COLMAP export in
-    the same call), are scaled to the depth maps. These files are read as well: ``cameras.npz`` of Lyra 2; the output of
-    VGGT (``extrinsic``, world to camera); that of MapAnything (camera to world, as its points show); and that of
-    AnySplat (camera to world, intrinsics divided by the size, in a batch of one). SceneError if the file cannot be read
-    or lacks an array.
+    Intrinsics are scaled to the depth maps if they are divided by the size, or if they are for another image size, as
+    after a COLMAP export in the same call. The function also reads ``cameras.npz`` of Lyra 2, and the outputs of VGGT
+    (``extrinsic``, world to camera), MapAnything (camera to world, as its points show) and AnySplat (camera to world,
+    intrinsics divided by the size, in a batch of one). SceneError if the file cannot be read or lacks an array.
     """
     path = source.path
     size_names = () if holds_images(path) else _DEPTHS  # depths are read for their shape alone
@@ -65,17 +65,17 @@ def read_da3(source: CameraSource) -> StoredCameras:
     Ks = Ks[0] if Ks is not None and Ks.ndim == 4 and len(Ks) == 1 else Ks
     _check_poses(path, poses, Ks, ("extrinsics [c,3,4]", "intrinsics [c,3,3]"))
     photos: PhotoArrays = ()
-    grid = depths
+    pixels = depths  # an array of all pixels, for their number
     if images is not None:
-        photos = grid = _as_images(path, images, len(poses))
+        photos = pixels = _as_images(path, images, len(poses))
     Ks = None if Ks is None else Ks.astype(np.float64)
     width = height = 0
-    if grid is not None and grid.ndim >= 3 and min(grid.shape[1:3]) > 0:
-        height, width = grid.shape[1:3]
+    if pixels is not None and pixels.ndim >= 3 and min(pixels.shape[1:3]) > 0:
+        height, width = pixels.shape[1:3]
         Ks = None if Ks is None else _at_size(_without_colmap_scale(path, Ks, width, height), width, height)
     elif Ks is not None:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
-    if width <= 1 and Ks is not None and not is_da3(path):  # normalised: AnySplat's
+    if width <= 1 and Ks is not None and not is_da3(path):  # AnySplat divides intrinsics by the size
         return StoredCameras(_views(poses, Ks, (0, 0)), photos, convention=C2W_OPENCV)
     convention = C2W_OPENCV if _POINTS in array_names(path) and _are_camera_to_world(path, poses) else None
     return StoredCameras(_views(poses, Ks, (width, height)), photos, convention=convention)
@@ -84,8 +84,8 @@ def read_da3(source: CameraSource) -> StoredCameras:
 def _are_camera_to_world(path: Path, poses: np.ndarray) -> bool:
     """Return whether stored points fit the depth maps better with camera-to-world than with world-to-camera poses."""
     points, depths = read_arrays(path, (_POINTS,))[_POINTS], read_depths(path)
-    same_grid = depths is not None and len(depths) == len(poses) and points.shape == (*depths.shape, 3)
-    if depths is None or not same_grid or points.dtype.kind not in "fiu":
+    has_point_per_depth = depths is not None and len(depths) == len(poses) and points.shape == (*depths.shape, 3)
+    if depths is None or not has_point_per_depth or points.dtype.kind not in "fiu":
         return False
     sample = slice(None), slice(None, None, max(1, depths[0].size // _SAMPLE_POINTS))
     z, xyz = (array.reshape(len(poses), depths[0].size, -1)[sample].astype(np.float64) for array in (depths, points))
@@ -212,7 +212,7 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
         return np.ascontiguousarray(images)
     read_budget(path).check_memory(images.nbytes + images.size, "images")
     out = np.empty(images.shape, np.uint8)
-    for row in range(images.shape[1]):  # by rows, whose floats take little memory
+    for row in range(images.shape[1]):  # row by row, because the floats of a row take little memory
         out[:, row] = np.round(np.nan_to_num(np.clip(images[:, row], 0, 1).astype(np.float32)) * 255)
     return out
 
@@ -224,7 +224,7 @@ def _without_colmap_scale(path: Path, Ks: np.ndarray, width: int, height: int) -
         with suppress(SceneError):
             views = read_colmap(CameraSource(folder), suffix).views
             sizes = np.array([view.size for view in views], np.float64).reshape(-1, 2, 1).clip(min=1)
-            if len(views) == len(Ks) and np.allclose(np.array([view.K for view in views]), Ks, rtol=_SAME):
+            if len(views) == len(Ks) and np.allclose(np.array([view.K for view in views]), Ks, rtol=_EQUAL_INTRINSICS):
                 return Ks * np.insert([[width], [height]] / sizes, 2, 1, axis=1)
     return Ks
 
@@ -233,9 +233,10 @@ def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
     """Scale intrinsics to an image size. These networks assume that the principal point is in the middle."""
     size = np.array([width, height])
     ratio = 2 * np.maximum(Ks[:, :2, 2], _SMALL) / size
-    normalised = (Ks[:, 0, 0] < 10) & (Ks[:, 0, 2] < 2) & (width > 10)
-    # intrinsics are for another size if both axes clearly have the same ratio; otherwise the principal point is off
-    other_size = (np.abs(ratio[:, 0] / ratio[:, 1] - 1) < 0.03) & (np.abs(ratio[:, 0] - 1) > 0.1)
+    normalised = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 0, 2] < 2) & (width > 10)
+    # If the ratios of both axes are equal and not 1, intrinsics are for another size; else the principal point is off
+    are_equal = np.abs(ratio[:, 0] / ratio[:, 1] - 1) < _MAX_RATIO_DIFFERENCE
+    other_size = are_equal & (np.abs(ratio[:, 0] - 1) > _MIN_SIZE_DIFFERENCE)
     scaled = Ks.copy()
     scaled[normalised, :2] *= size[:, None]
     other_size &= ~normalised
@@ -303,8 +304,8 @@ def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> 
 def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     with stream:
         start = io.BytesIO(stream.read(_MAX_HEADER))
-    first = np.lib.format.read_magic(start) == (1, 0)
-    read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+    is_version_1 = np.lib.format.read_magic(start) == (1, 0)
+    read_header = np.lib.format.read_array_header_1_0 if is_version_1 else np.lib.format.read_array_header_2_0
     shape, _, dtype = read_header(start)
     return shape, dtype
 

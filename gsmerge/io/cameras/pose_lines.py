@@ -46,11 +46,11 @@ def lists_poses(path: Path) -> bool:
 def read_poses(source: CameraSource) -> StoredCameras:
     """Read the cameras of a text file, or of the text files in a folder: a pose per line, or a matrix in four lines.
 
-    Poses have 12 or 16 numbers, row by row, or are those of TUM; they are camera-to-world with OpenCV axes. Only those
-    of RealEstate10K are world-to-camera, and have intrinsics before them. Intrinsics of other poses may be in a file
+    Poses have 12 or 16 numbers, row by row, or TUM's 8 numbers; they are camera-to-world with OpenCV axes. Only poses
+    of RealEstate10K are world-to-camera, with intrinsics in the same line. Intrinsics of other poses may be in a file
     beside them, see :data:`INTRINSICS`: fx, fy, cx, cy in pixels or a matrix, for all views or for each. The size is
-    that of DA3-Streaming's frames, otherwise unknown. Views of a folder whose matrix is not finite are left out.
-    SceneError if a line has another count of numbers.
+    that of DA3-Streaming's frames; without frames it is unknown. In a folder, views without a finite matrix are left
+    out. SceneError if a line has another count of numbers.
     """
     path = source.path
     columns = len(_words(next(filter(str.strip, _lines(path)), "")))
@@ -59,9 +59,7 @@ def read_poses(source: CameraSource) -> StoredCameras:
     intrinsics = next((path.parent / name for name in INTRINSICS if (path.parent / name).exists()), None)
     Ks = [] if intrinsics is None or columns == _RE10K else _read_intrinsics(intrinsics)
     if columns == _TUM:
-        with np.errstate(all="ignore"):  # what is not finite is refused with the cameras
-            names, rotations = [f"{row[0]:.6f}" for row in rows], quat_to_rotmat(np.array(rows)[:, [7, 4, 5, 6]])
-        poses = [np.column_stack([rotation, row[1:4]]) for rotation, row in zip(rotations, rows, strict=True)]
+        names, poses = [f"{row[0]:.6f}" for row in rows], _tum_poses(np.array(rows))
     elif columns == _RE10K:
         names, Ks = [f"{row[0]:.0f}" for row in rows], [make_pinhole(*row[1:5]) for row in rows]
         poses = [row[7:] for row in rows]
@@ -78,6 +76,14 @@ def read_poses(source: CameraSource) -> StoredCameras:
     return StoredCameras(views, convention=W2C_OPENCV if columns == _RE10K else None)
 
 
+def _tum_poses(rows: np.ndarray) -> list[np.ndarray]:
+    """Convert rows ``[n,8]`` of time, centre and quaternion xyzw to poses ``[3,4]``."""
+    centres, quats = rows[:, 1:4], rows[:, [7, 4, 5, 6]]  # wxyz
+    with np.errstate(all="ignore"):  # the check of the cameras refuses numbers that are not finite
+        rotations = quat_to_rotmat(quats)
+    return [np.column_stack([rotation, centre]) for rotation, centre in zip(rotations, centres, strict=True)]
+
+
 def _read_intrinsics(path: Path) -> list[np.ndarray]:
     """Read intrinsics ``[3,3]``: lines of fx, fy, cx, cy or of matrices, or a matrix in several lines.
 
@@ -85,7 +91,8 @@ def _read_intrinsics(path: Path) -> list[np.ndarray]:
     """
     rows = _join_rows(path, _parse(path, _lines(path), (1, 2, 3, 4, 9, 16)))
     if len(rows) > 1 and len(rows[0]) == 4 != len(rows[-1]):
-        rows = [rows[0][[0, 0, 1, 2]]]
+        f, cx, cy, _ = rows[0]
+        rows = [np.array([f, f, cx, cy])]
     if any(len(row) not in (4, 9, 16) for row in rows):
         raise SceneError(path, "expected lines of fx, fy, cx, cy or a matrix of 9 or 16 numbers, found another count")
     sides = {9: 3, 16: 4}
@@ -128,15 +135,15 @@ def list_frames(folder: Path) -> list[Path]:
 
     SceneError if a number is missing.
     """
-    place = folder if folder.name == FRAMES else folder / FRAMES
+    frames_folder = folder if folder.name == FRAMES else folder / FRAMES
     with suppress(OSError):
-        if (place.parent / POSES).is_file():
-            matches = [(_FRAME.fullmatch(path.name), path) for path in place.iterdir()]
+        if (frames_folder.parent / POSES).is_file():
+            matches = [(_FRAME.fullmatch(path.name), path) for path in frames_folder.iterdir()]
             numbers = {int(match[1]): path for match, path in matches if match}
             missing = next((number for number in range(len(numbers)) if number not in numbers), None)
             if missing is not None:
                 problem = f"expected {len(numbers)} frames from frame_0.npz on, found none with number {missing}"
-                raise SceneError(place, problem, "add it, and one line of camera_poses.txt for each")
+                raise SceneError(frames_folder, problem, "add it, and one line of camera_poses.txt for each")
             return [numbers[number] for number in range(len(numbers))]
     return []
 

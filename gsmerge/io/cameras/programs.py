@@ -17,7 +17,7 @@ from gsmerge.io.image_names import natural_key
 
 
 def list_shots(source: CameraSource) -> list[Entry]:
-    """List the shots of OpenSfM's reconstruction that has most of them, each with its camera."""
+    """List the shots of OpenSfM's largest reconstruction, each with its camera."""
     with number_errors(source.path, "expected reconstructions of 'cameras' and 'shots'"):
         largest = max(source.json, key=lambda entry: len(entry["shots"]))
         shots, cameras = dict(largest["shots"]), largest["cameras"]
@@ -49,8 +49,8 @@ def _read_object(path: Path) -> dict[str, Any]:
 def join_matrices(source: CameraSource) -> list[Entry]:
     """List WorldMirror's views: each has the same ``camera_id`` in the lists "extrinsics" and "intrinsics".
 
-    ``camera_id`` is the stem of the image's name, or its number. Views are in the order of the numbers, otherwise in
-    the file's. SceneError if one of the lists lacks a view.
+    ``camera_id`` is the stem of the image's name, or its number. Views are in the order of these numbers, or else in
+    the file's order. SceneError if one of the lists lacks a view.
     """
     poses, Ks = (_matrices_by_id(source, key) for key in ("extrinsics", "intrinsics"))
     if poses.keys() != Ks.keys():
@@ -72,11 +72,11 @@ def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
 
 
 def set_centred_size(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
-    """Set the size of which all principal points are the middle; return the views unchanged if there is none."""
+    """Set the size of views to twice their principal points; return them unchanged if these are not all centred."""
     sides = 2 * np.array([view.K for view in views])[:, :2, 2].reshape(-1, 2) if views else np.zeros((0, 2))
-    whole = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
-    centred = len(sides) > 0 and bool((np.abs(sides - whole) <= CENTRED_PX).all())
-    if not centred or not (whole > MAX_NORMALISED_FOCAL).all():
+    first_size = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
+    are_centred = len(sides) > 0 and bool((np.abs(sides - first_size) <= CENTRED_PX).all())
+    if not are_centred or not (first_size > MAX_NORMALISED_FOCAL).all():
         return views
-    size = int(whole[0, 0]), int(whole[0, 1])
+    size = int(first_size[0, 0]), int(first_size[0, 1])
     return [view._replace(size=size) for view in views]

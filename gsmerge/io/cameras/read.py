@@ -51,10 +51,10 @@ def _is_camera_folder(folder: Path) -> bool:
 
 
 def find_other_cameras(folder: Path) -> Path | None:
-    """Find cameras in a folder under a name of any kind: the only file that is read as cameras.
+    """Find the only file in a folder that can be read as cameras, whatever its name.
 
-    If no file is read, the first that starts like camera poses of an unknown program. None if there are several files
-    of cameras, or none.
+    If no file can be read, return the first file that starts like camera poses of an unknown program. None if there are
+    several files of cameras, or none.
     """
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _CANDIDATE_ENDINGS)
     files = [path for path in files if path.name not in INTRINSICS and not path.name.endswith(ENDING)]
@@ -94,11 +94,11 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
     path = _resolve(Path(path))
     ending = "" if path.is_dir() else path.suffix.lower().replace(LOG, ".txt")
     source = CameraSource(path, scene, folder)
-    chosen = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
-    if chosen is None:
+    format_ = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
+    if format_ is None:
         check_unknown(path)
         raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
-    return chosen.cameras(source)
+    return format_.cameras(source)
 
 
 def _resolve(path: Path) -> Path:
@@ -110,16 +110,16 @@ def _resolve(path: Path) -> Path:
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
     if path.is_dir() and not _is_camera_folder(path):
-        inside = find_cameras(path) or find_other_cameras(path)
-        if inside is None:
+        camera_path = find_cameras(path) or find_other_cameras(path)
+        if camera_path is None:
             check_program(path)
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
-        path = inside
+        path = camera_path
     return path if path.is_dir() else _folder_of(path) or path
 
 
 def _folder_of(path: Path) -> Path | None:
-    """Return the folder of the model or the keyframes that a file belongs to; None if the file stands for itself."""
+    """Return the folder of a model or of keyframes if a file is part of it; None for any other file."""
     check_program(path)
     check_file(path)
     if path.suffix == ".json":

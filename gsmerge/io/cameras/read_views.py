@@ -28,7 +28,7 @@ _MAX_MODEL = 40  # letters of a camera model's name
 def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
     """Read the cameras of a file by its layout; SceneError with file, view and key if a value is missing or wrong."""
     entries = layout.views(source) if callable(layout.views) else _list_entries(source, layout.views)
-    shared: dict[int, dict[str, Any]] = {}  # by id; converted once, because it may be large and views many
+    shared: dict[int, dict[str, Any]] = {}  # values that views share, by id; converted once, since they may be large
     cameras: list[tuple[Path, str, np.ndarray, dict[str, Any]]] = []
     for i, entry in enumerate(entries):
         path, name = entry.path or source.path, entry.name or _find_name(entry.values, layout.name) or f"view {i}"
@@ -40,7 +40,7 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
             values = shared[id(entry.shared)] | _camera_values(layout, entry.values)
             cameras.append((path, name, layout.pose.read(entry.values), values))
     has_intrinsics = any(key in values for *_, values in cameras for key in ("K", *_FOCAL))
-    size_of = cache(image_size)  # of photos that many views may name
+    size_of = cache(image_size)  # many views may name the same photo
     views = []
     for path, name, pose, values in cameras:
         with number_errors(path, f"view {name}: expected numbers"):
@@ -54,7 +54,7 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
 
 
 def _list_entries(source: CameraSource, key: str) -> list[Entry]:
-    """List the views under a key of a file's object, or those of a file that is a list."""
+    """List the views under a key of a file's object; "" if the file itself is the list."""
     views = source.object.get(key) if key else source.json
     if not isinstance(views, list) or not all(isinstance(view, dict) for view in views):
         place = repr(key) if key else "the file"
@@ -68,13 +68,13 @@ def _alternatives(key: Key) -> tuple[str, ...]:
 
 
 def _find_value(values: Mapping[str, Any], key: Key) -> Any:
-    """Return the value of the first of a key's alternatives that has one; None if none has."""
-    return next((values[one] for one in _alternatives(key) if values.get(one) is not None), None)
+    """Return the value of the first alternative of a key that has a value; None if no alternative has a value."""
+    return next((values[name] for name in _alternatives(key) if values.get(name) is not None), None)
 
 
 def _find_name(values: Mapping[str, Any], key: Key) -> str:
     """Return the name of a view's image, "" if it has none."""
-    return str(next((values[one] for one in _alternatives(key) if values.get(one) not in (None, "")), ""))
+    return str(next((values[name] for name in _alternatives(key) if values.get(name) not in (None, "")), ""))
 
 
 def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None:
@@ -89,10 +89,10 @@ def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None
 
 
 def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert what a view, or the object that views share, has of intrinsics, size and lens.
+    """Convert the intrinsics, size and lens in the values of a view, or of the object that views share.
 
-    The result has no more keys than the file: those of ``number_keys``, "K" for a matrix, and of a lens "model",
-    "is_fisheye", "distortion_params" and the coefficients. Errors as in :func:`convert`.
+    The result has the keys of ``number_keys``, "K" for a matrix, and for a lens "model", "is_fisheye",
+    "distortion_params" and the coefficients, as far as the file has them. Errors as in :func:`convert`.
     """
     keys = layout.number_keys | ({name: name for name in _COEFFICIENTS} if layout.lens else {})
     camera: dict[str, Any] = {}
@@ -130,8 +130,8 @@ def _with_size(
     keys = layout.number_keys
     if not any(key in values for key in _FOCAL):
         missing = ", ".join(str(keys[field]) for field in ("fx", "w", "h") if field not in values)
-        every = ", ".join(str(keys[field]) for field in ("fx", "fy", "cx", "cy", "w", "h"))
-        problem = f"view {name}: expected intrinsics ({every}), found none of {missing}"
+        expected = ", ".join(str(keys[field]) for field in ("fx", "fy", "cx", "cy", "w", "h"))
+        problem = f"view {name}: expected intrinsics ({expected}), found none of {missing}"
         raise SceneError(path, problem, "add them in pixels, for all views or for each")
     has_size = values.get("w") and values.get("h")
     if has_size or {"fx", "cx", "cy"} <= values.keys() or keys.get("w") not in layout.optional:
@@ -152,7 +152,7 @@ def _intrinsics(path: Path, name: str, layout: ViewLayout, values: Mapping[str, 
             problem = f"expected 3x3 numbers in {layout.K.key!r}, found shape {K.shape}"
             raise SceneError(path, f"view {name}: {problem}")
         return K * np.array([[round(width)], [round(height)], [1]]) if layout.unit == "size" else K
-    unit = max(width, height) if layout.unit == "larger side" else 1.0
+    unit = max(width, height) if layout.unit == "larger side" else 1.0  # pixels
     fx, fy = _focal(values, "x", width), _focal(values, "y", height)
     fx = fx or fy if layout.K.fx in layout.optional else fx
     fy = fy or fx if layout.K.fy in layout.optional else fy

@@ -1,6 +1,6 @@
-"""Every format of cameras: how a file is recognised, how its views are stored, and in which convention.
+"""The table of camera formats: how to recognise a file, how it stores its views, and its convention of poses.
 
-A format whose files have a key for each value is a :class:`ViewLayout`; formats of other kinds have a function.
+If files of a format have a key for each value, a :class:`ViewLayout` reads them; a function reads any other format.
 """
 
 from __future__ import annotations
@@ -70,12 +70,12 @@ def _holds_model(folder: Path, suffix: str) -> bool:
 
 def is_keyframes(folder: Path) -> bool:
     """Return whether a folder holds the cameras of Polycam's keyframes, a ``.json`` each."""
-    first = min(folder.glob("[!.]*.json"), default=folder)
-    return first.is_file() and f'"{KEYFRAME}"'.encode() in read_start(first)
+    first_file = min(folder.glob("[!.]*.json"), default=folder)
+    return first_file.is_file() and f'"{KEYFRAME}"'.encode() in read_start(first_file)
 
 
 def _has_views_with(source: CameraSource, key: str) -> bool:
-    """Return whether a JSON file has ``views``, of which one has a key."""
+    """Return whether a JSON file has a list ``views`` of objects, and any of them has the key."""
     views = source.object.get("views")
     return isinstance(views, list) and all(isinstance(v, dict) for v in views) and any(key in v for v in views)
 
@@ -160,7 +160,7 @@ RE10K = CameraFormat(
     "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`; needs torch", CHUNK,
     _lazy("re10k.read_re10k"), W2C_OPENCV, "divided by the size",
 )  # fmt: skip
-# In the order of trial: the first row with the ending of a file that recognises it reads it
+# Rows are tried in this order; a file is read by the first row that has its ending and recognises it
 CAMERA_FORMATS = (
     CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(_READ_COLMAP, suffix=".bin"),
                  W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".bin")),

@@ -1,4 +1,4 @@
-"""Declare how a file stores its views: under which keys the pose, intrinsics, size and lens of each are.
+"""Declare how a file stores its views: the keys of the pose, intrinsics, size and lens of each view.
 
 The rows of ``table.py`` hold such declarations, and ``read_views.py`` reads files by them.
 """
@@ -16,16 +16,16 @@ from gsmerge.geometry import motion_matrices
 from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, convert, to_array, to_number
 
-Key = str | tuple[str, ...]  # a key, or several, of which the first that has a value counts
+Key = str | tuple[str, ...]  # a key, or several keys; the first key with a value counts
 
 
 class Entry(NamedTuple):
     """One view as a file stores it, before conversion."""
 
     values: Mapping[str, Any]  # its own
-    shared: Mapping[str, Any] = {}  # those of several views, for example of one camera; they fill in what a view lacks
-    name: str = ""  # of its image, where the name is no value
-    path: Path | None = None  # the view's own file, where each view has one
+    shared: Mapping[str, Any] = {}  # values of several views, such as one camera's; they replace missing values
+    name: str = ""  # of its image, if no value has the name
+    path: Path | None = None  # the view's own file, if each view has a file
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def rotation_of_matrix(numbers: np.ndarray) -> np.ndarray:
 
 
 def rotation_of_vector(numbers: np.ndarray) -> np.ndarray:
-    """Return the rotation ``[3,3]`` about an axis: the vector ``[3]`` along it has the angle in radians as length."""
+    """Return the rotation ``[3,3]`` of a vector ``[3]`` along the axis, whose length is the angle in radians."""
     motion = np.concatenate([numbers.reshape(1, 3), np.zeros((1, 3))], 1)
     return motion_matrices(motion)[0, :3, :3]
 
@@ -114,7 +114,7 @@ class RotationAndShift:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """Intrinsics with a key for each number. What happens without one counts where the layout makes it optional.
+    """Intrinsics with a key for each number. If the layout makes a key optional, the defaults below apply.
 
     Args:
         fx: Key of the horizontal focal length. A view without it has square pixels.
@@ -135,26 +135,25 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class ViewLayout:
-    """Where a file lists its views, and under which keys a view has its values.
+    """The place of a file's list of views, and the keys of a view's values.
 
-    A value of null counts as missing. A view takes what it lacks from the object that has the list of views, except for
+    A value of null counts as missing. The object with the list of views replaces missing values of a view, except for
     its name and pose.
 
     Args:
         pose: The pose, in the convention of the format.
         K: The intrinsics: a key for each number, or a matrix ``[3,3]``.
         views: Key of the list of views; "" if the file itself is the list; or a function that lists them.
-        name: Key of the image's name. Views without one are called "view 0", "view 1" and so on.
+        name: Key of the image's name. Views without a name are called "view 0", "view 1" and so on.
         size: Keys of width and height in pixels, or the key of a list [height, width]; "" if the file has no size.
-        unit: What intrinsics are measured in: pixels, the image's width and height, or its larger side. Intrinsics that
-            are "pixels" but small enough to be shares of width and height are taken as these, see
-            :func:`make_camera_file`.
+        unit: Unit of the intrinsics: pixels, the image's width and height, or its larger side. Small intrinsics in
+            "pixels" count as shares of width and height, see :func:`make_camera_file`.
         origin: The point of the image from which the principal point is measured: the upper left corner or the middle.
-        lens: Key of the camera model, beside which the file has the coefficients k1, k2 and so on; "" for pinholes.
-        models: COLMAP's names of the program's camera models, where they differ.
-        optional: Keys that a view may lack. Without a size, that of the image counts. If no view of the file has a
+        lens: Key of the camera model, with the coefficients k1, k2 and so on beside it; "" for pinholes.
+        models: The program's names of camera models -> COLMAP's names; equal names are left out.
+        optional: Keys that a view may lack. Without a size, the size of the image counts. If no view of the file has a
             focal length, it is estimated later.
-        finish: A function that changes the views where the values do not say all.
+        finish: A function that completes the views from other content of the file or folder; None: nothing to add.
     """
 
     pose: Matrix | MatrixEntries | RotationAndShift

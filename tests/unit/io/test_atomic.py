@@ -129,7 +129,7 @@ def test_what_dead_processes_left_is_removed_and_what_others_write_is_not(tmp_pa
         tmp_path / ".out-00112233.ply",
     ]
     elsewhere = [left_by(dead_process(), tmp_path / name) for name in ("out.ply", "old.ply")]
-    recent, old = [path.with_name(path.name.replace(atomic._place(), "00000000")) for path in elsewhere]
+    recent, old = [path.with_name(path.name.replace(atomic._machine_hash(), "00000000")) for path in elsewhere]
     for path in (*dead, *kept, recent, old):
         path.touch()
     os.utime(old, (0, 0))
