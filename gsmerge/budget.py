@@ -1,4 +1,4 @@
-"""Numbers of Gaussians that superpixels and K give, and that budgets, file sizes and devices ask for or allow."""
+"""Limit the number of Gaussians by superpixels and K, and by budgets, file sizes and devices."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, 
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 
 LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
-MAX_ADAPTED = 4  # bass-adaptive comes to at most so many times more, or fewer, superpixels than it starts with
+MAX_ADAPTED = 4  # bass-adaptive changes the number of superpixels by at most this factor, up or down
 FEW_PIXELS = 1 << 18  # pixels of a few small photos
-# Gaussians per pixel of the photos, counting at most FEW_PIXELS pixels, below which a scene has few Gaussians. Then a
-# share of superpixels is a share of pixels, and at most this share of the Gaussians
+# A scene has few Gaussians below this number per pixel of the photos, counting at most FEW_PIXELS pixels. Then a share
+# of superpixels is a share of pixels, and at most this share of the Gaussians
 FEW = 0.5
 
 
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
-    """Return the number of Gaussians that a budget or a file size asks for; None without either."""
+    """Return the number of Gaussians requested by a budget or a file size; None without either."""
     device = DEVICES.get(str(options.budget))
     if device is not None:  # only a limit, unless it is to be filled, or the useful number for the scene is known
-        most = num_input if options.fill else options.most
-        return None if most is None else min(device, most)
+        device_limit = num_input if options.fill else options.most
+        return None if device_limit is None else min(device, device_limit)
     if options.budget in (None, AUTO):
         return None
-    most = num_input if options.most is None else options.most
+    limit = num_input if options.most is None else options.most
     if size := file_size(options):
-        return min(count_for_bytes(size.file, size.num_bytes, sh_degree), most)
-    return min(parse_budget(str(options.budget), num_input), most)
+        return min(count_for_bytes(size.file, size.num_bytes, sh_degree), limit)
+    return min(parse_budget(str(options.budget), num_input), limit)
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class FileSize:
 
     @property
     def packed(self) -> bool:
-        """Whether the number of bytes depends on the content, so that files have to be made to measure it."""
+        """Whether the size in bytes depends on the content, so that it can only be measured by making the file."""
         return self.file.count is None
 
 
 def file_size(options: BudgetOptions) -> FileSize | None:
-    """Return the size that a budget in bytes asks for; None for any other budget.
+    """Return the file size requested by a budget in bytes; None for any other budget.
 
-    Raises UsageError if the format of the output has no size that follows from its Gaussians.
+    Raises UsageError if the size of the output's format does not follow from its Gaussians.
     """
     if not options.in_bytes:
         return None
@@ -59,7 +59,7 @@ def file_size(options: BudgetOptions) -> FileSize | None:
 
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
-    """Return the largest number of Gaussians that budget, file size and device allow, at most that of the input."""
+    """Return the largest number of Gaussians that budget, file size and device allow, at most ``num_input``."""
     limits = DEVICES.get(str(options.budget)), exact_count(options, num_input, sh_degree), options.most
     return min([num_input, *(limit for limit in limits if limit is not None)])
 
@@ -68,14 +68,14 @@ def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
 class CountLimits:
     """Limits on the number of Gaussians that follow from the options."""
 
-    per_view: int  # Superpixels of each view that the options ask for
-    default: int  # Gaussians that `superpixels` and K ask for
+    per_view: int  # Superpixels of each view by the options
+    default: int  # Gaussians by `superpixels` and K
     min_count: int  # Fewest Gaussians that the scene can be cut to: one for each view
     max_count: int  # Most Gaussians that a budget, a size or a device allows
-    exact: int | None  # Gaussians that a budget or a size asks for; None without either
+    exact: int | None  # Gaussians requested by a budget or a size; None without either
     num_pixels: int  # Pixels of all views
     num_input: int  # Gaussians of the scene
-    most: int  # Most Gaussians that are useful for the scene; as many as it has, if that is not known
+    most: int  # Most Gaussians that are useful for the scene; if unknown, the number of its Gaussians
 
     @property
     def count(self) -> int | None:

@@ -17,9 +17,12 @@ from gsmerge.types import FeatureGaussians, Gaussians, Pixels, Scene
 Rule = Literal["depth", "paper"]
 
 MIN_SCALE = 1e-12
-MAX_OPACITY = 0.999  # of a merged Gaussian, so that its logit is finite and a later fit can still change it
+MAX_OPACITY = 0.999  # largest opacity of a merged Gaussian, so that its logit is finite and a later fit can change it
 ROWS_PER_TASK = 4096  # groups that one task pools
 ROWS = 65536  # Gaussians whose footprints one task computes
+# Columns of a group in the output of the kernel `pool`
+MEAN, COVAR, WEIGHT, MASS, EXTINCTION, FOOTPRINT, COLUMNS = slice(0, 3), slice(3, 9), 9, 10, 11, 12, 13
+FULL_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # entries of an upper triangle xx xy xz yy yz zz in a flattened 3 x 3 matrix
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,8 @@ class Members:
     scales: np.ndarray  # [n,3]
     opacities: np.ndarray  # [n]
     sh0: np.ndarray  # [n,1,3]
-    shN: np.ndarray  # [n,k-1,3], separate because they are most of a scene of degree 4 and only pooling reads them
-    footprints: np.ndarray  # [n] size of the own view's pixel at the member's depth, world units
+    shN: np.ndarray  # [n,k-1,3], separate because it is most of a scene of degree 4 and only pooling reads it
+    footprints: np.ndarray  # [n] size of a pixel of the member's view at the member's depth, world units
     pixels: np.ndarray  # [n] int, the pixel (view-major, row-major over all views) of each member, -1 for none
     fronts: np.ndarray  # [v,h,w] int32, the member that each pixel shows, -1 for none
 
@@ -44,27 +47,27 @@ def _array(values: np.ndarray) -> np.ndarray:
 def scene_members(scene: Scene) -> Members:
     """Return the Gaussians of a canonical scene with pixels as members.
 
-    Footprints are measured in the view of each Gaussian's pixel, or for Gaussians without a pixel in the view with the
-    smallest footprint.
+    The footprint of a Gaussian is measured in the view of its pixel. Without a pixel, it is the smallest footprint over
+    all views.
     """
     g, cameras, homes = scene.gaussians, scene.cameras, scene.get_pixels().homes
     means, footprints = _array(g.means), np.empty(len(g), np.float32)
     viewmats, Ks = cameras.viewmats.astype(np.float32), cameras.Ks
     focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in Ks])
 
-    def fill(first: int) -> None:
-        rows = slice(first, first + ROWS)
+    def measure_footprints(start: int) -> None:
+        rows = slice(start, start + ROWS)
         views = homes[rows] // scene.pixels_per_view
         depths = np.abs(camera_depths(means[rows], viewmats[views]))
         footprints[rows] = np.maximum(depths, np.float32(1e-6)) / focals.astype(np.float32)[views]
 
-    parallel_map(fill, range(0, len(g), ROWS))
-    alone = np.flatnonzero(homes < 0)
-    if len(alone):
-        nearest = np.full(len(alone), np.inf)
+    parallel_map(measure_footprints, range(0, len(g), ROWS))
+    homeless = np.flatnonzero(homes < 0)
+    if len(homeless):
+        smallest = np.full(len(homeless), np.inf)
         for centre, focal in zip(cameras.centres.astype(np.float64), focals, strict=True):
-            np.minimum(nearest, np.linalg.norm(means[alone] - centre, axis=1) / focal, out=nearest)
-        footprints[alone] = np.maximum(nearest, 1e-6)
+            np.minimum(smallest, np.linalg.norm(means[homeless] - centre, axis=1) / focal, out=smallest)
+        footprints[homeless] = np.maximum(smallest, 1e-6)
     return _make_members(g, footprints, scene.get_pixels())
 
 
@@ -101,24 +104,26 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
     states no opacity, so the mean opacity of the members is used.
     """
     num_groups = len(starts) - 1
-    geometry = np.zeros((num_groups, 13))
+    pooled = np.zeros((num_groups, COLUMNS))
     sh = np.zeros((num_groups, 1 + members.shN.shape[1], 3), np.float32)
 
-    def run(first: int) -> None:
-        last = min(first + ROWS_PER_TASK, num_groups)
+    def pool_groups(begin: int) -> None:
+        end = min(begin + ROWS_PER_TASK, num_groups)
         m = members
         pool(
-            starts[first : last + 1], ids, m.means, m.quats, m.scales, m.opacities, m.sh0, m.shN, m.footprints,
-            rule == "depth", geometry[first:last], sh[first:last],
+            starts[begin : end + 1], ids, m.means, m.quats, m.scales, m.opacities, m.sh0, m.shN, m.footprints,
+            rule == "depth", pooled[begin:end], sh[begin:end],
         )  # fmt: skip
 
-    parallel_map(run, range(0, num_groups, ROWS_PER_TASK))
-    covars, extinctions = geometry[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3), geometry[:, 11]
+    parallel_map(pool_groups, range(0, num_groups, ROWS_PER_TASK))
+    covars, extinctions = pooled[:, COVAR][:, FULL_MATRIX].reshape(-1, 3, 3), pooled[:, EXTINCTION]
     if rule == "paper" and num_groups:
         scales, _ = principal_axes(covars)
-        mean = np.add.reduceat(members.opacities[ids].astype(np.float64), starts[:-1]) / np.diff(starts)
-        extinctions = -log(1 - np.clip(mean, 1e-4, MAX_OPACITY)) * scales[:, 1] * scales[:, 2]
-    return Moments(geometry[:, :3], covars, geometry[:, 9], geometry[:, 10], extinctions, geometry[:, 12], sh)
+        opacities = np.add.reduceat(members.opacities[ids].astype(np.float64), starts[:-1]) / np.diff(starts)
+        extinctions = -log(1 - np.clip(opacities, 1e-4, MAX_OPACITY)) * scales[:, 1] * scales[:, 2]
+    return Moments(
+        pooled[:, MEAN], covars, pooled[:, WEIGHT], pooled[:, MASS], extinctions, pooled[:, FOOTPRINT], sh
+    )  # fmt: skip
 
 
 def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -126,11 +131,11 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     covars = np.ascontiguousarray(covars, dtype=np.float64)
     scales, quats = np.empty((len(covars), 3)), np.empty((len(covars), 4))
 
-    def run(first: int) -> None:
-        rows = slice(first, first + ROWS_PER_TASK)
-        decompose(covars[rows], scales[rows], quats[rows])
+    def decompose_rows(start: int) -> None:
+        rows = slice(start, start + ROWS_PER_TASK)
+        decompose(covars[rows], scales[rows], quats[rows])  # fills `scales` and `quats`
 
-    parallel_map(run, range(0, len(covars), ROWS_PER_TASK))
+    parallel_map(decompose_rows, range(0, len(covars), ROWS_PER_TASK))
     return np.maximum(scales, MIN_SCALE), quats
 
 

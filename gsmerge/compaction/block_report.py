@@ -78,17 +78,19 @@ def _join_parts(starts: Sequence[BlockStart], scores: Sequence[BlockScores], siz
     def mean(rows: Sequence[tuple[float, ...]], weights: Sequence[float] = sizes) -> list[float]:
         return np.average(rows, axis=0, weights=weights).tolist()
 
-    each = [score.parts for score in scores]
+    block_parts = [score.parts for score in scores]
     covered = photo_files = protected = None
-    if any(parts.covered for parts in each):
-        rows = [astuple(parts.covered or Covered(1.0, *pair)) for parts, pair in zip(each, whole, strict=True)]
+    if any(parts.covered for parts in block_parts):
+        rows = [astuple(parts.covered or Covered(1.0, *pair)) for parts, pair in zip(block_parts, whole, strict=True)]
         covered = Covered(*mean(rows))
-    if any(parts.photo_files for parts in each):
-        rows = [astuple(parts.photo_files or PhotoFiles(*pair)) for parts, pair in zip(each, whole, strict=True)]
+    if any(parts.photo_files for parts in block_parts):
+        rows = [astuple(parts.photo_files or PhotoFiles(*pair)) for parts, pair in zip(block_parts, whole, strict=True)]
         photo_files = PhotoFiles(*mean(rows))
-    protected_shares = [parts.protected.share if parts.protected else 0.0 for parts in each]
+    protected_shares = [parts.protected.share if parts.protected else 0.0 for parts in block_parts]
     shares = [size * share for size, share in zip(sizes, protected_shares, strict=True)]
     if sum(shares) > 0:
-        rows = [(parts.protected.before, parts.protected.after) if parts.protected else (0.0, 0.0) for parts in each]
+        rows = [
+            (parts.protected.before, parts.protected.after) if parts.protected else (0.0, 0.0) for parts in block_parts
+        ]
         protected = Covered(sum(shares) / sum(sizes), *mean(rows, shares))
     return PartScores(covered, photo_files, protected)

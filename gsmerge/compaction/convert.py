@@ -193,7 +193,7 @@ def _photo_folder(options: ConvertOptions, stored: CameraFile | None) -> Path | 
 def _clean(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
 ) -> tuple[np.ndarray, dict[str, int]]:
-    """Crop the Gaussians and drop unwanted ones; return the remaining rows, and the dropped numbers by reason."""
+    """Crop the Gaussians and drop unwanted ones; return the remaining rows, and numbers of dropped ones by reason."""
     drops = options.clean.drops
     if not {"sky", "unseen"} & set(drops) or len(gaussians) == 0:
         return clean(gaussians, options.clean, None, None, lambda g: g)

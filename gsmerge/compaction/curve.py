@@ -26,18 +26,18 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians
 
 KNEE_STEPS = 60  # steps of each short fit: enough to find the knee
-DROP_STEPS = 300  # the same where tenths of a dB count on clean scenes, for a largest loss of quality
+DROP_STEPS = 300  # steps of each short fit for a largest loss of quality, where tenths of a dB count on clean scenes
 HOLDOUT = 0.1  # share of the photos' patches that the fits leave out
 PROGRESS = "curve: what each count brings"
 DROP_SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # counts at which the curve is measured, of the usual count
-KNEE_SHARES = DROP_SHARES[1:5]  # the same where only the knee is searched for
-SSIM_DB = 40.0  # dB that count as much as 1 of SSIM: where 1 % of the Gaussians beats 4 % in PSNR it still blurs
-KNEE_SLOPE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaussians are not worth it
+KNEE_SHARES = DROP_SHARES[1:5]  # the counts for finding only the knee
+SSIM_DB = 40.0  # dB equal to 1 of SSIM; SSIM counts, because 1 % of the Gaussians may beat 4 % in PSNR and still blur
+KNEE_SLOPE = 0.15  # dB of quality per doubling of the count; below it, more Gaussians gain too little
 
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """Quality of a short fit with ``count`` Gaussians, measured on what the fit left out of the photos."""
+    """Quality of a short fit with ``count`` Gaussians, measured on held-out photos or patches."""
 
     count: int  # Gaussians
     psnr: float  # dB
@@ -114,21 +114,21 @@ def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
     return count_reaching([(point.count, point.quality) for point in points], best - max_drop)
 
 
-def count_reaching(points: Sequence[tuple[int, float]], wanted: float) -> int:
-    """Return the fewest Gaussians at which a curve of (count, quality) reaches ``wanted``; one of its points does."""
-    first = next(i for i, (_, quality) in enumerate(points) if quality >= wanted)
-    if first == 0:
+def count_reaching(points: Sequence[tuple[int, float]], target: float) -> int:
+    """Return the fewest Gaussians at which a curve of (count, quality) reaches ``target``; one of its points does."""
+    index = next(i for i, (_, quality) in enumerate(points) if quality >= target)
+    if index == 0:
         return points[0][0]
-    (count, quality), (more, better) = points[first - 1 : first + 1]
-    return math.ceil(count * float(power(more / count, (wanted - quality) / (better - quality))))
+    (low_count, low), (high_count, high) = points[index - 1 : index + 1]
+    return math.ceil(low_count * float(power(high_count / low_count, (target - low) / (high - low))))
 
 
 def curve_knee(points: Sequence[CurvePoint]) -> int:
     """Return the count beyond which more Gaussians add little quality.
 
-    The knee is the last count at which the quality grows by at least 0.15 dB per doubling of the count. The slope at
-    the middle of two neighbouring points is that between them; between the middles it is linear. Points come by rising
-    count.
+    The knee is the last count at which the quality grows by at least 0.15 dB per doubling of the count. The slope in
+    the middle of two neighbouring points is the slope of the line between them. Between the middles the slope is
+    linear. Points come by rising count.
     """
     if not points:
         raise ValueError("points: expected at least one, got none")

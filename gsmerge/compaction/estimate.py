@@ -41,8 +41,8 @@ from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
 
-COARSER = 0.5  # time of each coarser level, as a share of that of the result
-MAX_DRAWN_GAUSSIANS = 10_000  # sample of Gaussians by which the share inside a view is estimated
+COARSER = 0.5  # time of each coarser level, as a share of the time of the result
+MAX_DRAWN_GAUSSIANS = 10_000  # the share of Gaussians inside a view is estimated from a sample of this size
 
 
 def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
@@ -66,8 +66,8 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     choices = choose_for_scene(size, options)
     limits, settings = choices.limits, choices.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)
-    most = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
-    count = min(scene.num_gaussians or pixels, most)
+    max_count = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
+    count = min(scene.num_gaussians or pixels, max_count)
     at_once, num_rest = gaussians_at_once(pixels, choices.blocks), 3 * scene.gaussians.shN.shape[1]
     drawn = pixels if options.method == "unmerged-fit" else count
     threads, steps = options.threads or available_threads(), choices.fit.steps

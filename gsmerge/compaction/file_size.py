@@ -17,7 +17,7 @@ from gsmerge.types import Cameras, Gaussians
 
 NEAR_SHARE = 0.97  # share of the size that a build has to reach
 MOST_DROPPED = 0.08  # largest share of the Gaussians that is dropped after the last build
-ENOUGH = 0.985  # share of the size from which on no further Gaussian is put back
+ENOUGH = 0.985  # no further Gaussian is put back from this share of the size on
 SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
 TRIES, MAX_REBUILDS = 8, 2  # files that are measured to choose what is dropped; builds after the first one
 
@@ -36,51 +36,52 @@ def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras) -> int:
 def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan: Plan) -> Candidate:
     """Make a candidate as large as its file may be: rebuild it until it is near, then drop the faintest Gaussians.
 
-    A candidate without a size in bytes, or with one that follows from the count, stays unchanged.
+    Without a size in bytes, or if the size follows from the count, the candidate stays unchanged.
     """
     if plan.size is None or not plan.size.packed:
         return candidate
-    most, file = plan.size.num_bytes, plan.size.file
-    rest = measure_rest(candidate.gaussians, most, file, candidate.cameras)
+    max_bytes, file = plan.size.num_bytes, plan.size.file
+    rest = measure_rest(candidate.gaussians, max_bytes, file, candidate.cameras)
 
     def choose_next(built: Sequence[Candidate]) -> int | None:
         size, count = measure_bytes(built[-1].gaussians, file, built[-1].cameras), len(built[-1].gaussians)
-        # unseen Gaussians were dropped from the asked number: the bytes that they free are not filled up
-        asked = max(count, built[-1].count or 0)
-        whole = rest + (size - rest) * asked / max(count, 1)
-        room = min(int(SURPLUS * count * (most - rest) / max(size - rest, 1)), plan.limits.most)
-        fits = room >= (1 - MOST_DROPPED) * count and (whole >= NEAR_SHARE * most or room <= SURPLUS * asked)
+        # unseen Gaussians were dropped from the requested number; the bytes that they free are not filled up
+        requested = max(count, built[-1].count or 0)
+        full_size = rest + (size - rest) * requested / max(count, 1)  # bytes with the dropped Gaussians
+        room = min(int(SURPLUS * count * (max_bytes - rest) / max(size - rest, 1)), plan.limits.most)
+        is_near = full_size >= NEAR_SHARE * max_bytes or room <= SURPLUS * requested
+        fits = room >= (1 - MOST_DROPPED) * count and is_near
         return None if fits or len(built) > MAX_REBUILDS else room
 
     candidate = meet(rebuild, candidate, choose_next)[-1]
-    gaussians = drop_to_bytes(candidate.gaussians, most, file, candidate.cameras, rest)
+    gaussians = drop_to_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, rest)
     return candidate if len(gaussians) == len(candidate.gaussians) else shrink(candidate, gaussians, prepared, plan)
 
 
-def measure_rest(gaussians: Gaussians, most: int, file: Format, cameras: Cameras) -> int:
-    """Count the bytes of a file with one Gaussian; UsageError if they are more than ``most``."""
+def measure_rest(gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras) -> int:
+    """Count the bytes of a file with one Gaussian; UsageError if they are more than ``max_bytes``."""
     rest = measure_bytes(gaussians[:1], file, cameras)
-    if rest > most:
+    if rest > max_bytes:
         problem = f"expected at least {human_bytes(rest)} for a {file.ending} with one Gaussian"
-        raise UsageError(f"budget: {problem}, got {human_bytes(most)}")
+        raise UsageError(f"budget: {problem}, got {human_bytes(max_bytes)}")
     return rest
 
 
-def drop_to_bytes(gaussians: Gaussians, most: int, file: Format, cameras: Cameras, rest: int) -> Gaussians:
-    """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes.
+def drop_to_bytes(gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras, rest: int) -> Gaussians:
+    """Keep as many of the largest and most opaque Gaussians as fit into ``max_bytes``.
 
     ``rest``: bytes of a file with one Gaussian.
     """
     low, high = 0, len(gaussians)  # counts: the largest that is known to fit, and the largest that may fit
     best, count = gaussians[:0], len(gaussians)
     for _ in range(TRIES):
-        tried = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
-        size = measure_bytes(tried, file, cameras)
-        if size <= most:
-            low, best = count, tried
+        trial = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
+        size = measure_bytes(trial, file, cameras)
+        if size <= max_bytes:
+            low, best = count, trial
         else:
             high = count - 1
-        if low == len(gaussians) or (low and ENOUGH * most <= size <= most) or low >= high:
+        if low == len(gaussians) or (low and ENOUGH * max_bytes <= size <= max_bytes) or low >= high:
             break
-        count = min(max(low + 1, int(count * ((1 + ENOUGH) / 2 * most - rest) / max(size - rest, 1))), high)
+        count = min(max(low + 1, int(count * ((1 + ENOUGH) / 2 * max_bytes - rest) / max(size - rest, 1))), high)
     return best

@@ -82,8 +82,8 @@ def compact_files(
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras if len(load.scene) else None
-        is_kept = cameras_path is not None and cameras_path.exists() and not outputs.overwrite
-        if cameras_path is not None and is_kept and named_cameras(cameras_path, names) is None:
+        keeps_cameras = cameras_path is not None and cameras_path.exists() and not outputs.overwrite
+        if cameras_path is not None and keeps_cameras and named_cameras(cameras_path, names) is None:
             raise other_cameras(cameras_path)  # before the long work
         read = perf_counter()
         with warnings.catch_warnings():

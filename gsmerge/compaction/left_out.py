@@ -19,7 +19,7 @@ from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.setting import piece_settings
 from gsmerge.types import Gaussians, PicturedScene
 
-LEAST_VIEWS = 4  # fewest views with photos: of fewer, too little is left when one is left out
+LEAST_VIEWS = 4  # fewest views with photos; of fewer views, too little would remain
 PART, MOST = 6, 3  # one of every PART views is left out at a time, and at most MOST views
 LEAST_SEEN = 0.02  # share of a left-out photo that the other views must cover
 
@@ -72,15 +72,15 @@ def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) ->
         prepared, input_scene=rest, scene=rest, reference=Reference(PHOTOS, every, every), repeated=every, moved=False,
         unseen=rest.gaussians[:0], agreement=None,
     )  # fmt: skip
-    chosen = subset(scene, views)
-    left_out = LeftOut(prepared_rest, scene_photos(chosen), cover(rest, chosen))
+    left_out_views = subset(scene, views)
+    left_out = LeftOut(prepared_rest, scene_photos(left_out_views), cover(rest, left_out_views))
     return left_out if (left_out.shares > LEAST_SEEN).any() else None
 
 
 def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
     """Return the mean of the scores ``[v]`` of left-out photos, weighted by the ``shares [v]`` that other views see.
 
-    Photos of which other views see almost nothing do not count.
+    A photo does not count if other views see almost nothing of it.
     """
     seen = shares > LEAST_SEEN
     return float(np.average(scores[seen], weights=shares[seen]))
@@ -89,17 +89,17 @@ def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
 def choose_views(views: Sequence[int]) -> tuple[list[int], list[int]]:
     """Choose views to leave out in each of two rounds: evenly spread among ``views``, without neighbours in a round."""
     count = min(MOST, max(1, len(views) // PART))
-    chosen = [views[place] for place in pick_views(len(views), 2 * count)]
-    return chosen[::2], chosen[1::2]
+    spread = [views[i] for i in pick_views(len(views), 2 * count)]
+    return spread[::2], spread[1::2]
 
 
 def can_leave_out(prepared: Prepared) -> bool:
     """Return whether views can be left out: enough of them have photos, and they have Gaussians of their own."""
     reference = prepared.reference
-    of_photos = reference.name == PHOTOS and len(reference.score_views) >= LEAST_VIEWS
-    return of_photos and prepared.scene.has_own_pixels
+    has_photos = reference.name == PHOTOS and len(reference.score_views) >= LEAST_VIEWS
+    return has_photos and prepared.scene.has_own_pixels
 
 
 def cover(rest: PicturedScene, views: PicturedScene) -> np.ndarray:
-    """Mark the pixels ``[v,h,w]`` of ``views`` that show surfaces which views of the ``rest`` see."""
+    """Mark the pixels ``[v,h,w]`` of ``views`` with surfaces that are also visible in views of the ``rest``."""
     return visible_pixels(context_points(rest, NEAR_PLANE), views.cameras, NEAR_PLANE, rest.cameras)

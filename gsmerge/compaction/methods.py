@@ -22,7 +22,7 @@ from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Gaussians, Scene
 
 Need = Literal["photos", "pixels"]
-COUNTS = names_of(CompactOptions, lambda one: one.counts)  # settings that decide the number of Gaussians
+COUNTS = names_of(CompactOptions, lambda setting: setting.counts)  # settings that decide the number of Gaussians
 
 
 @dataclass(frozen=True)

@@ -25,12 +25,12 @@ from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
 from gsmerge.types import PicturedScene, Pixels
 
-SIDE = 120  # the longer side of the small pictures is at least so many pixels long
-# Most steps of the fit. Fewer than 150 steps fit few views differently (gsmerge.fit.schedule.MANY_STEPS), and say less
+SIDE = 120  # the longer side of the small pictures has at least this many pixels
+# Most steps of the fit. Fits of few views differ below 150 steps (gsmerge.fit.schedule.MANY_STEPS), and predict less
 STEPS = 200
-# Small pictures have more detail in each pixel, so fewer Gaussians cost them more. The trial's share of Gaussians,
-# relative to the usual share, is that of the result to the power of LESS. On five captures at 1 % this lowers the error
-# of the estimated gain from 2.3 to 1.0 dB
+# Small pictures have more detail in each pixel, so they lose more with few Gaussians. The shares of the trial and of
+# the result are relative to the usual share. The trial's share is the result's share to the power of LESS. On five
+# captures at 1 % this lowers the error of the estimated gain from 2.3 to 1.0 dB
 USUAL, LESS = parse_share(SHARE), 0.3
 # OWN is the weight of the gain of own photos, where depth is confirmed; the rest is the weight of the trial's gain. It
 # was chosen on ten captures. On these and five others 80 % of the results lie within SPREAD dB of the estimate
@@ -40,7 +40,7 @@ OWN, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
 
 @dataclass(frozen=True)
 class NewViews(ExpectedScores):
-    """PSNR (dB) that new views of a scene are expected to have, estimated on so many ``views``."""
+    """Expected PSNR (dB) of new views of a scene, estimated on a number of ``views``."""
 
     views: int
 
@@ -56,7 +56,7 @@ class NewViews(ExpectedScores):
 
 @dataclass(frozen=True)
 class Trial:
-    """PSNR (dB) of small photos that short fits have not seen."""
+    """PSNR (dB) of small photos that short fits were not trained on."""
 
     own_before: float  # Rendered from all rows of the input
     before: float  # Rendered from the rows of other views
@@ -67,11 +67,11 @@ class Trial:
         """Predict the PSNR of new views of a result.
 
         ``own_before`` and ``own_after`` are the PSNR (dB) of its own photos, from the input and from the result;
-        ``confirmed`` is the share of confirmed depth. New views gain at most this share of the gain of own photos. The
-        input shows new views as much worse than own photos as in the trial.
+        ``confirmed`` is the share of confirmed depth. New views gain at most this share of the gain of own photos. From
+        the input, new views are assumed to be worse than own photos by the same difference as in the trial.
         """
-        most = confirmed * max(0.0, own_after - own_before)
-        gain = OWN * most + (1 - OWN) * min(self.after - self.before, most)
+        max_gain = confirmed * max(0.0, own_after - own_before)
+        gain = OWN * max_gain + (1 - OWN) * min(self.after - self.before, max_gain)
         before = own_before + self.before - self.own_before
         before, after, low, high = (round(psnr, 2) for psnr in (before, before + gain, gain - SPREAD, gain + SPREAD))
         return NewViews(before, after, low, high, self.views)  # rounded as in files
@@ -84,7 +84,7 @@ def trial_part(prepared: Prepared, plan: Plan) -> Part | None:
     scene, num_rounds = prepared.scene, len(choose_views(prepared.reference.score_views))
     pixels = scene.pixels_per_view / _reduction(scene) ** 2
     fits = fit_cost(min(STEPS, plan.fit.steps), pixels, USUAL * pixels * len(scene))
-    before, after = (num_rounds * each * pixels * len(scene) for each in (BEFORE, AFTER))
+    before, after = (num_rounds * cost * pixels * len(scene) for cost in (BEFORE, AFTER))
     return Part(before, num_rounds * fits, after, num_rounds)
 
 
@@ -93,15 +93,15 @@ def _has_trial(prepared: Prepared, plan: Plan) -> bool:
 
 
 def _reduction(scene: PicturedScene) -> int:
-    """Return by which factor the sides of the trial's pictures are shorter."""
+    """Return the factor by which the sides of the trial's pictures are shorter."""
     return max(1, max(scene.cameras.width, scene.cameras.height) // SIDE)
 
 
 def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> Trial | None:
-    """Measure in a trial what views gain that a fit of ``count`` Gaussians leaves out.
+    """Measure in a trial the PSNR of views that are left out of a fit, for a result of ``count`` Gaussians.
 
-    None with too few views or photos, or too many Gaussians. None also if views have no Gaussians of their own: then
-    the Gaussians still hold what the left-out photos showed, which makes the error 2 dB instead of 1.2, and the trial
+    Returns None with too few views or photos, or too many Gaussians. Returns None also if views have no Gaussians of
+    their own. Then the Gaussians still contain the left-out photos, so the error is 2 dB instead of 1.2, and the trial
     takes a quarter of a run's time.
     """
     scene = prepared.scene
@@ -117,20 +117,20 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     add_seconds({"new views": sum(record.seconds.values())})
     if not scores:
         return None
-    shares, *each = np.concatenate(scores, 1)
-    own, before, after = (mean_seen(psnr, shares) for psnr in each)
+    shares, *psnrs = np.concatenate(scores, 1)
+    own, before, after = (mean_seen(photo_psnrs, shares) for photo_psnrs in psnrs)
     return Trial(own, before, after, int((shares > LEAST_SEEN).sum()))
 
 
 def _score_round(left_out: LeftOut, small: PicturedScene, plan: Plan, build: Build, share: float) -> np.ndarray:
-    """Compact the rest with a short fit, and score it on the photos that are left out.
+    """Compact the remaining views with a short fit, and score the result on the left-out photos.
 
-    Returns ``[4,v]``: for each photo the share that the rest sees, and the PSNR (dB) of renders from all rows, from the
-    rows of the rest, and from the result.
+    Returns ``[4,v]`` for the photos: the share that the remaining views see, and the PSNR (dB) of renders from all
+    rows, from the rows of the remaining views, and from the result.
     """
     superpixels = max(1, round(share * small.pixels_per_view))
     short = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(STEPS, plan.fit.steps))
-    # views from outside the photos' region are of no use here: no photo shows what they see
+    # no photo shows the views from outside, so these cannot change the score
     inside = replace(short.fit, tuning=replace(short.fit.tuning, outside_from=1.0))
     compacted = build(left_out.rest, replace(short, fit=inside), None).gaussians
     drawn = small.file_gaussians, left_out.rows, compacted
@@ -149,10 +149,11 @@ def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
         None if values is None else values[middle] for values in (scene.masks, scene.empty, scene.importance)
     )
     fronts = scene.get_pixels().fronts[middle]
-    rows, chosen = fronts[fronts >= 0], scene.gaussians[fronts[fronts >= 0]]
+    rows = fronts[fronts >= 0]
+    gaussians = scene.gaussians[rows]
     return replace(
         scene, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=images, masks=masks,
         empty=empty, importance=importance, large_photos=None,
-        gaussians=replace(chosen, scales=chosen.scales * np.float32(step)), pixels=Pixels.of_grid(fronts >= 0),
+        gaussians=replace(gaussians, scales=gaussians.scales * np.float32(step)), pixels=Pixels.of_grid(fronts >= 0),
         filled=None if scene.filled is None else scene.filled[rows],
     )  # fmt: skip

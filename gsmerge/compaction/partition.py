@@ -125,12 +125,12 @@ def make_frustums(cameras: Cameras, depths: np.ndarray) -> Frustums:
     return Frustums(matmul(normals, viewmats), (1 + SAME_DEPTH) * depths.max((1, 2)))
 
 
-def split_points(points: np.ndarray, most: int) -> Iterator[np.ndarray]:
-    """Yield the rows of ``points [n,3]`` in groups of at most ``most`` that lie close to each other."""
+def split_points(points: np.ndarray, max_size: int) -> Iterator[np.ndarray]:
+    """Yield the rows of ``points [n,3]`` in groups of at most ``max_size`` points that lie close to each other."""
     groups = [np.arange(len(points))] if len(points) else []
     while groups:
         rows = groups.pop()
-        if len(rows) <= most:
+        if len(rows) <= max_size:
             yield rows
             continue
         values = points[rows]
@@ -231,14 +231,14 @@ def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """
     labels, count = labels.copy(), int(labels.max()) + 1
     mean = len(labels) / count
-    least, most = int(np.floor((1 - SLACK) * mean)), int(np.ceil((1 + SLACK) * mean))
+    min_size, max_size = int(np.floor((1 - SLACK) * mean)), int(np.ceil((1 + SLACK) * mean))
     for _ in range(SWEEPS):
         moved = False
         for view in range(len(labels)):
             ties = np.bincount(labels, weights[view], count)
             sizes, label = np.bincount(labels, minlength=count), labels[view]
-            is_better = (sizes < most) & (ties > ties[label])
-            if sizes[label] > max(1, least) and is_better.any():
+            is_better = (sizes < max_size) & (ties > ties[label])
+            if sizes[label] > max(1, min_size) and is_better.any():
                 labels[view] = int(np.where(is_better, ties, -np.inf).argmax())
                 moved = True
         if not moved:
@@ -249,8 +249,8 @@ def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
 def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence[int]) -> np.ndarray:
     """Return the owner ``[n]`` of each point ``[n,3]``: the nearest of the ``views`` that see the point.
 
-    If no view sees the point, its owner is the nearest view with the point inside its picture; if there is none, the
-    nearest view.
+    If no view sees the point, its owner is the nearest view with the point inside its picture. If no picture contains
+    the point, its owner is the nearest view.
     """
     cameras, depths = covisibility.cameras[list(views)], covisibility.depths[list(views)]
     centres, frustums = camera_centres(cameras.viewmats.astype(np.float64)), make_frustums(cameras, depths)
@@ -259,13 +259,13 @@ def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence
     def find_owners(rows: np.ndarray) -> np.ndarray:
         owners, ownerless = np.zeros(len(rows), np.int64), np.arange(len(rows))
         for condition in ("seen", "inside", "any"):
-            part = points[rows[ownerless]]
+            remaining = points[rows[ownerless]]
             candidates = np.arange(len(views))
             if condition != "any":
-                candidates = frustums.reached_by(part, hidden=condition == "inside")
-            squares = np.square(part - centres[candidates][:, None]).sum(-1)
+                candidates = frustums.reached_by(remaining, hidden=condition == "inside")
+            squares = np.square(remaining - centres[candidates][:, None]).sum(-1)
             if condition != "any":
-                seen, inside = see(part, cameras[candidates], depths[candidates])
+                seen, inside = see(remaining, cameras[candidates], depths[candidates])
                 squares[~(seen if condition == "seen" else inside)] = np.inf
             is_owned = np.isfinite(squares).any(0)
             if is_owned.any():

@@ -19,13 +19,15 @@ from gsmerge.runtime.record import add_seconds, begin_part, choose, record_part,
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-FOREIGN = 0.1  # share of a Gaussian's weights in views of other blocks from which on it is at a seam
-SEAM_SHARE = 0.1  # share of a view's weights on Gaussians at seams from which on these are fitted to the view
+FOREIGN = 0.1  # a Gaussian is at a seam if more than this share of its weights is in views of other blocks
+SEAM_SHARE = 0.1  # seams are fitted to a view if more than this share of its weights is on Gaussians at seams
 SEAM_STEPS = 100  # fewest steps of the fit
 SEAM_VIEW_STEPS = 2  # steps for each view
-# Share of Gaussians at seams from which on the blocks are one room, and the steps for each view then
+# Blocks are parts of one room if at least the share ROOM_SHARE of the Gaussians is at seams. Then each view gets
+# ROOM_VIEW_STEPS steps
 ROOM_SHARE, ROOM_VIEW_STEPS = 0.5, 4
-# Step sizes, relative to the usual first ones: the Gaussians are fitted already, but beside older neighbours
+# Step sizes relative to the usual start: they are smaller, because the Gaussians are fitted already, but beside older
+# neighbours
 SEAM_RATE = 0.6
 SEAM_DECAY = 0.1  # factor on the step sizes at the end
 
@@ -74,23 +76,27 @@ def find_seams(
         total += weights
         foreign += np.where(owners == number, 0, weights)
     at_seam = foreign > FOREIGN * total
-    for number, view, weights in _view_weights(splats, starts):  # again: those of all views would not fit into memory
-        seam_weight, weight = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam], weights))
-        if view in starts[number].prepared.reference.fit_views and seam_weight > SEAM_SHARE * weight:
+    # measured a second time, because the weights of all views would not fit into memory
+    for number, view, weights in _view_weights(splats, starts):
+        seam_weight, view_weight = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam], weights))
+        if view in starts[number].prepared.reference.fit_views and seam_weight > SEAM_SHARE * view_weight:
             views[number].append(view)
     return at_seam, views
 
 
-def join_views(chosen: Sequence[tuple[PicturedScene, list[int]]]) -> PicturedScene:
-    """Join the ``chosen`` views of several scenes without Gaussians into one scene; many photos are kept in a file."""
-    total, cameras = sum(len(ids) for _, ids in chosen), chosen[0][0].cameras
-    images, first = make_array((total, cameras.height, cameras.width, 3), np.float32), 0
-    for scene, ids in chosen:
+def join_views(scene_views: Sequence[tuple[PicturedScene, list[int]]]) -> PicturedScene:
+    """Join views of several scenes without Gaussians into one scene; many photos are kept in a file.
+
+    ``scene_views`` are pairs of a scene and the ids of its views.
+    """
+    total, cameras = sum(len(ids) for _, ids in scene_views), scene_views[0][0].cameras
+    images, count = make_array((total, cameras.height, cameras.width, 3), np.float32), 0
+    for scene, ids in scene_views:
         for view in ids:
-            images[first] = scene.images[view]
-            first += 1
+            images[count] = scene.images[view]
+            count += 1
         free_pages([scene.images, images])
-    joined = concat_scenes([subset(scene.without_pictures(), ids) for scene, ids in chosen], images)
+    joined = concat_scenes([subset(scene.without_pictures(), ids) for scene, ids in scene_views], images)
     return PicturedScene.with_pictures(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
 
 
@@ -101,7 +107,7 @@ def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tupl
     """
     for number, start in enumerate(starts):
         own_views, repeated = set(start.block.own), start.prepared.repeated
-        views = sorted({repeated[place] for place, view in enumerate(start.block.views) if view in own_views})
+        views = sorted({repeated[i] for i, view in enumerate(start.block.views) if view in own_views})
         photos = blank_photos(start.prepared.scene.cameras[views], 2)
 
         def weights_of(view: int, photos: Photos = photos) -> np.ndarray:

@@ -197,7 +197,11 @@ class CountSearch:
 
 def psnr_by_count(candidates: Sequence[Candidate]) -> dict[int, float]:
     """Return the deciding PSNR (dB) of each candidate by its count, in the order of the candidates."""
-    return {candidate.count: candidate.deciding_psnr or 0.0 for candidate in candidates if candidate.count is not None}
+    psnrs = dict[int, float]()
+    for candidate in candidates:
+        if candidate.count is not None:
+            psnrs[candidate.count] = candidate.deciding_psnr or 0.0
+    return psnrs
 
 
 def add_target(plan: Plan, prepared: Prepared) -> Plan:

@@ -72,9 +72,9 @@ def _weigh_view(
     shown.reshape(-1)[pixels[inside]] = True
     level = choose_level(shown, REACH * float(np.sqrt(np.median(np.abs(areas[:: max(1, len(areas) // SAMPLE)])))))
     order, (cells, shape) = order_by_depth(depths), _cells_of(pixels, fronts.shape, level)
-    cell_grid = np.empty(shape, np.int32)
-    weights = weigh_centres(order, ids, cells, areas, opacities, cell_grid)  # fills `cell_grid`
-    cell_fronts = cell_grid.reshape(-1)
+    grid_fronts = np.empty(shape, np.int32)
+    weights = weigh_centres(order, ids, cells, areas, opacities, grid_fronts)  # fills `grid_fronts`
+    cell_fronts = grid_fronts.reshape(-1)
     front_depths = depths[np.searchsorted(ids, cell_fronts).clip(max=len(ids) - 1)]
     max_depths = SAME_DEPTH * np.where(cell_fronts >= 0, front_depths, np.inf)
     weigh_centres(order[(depths <= max_depths[cells])[order]], ids, pixels, areas, opacities, fronts)  # fills `fronts`

@@ -84,8 +84,8 @@ class NetworkContext(Corrector):
         if not options.merger:
             return pooled
         if options.merger_start == "first":
-            first = {name: getattr(parts, name)[order[cuts]] for name in OWN_COLUMNS}
-            pooled = replace(pooled, **first)
+            first_columns = {name: getattr(parts, name)[order[cuts]] for name in OWN_COLUMNS}
+            pooled = replace(pooled, **first_columns)
         group_features, base = self.describe(pooled), self.make_base(parts)
         sizes, seeds = np.diff(np.append(cuts, len(order))), point_seeds(as_array(pooled.means), self.seed)
         from_means, means = as_array(parts.means), as_array(pooled.means)
@@ -118,8 +118,8 @@ class NetworkContext(Corrector):
             mask = ids >= 0
             ids = np.where(mask, ids, owners)
             relative = self.make_tokens(group_features.base, ids, owners, group_features)
-            same = (views[ids] == views[owners]).astype(np.float32)[:, None]
-            tokens = concat_columns([relative, same, features.latents[ids]]).reshape(len(rows), width, -1)
+            is_same_view = (views[ids] == views[owners]).astype(np.float32)[:, None]
+            tokens = concat_columns([relative, is_same_view, features.latents[ids]]).reshape(len(rows), width, -1)
             return self.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
 
         max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent
@@ -163,9 +163,9 @@ class NetworkContext(Corrector):
             outputs = parallel_map(lambda table: run(*table), tables)
         else:
             outputs = [run(*table) for table in tables]
-        places = np.empty(len(sizes), np.int64)
-        places[np.concatenate([rows for rows, _ in tables])] = np.arange(len(sizes))
-        return concat_rows(outputs)[places]
+        output_rows = np.empty(len(sizes), np.int64)  # row of each group in the joined outputs of the tables
+        output_rows[np.concatenate([rows for rows, _ in tables])] = np.arange(len(sizes))
+        return concat_rows(outputs)[output_rows]
 
 
 def encode_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
@@ -184,8 +184,8 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
         offsets = context.members.means[ids[positions]] - means[rows[owners]]
         keys = (offsets * axes[rows[owners]]).sum(1)
         sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
-        chosen = ids[positions][sample.reshape(-1)]
-        tokens = context.make_tokens(context.members, chosen, np.repeat(rows, width), group_features)
+        member_ids = ids[positions][sample.reshape(-1)]
+        tokens = context.make_tokens(context.members, member_ids, np.repeat(rows, width), group_features)
         table = tokens.reshape(*mask.shape, MEMBER)
         return context.networks.run("encoder", table, mask, group_features.group[rows])
 
@@ -252,19 +252,20 @@ def run_heads(
     """Compute bounded corrections ``[n,13]`` of children; zero if there is no head for their number."""
     options = context.options
     count, halves = len(group_features.features), options.max_children > SLOTS[-1]
-    first, sizes, owners = _split_siblings(parents, count, halves=halves)
-    outputs, places, total = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
-    for slots, fewest in zip(SLOTS, (1, 2, 3), strict=True):
-        rows = np.flatnonzero((sizes >= fewest) & (sizes <= slots))
+    starts, sizes, owners = _split_siblings(parents, count, halves=halves)
+    # row 0 of the outputs is zero; children without a head keep it
+    outputs, output_rows, total = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
+    for slots, min_size in zip(SLOTS, (1, 2, 3), strict=True):
+        rows = np.flatnonzero((sizes >= min_size) & (sizes <= slots))
         if len(rows) == 0:
             continue
         offsets = np.arange(slots)[None]
         mask = offsets < sizes[rows, None]
-        ids = first[rows, None] + np.where(mask, offsets, 0)
+        ids = starts[rows, None] + np.where(mask, offsets, 0)
         outputs.append(_run_head(children, (owners[rows], ids, mask), group_features, context))
-        places[ids[mask]] = total + np.flatnonzero(mask)
+        output_rows[ids[mask]] = total + np.flatnonzero(mask)
         total += mask.size
-    return scale_outputs(concat_rows(outputs)[places], WIDE if options.makes_children else options.bounds)
+    return scale_outputs(concat_rows(outputs)[output_rows], WIDE if options.makes_children else options.bounds)
 
 
 def _split_siblings(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -273,12 +274,12 @@ def _split_siblings(parents: np.ndarray, count: int, *, halves: bool) -> tuple[n
     With ``halves``, the children of a parent with more than four are split into two runs.
     """
     sizes = np.bincount(parents, minlength=count)
-    first = np.cumsum(sizes) - sizes
-    large = (sizes > SLOTS[-1]) & halves
-    half = np.where(large, (sizes + 1) // 2, sizes)
-    begin = np.concatenate([first, (first + half)[large]])
-    num = np.concatenate([half, (sizes - half)[large]])
-    return begin, num, np.concatenate([np.arange(count), np.flatnonzero(large)])
+    starts = np.cumsum(sizes) - sizes
+    is_split = (sizes > SLOTS[-1]) & halves
+    first_sizes = np.where(is_split, (sizes + 1) // 2, sizes)
+    run_starts = np.concatenate([starts, (starts + first_sizes)[is_split]])
+    run_sizes = np.concatenate([first_sizes, (sizes - first_sizes)[is_split]])
+    return run_starts, run_sizes, np.concatenate([np.arange(count), np.flatnonzero(is_split)])
 
 
 def _run_head(

@@ -35,43 +35,44 @@ def cross_view_stats(
     number of all views.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
-    stats[:, 6] = math.log(len(cameras)) / 4
+    stats[:, -1] = math.log(len(cameras)) / 4
     if len(means) == 0:
         return stats
     points, colors = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(SH_C0 * sh0[:, 0])
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
     size, limits = (cameras.width, cameras.height), (SH_C0, NEAR_LOG, FAR, MIN_OPACITY)
     sums, m = np.zeros((len(points), COLUMNS)), members
-    asked = np.sort(order_others(camera_distances(cameras))[:, :most], 1).astype(np.int32)
+    neighbors = np.sort(order_others(camera_distances(cameras))[:, :most], 1).astype(np.int32)
 
-    def add(first: int) -> None:
-        last = min(first + ROWS, len(points))
+    def add_sums(begin: int) -> None:
+        end = min(begin + ROWS, len(points))
         sum_cross_view(
-            points, colors, views, asked, viewmats, Ks, *size, m.fronts, m.means, m.opacities, m.sh0, *limits, first,
-            last, sums,
+            points, colors, views, neighbors, viewmats, Ks, *size, m.fronts, m.means, m.opacities, m.sh0, *limits,
+            begin, end, sums,
         )  # fmt: skip
 
-    parallel_map(add, range(0, len(points), ROWS))
-    num_seen, num_same = np.maximum(sums[:, 0], 1), np.maximum(sums[:, 1], 1)
-    shares = [sums[:, 1] / num_seen, sums[:, 2] / num_seen, sums[:, 3] / num_seen, sums[:, 4] / num_same]
-    stats[:, :6] = np.stack([log(1 + sums[:, 0]) / 3, *shares, sums[:, 5] / num_seen / FAR], 1)
+    parallel_map(add_sums, range(0, len(points), ROWS))
+    seen, same, behind, in_front, color_differences, depth_differences = sums.T
+    num_seen, num_same = np.maximum(seen, 1), np.maximum(same, 1)
+    shares = [same / num_seen, behind / num_seen, in_front / num_seen, color_differences / num_same]
+    stats[:, :-1] = np.stack([log(1 + seen) / 3, *shares, depth_differences / num_seen / FAR], 1)
     return stats
 
 
 def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
     """Find the nearest points of other views, ``[g,count]`` int64, nearest first (paper section 4.4).
 
-    The result is -1 if there are fewer. The search ends after ``MAX_COMPARED`` times ``count`` nearer points, at least
-    1,024. Most of these are of the own view, and Gaussians behind them do not overlap. Points are ``means [g,3]``
-    float64, finite. A view below 0 counts as different from all others.
+    If there are fewer than ``count``, the result is filled with -1. The search ends after ``MAX_COMPARED`` times
+    ``count`` nearer points, at least 1,024. Most of these belong to the point's own view, and Gaussians behind them do
+    not overlap. Points are ``means [g,3]`` float64, finite. A view below 0 counts as different from all others.
     """
     num = len(means)
     neighbors, means = np.empty((num, count), np.int64), np.ascontiguousarray(means)
-    most = MAX_COMPARED * max(count, MIN_NEIGHBORS)
+    max_compared = MAX_COMPARED * max(count, MIN_NEIGHBORS)
     order, axes, splits = make_tree(means)
     with use_threads() as threads:
         parallel_map(
-            lambda span: nearest_of_others(means, views, order, axes, splits, *span, most, neighbors),
+            lambda span: nearest_of_others(means, views, order, axes, splits, *span, max_compared, neighbors),
             pieces(num, threads),
         )
     return neighbors

@@ -86,7 +86,7 @@ def _viewmats(cameras: Cameras) -> np.ndarray:
 
 
 def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
-    """Choose a view ``[g]`` int64 for each Feature Gaussian: its own or, if merged, that with most summed opacity."""
+    """Choose a view ``[g]`` int64 for each Feature Gaussian: its own, or after merging the view of most opacity."""
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)
     if len(merged) == 0:
@@ -126,15 +126,15 @@ def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray
     for width in np.unique(widths):
         rows = np.flatnonzero(widths == width)
         step = max(1, TOKENS // int(width))
-        for first in range(0, len(rows), step):
-            yield rows[first : first + step], int(width)
+        for start in range(0, len(rows), step):
+            yield rows[start : start + step], int(width)
 
 
 def group_rows(begins: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the positions of all members of groups that start at ``begins [g]``, and the group of each."""
     owners = np.repeat(np.arange(len(sizes)), sizes)
-    first = np.cumsum(sizes) - sizes
-    return np.arange(len(owners)) - first[owners] + begins[owners], owners
+    offsets = np.cumsum(sizes) - sizes
+    return np.arange(len(owners)) - offsets[owners] + begins[owners], owners
 
 
 def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -145,7 +145,7 @@ def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.nd
     ``seeds [g]`` uint64, so the sample covers the group (paper supplement, encoder compute). Returns positions
     ``[g,width]`` in ``keys``, and a mask of the valid positions; the others repeat the first one of the group.
     """
-    first = np.cumsum(sizes) - sizes
+    offsets = np.cumsum(sizes) - sizes
     order = np.lexsort((keys, np.repeat(np.arange(len(sizes)), sizes)))
     slots = np.arange(width)[None]
     large = (sizes > width)[:, None]
@@ -154,7 +154,7 @@ def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.nd
     draws = low + np.floor(hash_uniform(seeds[:, None], slots.astype(np.uint64)) * (high - low)).astype(np.int64)
     within = np.where(large, draws, np.minimum(slots, sizes[:, None] - 1))
     mask = large | (slots < sizes[:, None])
-    return order[first[:, None] + np.where(mask, within, 0)], mask
+    return order[offsets[:, None] + np.where(mask, within, 0)], mask
 
 
 def hash_uniform(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:

@@ -68,12 +68,13 @@ class NetworkWeights:
         return self._run_refiner(*inputs) if name == "refiner" else self._run_set_network(name, *inputs)
 
     def _run_set_network(self, name: str, tokens: np.ndarray, mask: np.ndarray, group: np.ndarray) -> np.ndarray:
-        part = f"{name}.set"
-        x = self._mlp(f"{part}.embed", tokens)
+        """Run the encoder or the merger: embed the tokens of a set, let them attend, pool them, and join the group."""
+        set_name = f"{name}.set"
+        x = self._mlp(f"{set_name}.embed", tokens)
         for i in range(self.options.blocks):
-            x = self._block(f"{part}.blocks.{i}", x, mask)
-        pooled = self._pool(f"{part}.pool", x, mask)
-        hidden = self._mlp(f"{part}.join", np.concatenate([pooled, group], 1), GELU)
+            x = self._block(f"{set_name}.blocks.{i}", x, mask)
+        pooled = self._pool(f"{set_name}.pool", x, mask)
+        hidden = self._mlp(f"{set_name}.join", np.concatenate([pooled, group], 1), GELU)
         outs = ("latent", "shift") if name == "encoder" else ("out",)
         return np.concatenate([self._dense(f"{name}.{out}", hidden, TANH) for out in outs], 1)
 
@@ -81,7 +82,7 @@ class NetworkWeights:
         x = self._mlp("refiner.embed", tokens)
         last = self.options.refine_blocks - 1
         for i in range(last + 1):
-            x = self._block(f"refiner.blocks.{i}", x, mask, first=i == last)
+            x = self._block(f"refiner.blocks.{i}", x, mask, first_token_only=i == last)
         first_token = self._norm("refiner.norm", x[:, 0])
         hidden = self._mlp("refiner.join", np.concatenate([first_token, group], 1), GELU)
         return self._dense("refiner.out", hidden, TANH)
@@ -97,10 +98,10 @@ class NetworkWeights:
         x = self._norm(f"{name}.norm", self._block(f"{name}.block", x, mask))
         return self._dense(f"{name}.out", x, TANH).reshape(len(children), -1)
 
-    def _block(self, name: str, x: np.ndarray, mask: np.ndarray, *, first: bool = False) -> np.ndarray:
-        """Run attention and an MLP; with ``first`` only for the first token."""
+    def _block(self, name: str, x: np.ndarray, mask: np.ndarray, *, first_token_only: bool = False) -> np.ndarray:
+        """Run attention and an MLP, for all tokens or for the first token only."""
         context = self._norm(f"{name}.before", x)
-        x, query = (x[:, :1], context[:, :1]) if first else (x, context)
+        x, query = (x[:, :1], context[:, :1]) if first_token_only else (x, context)
         x = self._attention(f"{name}.attention", query, context, mask, x)
         return self._mlp(f"{name}.mlp", self._norm(f"{name}.between", x), residual=x)
 
@@ -154,15 +155,15 @@ class NetworkWeights:
         weight, bias = self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
         width, heads = self.options.width, self.options.heads
         size = width // heads
-        places = np.arange(width) // size * padded(size) + np.arange(width) % size
+        padded_columns = np.arange(width) // size * padded(size) + np.arange(width) % size
         if name.endswith("attention.pair"):
-            places = np.concatenate([np.arange(width), width + places])
+            padded_columns = np.concatenate([np.arange(width), width + padded_columns])
             columns = width + heads * padded(size)
             wide, shift = np.zeros((columns, width), np.float32), np.zeros(columns, np.float32)
-            wide[places], shift[places] = weight, bias
+            wide[padded_columns], shift[padded_columns] = weight, bias
             weight, bias = wide, shift
         elif name.endswith("attention.out"):
             wide = np.zeros((width, heads * padded(size)), np.float32)
-            wide[:, places] = weight
+            wide[:, padded_columns] = weight
             weight = wide
         return *pack(weight, bias), len(bias)

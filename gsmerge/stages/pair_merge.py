@@ -16,7 +16,7 @@ from gsmerge.kernels.elementary import log
 from gsmerge.kernels.elementary import power as power_of
 from gsmerge.kernels.gaussians.cross_view import make_tree
 from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments, merge_pairs
-from gsmerge.pooling import MAX_OPACITY, principal_axes
+from gsmerge.pooling import FULL_MATRIX, MAX_OPACITY, principal_axes
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians
@@ -32,7 +32,6 @@ FLATNESS = 0.01  # least scale, relative to the largest, so that the logarithm o
 MIN_OPACITY = 1e-4  # least opacity of Gaussians that are merged, so that masses stay positive
 WIDER = 0.05  # most growth of scales for each doubling of the merged number; without it gaps would open
 CELLS_PER_TASK = 256
-FULL_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # entries of an upper triangle xx xy xz yy yz zz in a flattened 3 x 3 matrix
 NEXT_AXIS = [1, 2, 0]  # the axis after each axis, so that products with it cover the three pairs of axes
 
 
