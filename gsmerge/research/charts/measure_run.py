@@ -204,9 +204,9 @@ class ChartRun:
         if num_views is not None and num_views > len(scene):
             raise ValueError(f"expected at most {len(scene)} views, got {num_views}")
         part, targets = choose_views(scene, held_out, num_views)
-        if is_input:
-            gaussians, facts = part.file_gaussians, {"seconds": 0.0}
-        else:
+        facts: dict[str, Any] = {"seconds": 0.0}
+        gaussians = part.file_gaussians
+        if not is_input:
             self._warm_up(scene, threads)
             gaussians, facts = self._merge(part, threads)
         options = replace(self.measured, threads=threads)
