@@ -205,9 +205,8 @@ class ChartRun:
             raise ValueError(f"expected at most {len(scene)} views, got {num_views}")
         part, targets = choose_views(scene, held_out, num_views)
         facts: dict[str, Any] = {"seconds": 0.0}
-        if is_input:
-            gaussians = part.file_gaussians
-        else:
+        gaussians = part.file_gaussians
+        if not is_input:
             self._warm_up(scene, threads)
             gaussians, facts = self._merge(part, threads)
         options = replace(self.measured, threads=threads)

@@ -179,7 +179,8 @@ def _bleed(depth: Array, near_edge: Float, noise: Noise) -> Array:
 
 def _wrong_patches(blank: Float, noise: Noise, rng: np.random.Generator) -> Float:
     """Draw patches ``[h,w]`` of wrong depth, 0 to 1, more likely where the photo is ``blank``."""
-    field = smooth_noise(rng, len(blank), blank.shape[1], int(rng.integers(5, 12))) + noise.blank * blank
+    height, width = blank.shape
+    field = smooth_noise(rng, height, width, int(rng.integers(5, 12))) + noise.blank * blank
     limit = np.float32(np.quantile(field.astype(np.float64), 1 - noise.patches))
     return np.clip((field - limit) / 0.3, 0, 1) if noise.patches > 0 else np.zeros_like(field)
 

@@ -119,9 +119,8 @@ def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
     corners = matmul(half[:, None] * signs, shapes.rotations.swapaxes(1, 2)) + shapes.centres[:, None]
     local = matmul(corners - c2w[:3, 3], c2w[:3, :3])
-    edges = np.array(
-        [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
-    )  # pairs that differ in one bit
+    # Corners whose numbers differ in one bit share an edge
+    edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
     a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
     with np.errstate(divide="ignore", invalid="ignore"):  # edges that are parallel to the plane do not cross it
         crossing = a + (b - a) * ((NEAR_PLANE - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))

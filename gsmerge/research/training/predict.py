@@ -39,7 +39,7 @@ from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
 
 TINY = 1e-12  # world units
-CONSTANT = slice(6, 8)  # columns of a group that have no gradient: its summed weights and its number of members
+CONSTANT = slice(6, 8)  # columns of a group without a gradient: log of the number of members, and their mean weight
 MIN_GAP = 1e-3  # least difference of two squared scales in the gradient of axes, over the largest squared scale
 
 
@@ -120,9 +120,8 @@ def _differentiate_frames(means: Tensor, viewmats: Tensor, values: np.ndarray) -
     right = normalize(across, dim=1)
     computed = torch.stack([right, torch.linalg.cross(away, right), away], 2)
     is_stable = (across.norm(dim=1) > 1e-3)[:, None, None]
-    return torch.where(
-        is_stable, frames + computed - computed.detach(), frames
-    )  # the values of frames, with a gradient
+    # ``computed`` gives the gradient, but does not change the values
+    return torch.where(is_stable, frames + computed - computed.detach(), frames)
 
 
 def differentiate_tokens(
@@ -135,9 +134,8 @@ def differentiate_tokens(
     pixels = torch.from_numpy(g.footprints)[owner_ids].clamp_min(TINY)
     local = rotate_vectors(back, selected.means - g.base.means[owner_ids]) / g.sizes[owner_ids, None]
     ordered = selected.scales.sort(-1).values.clamp_min(TINY)
-    normals = quat_to_rotmat(selected.quats).gather(2, selected.scales.argmin(1)[:, None, None].expand(-1, 3, 1))[
-        ..., 0
-    ]
+    shortest = selected.scales.argmin(1)[:, None, None].expand(-1, 3, 1)
+    normals = quat_to_rotmat(selected.quats).gather(2, shortest)[..., 0]
     facing = rotate_vectors(back, normals)
     flat = -(1 - ordered[:, 0] / ordered[:, 1]) * facing[:, 2].sign()
     colors = SH_C0 * (selected.sh0 - g.base.sh0[owner_ids])[:, 0]
