@@ -42,8 +42,14 @@ def list_cameras(source: CameraSource) -> list[Entry]:
 
 def _sensor_values(sensor: Element) -> dict[str, Any]:
     """Return size, intrinsics and lens of a sensor, from its adjusted calibration if there is one."""
-    calibration = max(sensor.findall("calibration"), key=lambda entry: entry.get("class") == "adjusted")
-    size = [*calibration.findall("resolution"), *sensor.findall("resolution")][0].attrib
+    calibrations = sensor.findall("calibration")
+    if not calibrations:
+        raise ValueError("no calibration")
+    calibration = max(calibrations, key=lambda entry: entry.get("class") == "adjusted")
+    sizes = [*calibration.findall("resolution"), *sensor.findall("resolution")]
+    if not sizes:
+        raise ValueError("no resolution")
+    size = sizes[0].attrib
     numbers = {child.tag: float(child.text or "") for child in calibration if child.tag != "resolution"}
     values: dict[str, Any] = {key: numbers[key] for key in ("cx", "cy", "k1", "k2", "k3", "k4") if key in numbers}
     # p1 and p2 are OpenCV's p2 and p1
