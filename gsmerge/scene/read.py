@@ -544,9 +544,8 @@ def _make_scene(
     views, camera_names = list(result.views), _camera_names(result)
     gaussians, pixels = take_gaussians(ply, result)
     num_faint = int(ply.valid.sum()) - len(gaussians)
-    notes = (
-        [count_words(num_faint, "Gaussian", "fainter than 1/255, which nothing draws, set aside")] if num_faint else []
-    )
+    faint = "fainter than 1/255, which nothing draws, set aside"
+    notes = [count_words(num_faint, "Gaussian", faint)] if num_faint else []
     cameras, images = result.cameras, result.images
     if views != list(range(len(cameras))):
         cameras, images = cameras[views], images[views] if len(images) else images
