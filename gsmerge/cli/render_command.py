@@ -160,7 +160,7 @@ def _check_layer(args: opt.Args, suffix: str) -> bool:
         raise UsageError(f"{option}: expected one scene, got {len(args.scenes)}")
     if suffix and suffix not in endings:
         expected = f"expected a folder or {opt.join_words(endings)} with {option}"
-        reason = "has no transparency" if channel == "color" else f"cannot hold {channel}"
+        reason = "is written without transparency" if channel == "color" else f"cannot hold {channel}"
         raise UsageError(f"{args.output}: {expected}, got {suffix}, which {reason}")
     return True
 
