@@ -230,3 +230,7 @@ def test_a_film_is_no_folder_of_photos(smallest_scene: Path, tmp_path: Path, run
     (tmp_path / "a.mov").write_bytes(b"\0")
     outcome = run("compact", smallest_scene, "--images", tmp_path / "a.mov", "-o", tmp_path / "a.ply", code=3)
     assert "found a film; save the frames" in outcome.err
+
+
+def test_words_for_a_number(run: Run) -> None:
+    assert_refused(run("compact", "a.ply", "--threads", "two"), 2, "--threads", "expected a whole number, got 'two'")
