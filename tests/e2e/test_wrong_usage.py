@@ -114,7 +114,7 @@ USAGE = {
     "lab chart -o out room --set lpips=some": "lpips*'some'",
     "lab chart -o room/scene.ply room": "--output*room/scene.ply",
     "lab chart -o room room": "room*results",
-    "lab generate -o out --views many": "--views*integer",
+    "lab generate -o out --views many": "--views*whole number*'many'",
     "lab generate -o out --size large": "--size*320x240*'large'",
     "lab generate -o out --set noise=loud": "--set noise*10*'loud'",
     "lab train -o out": "*'--data'",
