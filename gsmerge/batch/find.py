@@ -17,6 +17,7 @@ from gsmerge.io.formats.table import STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import natural_order
 from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
 from gsmerge.scene.no_gaussians import find_remedy
+from gsmerge.words import count_words
 
 NamedScene = tuple[Path, Path | None]  # a scene, and the folder that the user named; None if that was the scene itself
 MAX_FOLDERS = 100_000  # folders without a scene after the last scene; a link into a system's folders leads to more
@@ -211,7 +212,7 @@ def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:
                 file, "expected a list of scenes, one path per line, found JSON", "name the folder of the scene"
             )
         lines[line.strip()] = None
-        budget.check_memory(_JOB_BYTES * len(lines), f"{len(lines):,} scenes")
+        budget.check_memory(_JOB_BYTES * len(lines), count_words(len(lines), "scene"))
     for entry in lines:
         if not entry or entry.startswith("#"):
             continue

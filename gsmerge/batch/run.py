@@ -28,7 +28,8 @@ from gsmerge.report import file_sha256, finite
 from gsmerge.runtime.memory import free_memory
 from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.threads import available_threads
-from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, LostProcess, RayPool, WorkerPool
+from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, RayPool, WorkerPool
+from gsmerge.words import count_words
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory, for all scenes that run at the same time by default
 
@@ -41,7 +42,8 @@ class Concurrency:
     threads: int
 
     def __str__(self) -> str:
-        return f"{self.jobs or 'as many as the cluster has room for'} at once, {self.threads} thread(s) each"
+        jobs = self.jobs or "as many as the cluster has room for"
+        return f"{jobs} at once, {count_words(self.threads, 'thread')} each"
 
 
 @dataclass(frozen=True)

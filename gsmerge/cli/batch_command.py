@@ -17,6 +17,7 @@ from gsmerge.cli.console import print_document, say, say_warning, separate_stdou
 from gsmerge.errors import BatchError, TargetError, UsageError
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import Engine
+from gsmerge.words import count_words
 
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
@@ -102,7 +103,7 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     from gsmerge.batch.run import choose_concurrency
 
     totals, stdout = Totals(len(jobs)), sys.stdout
-    say(f"{len(jobs):,} scenes, {choose_concurrency(jobs, options)}", quiet=args.silent)
+    say(f"{count_words(len(jobs), 'scene')}, {choose_concurrency(jobs, options)}", quiet=args.silent)
 
     def add(record: dict[str, Any]) -> None:
         totals.add(record)
@@ -246,7 +247,7 @@ class Totals:
         statuses = [status for status in (DONE, SKIPPED, FAILED) if self.counts[status] or status == DONE]
         counts = [f"{self.counts[status]:,} {status}" for status in statuses]
         num_left = self.total - self.counts.total()
-        line = f"{self.total:,} scenes: {', '.join(counts)}" + (f", {num_left:,} left" if num_left else "")
+        line = f"{count_words(self.total, 'scene')}: {', '.join(counts)}" + (f", {num_left:,} left" if num_left else "")
         if self.num_input:
             share = human_share(self.num_output / self.num_input)
             line += f"; {self.num_input:,} -> {self.num_output:,} Gaussians ({share})"

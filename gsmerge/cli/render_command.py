@@ -156,8 +156,12 @@ def _check_layer(args: opt.Args, suffix: str) -> bool:
     for name in ("overlay", "background") if channel != "color" else ():
         if vars(args)[name] is not None:
             raise UsageError(f"--{name}: expected --channel color with it, got {option}")
-    if len(args.scenes) > 1 or (suffix and suffix not in endings):
-        raise UsageError(f"{args.output}: expected one scene, and a folder or {opt.join_words(endings)}, with {option}")
+    if len(args.scenes) > 1:
+        raise UsageError(f"{option}: expected one scene, got {len(args.scenes)}")
+    if suffix and suffix not in endings:
+        expected = f"expected a folder or {opt.join_words(endings)} with {option}"
+        reason = "is written without transparency" if channel == "color" else f"cannot hold {channel}"
+        raise UsageError(f"{args.output}: {expected}, got {suffix}, which {reason}")
     return True
 
 

@@ -46,6 +46,7 @@ BUDGET_WORDS = (
     "num_gaussians", "max_gaussians", "num_points", "target_count", "size", "max_size",
 )  # fmt: skip
 
+_NO_INTEGER = "Input should be a valid integer, unable to parse string as an integer"  # words of Typer
 # Typer does not export its usage errors; BadParameter, which it exports, derives from their common base
 UsageErrors: Any = typer.BadParameter.__mro__[2]
 
@@ -113,10 +114,19 @@ class Command(_Words, TyperCommand):
         return [*pieces, "[OPTIONS]"]
 
 
+def _wrong_values(error: BaseException) -> list[str]:
+    """List the texts that the cause of an error could not parse; empty for another cause."""
+    cause: Any = error.__cause__ or error.__context__
+    return [entry["input"] for entry in cause.errors()] if hasattr(cause, "errors") else []
+
+
 def usage_message(error: Any, make_command: Callable[[], Any]) -> str:
     """Describe wrong usage in one line, with a correction if one is known; ``make_command`` makes all commands."""
     path = PROGRAM if error.ctx is None else error.ctx.command_path.replace(f" {LOOK}", " compact")
     message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # Typer adds this prefix
+    if _NO_INTEGER in message:
+        message = message.replace(_NO_INTEGER, "expected a whole number")
+        message += next((f", got {value!r}" for value in _wrong_values(error)), "")
     parameters = [] if error.ctx is None else error.ctx.command.params
     has_output = any(parameter.name == "output" for parameter in parameters)
     if hasattr(error, "possibilities") and error.ctx is not None:

@@ -40,6 +40,7 @@ from gsmerge.runtime.threads import available_threads
 from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
+from gsmerge.words import count_words
 
 COARSER = 0.5  # time of each coarser level, as a share of the time of the result
 MAX_DRAWN_GAUSSIANS = 10_000  # the share of Gaussians inside a view is estimated from a sample of this size
@@ -122,7 +123,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     per_view = run["superpixels_per_view"]
     superpixels = "superpixels where the scene needs them"
     if per_view is not None:
-        superpixels = f"{per_view:,} superpixels per view, {run['k']} Gaussian(s) each"
+        superpixels = f"{per_view:,} superpixels per view, {count_words(run['k'], 'Gaussian')} each"
     method = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
     if per_view == 0:
         method = "neighbours merged pair by pair, because no photo shows them"
@@ -172,7 +173,7 @@ def plan_lines(document: Mapping[str, Any]) -> list[str]:
     scene, out = document["input"], document["output"]["path"]
     number, size = scene["num_views"], f"{scene['width']} x {scene['height']}"
     inside = find_format(out).levels == "inside"
-    levels = f", and {document['options']['levels']} level(s) in chunks beside it" if inside else ""
+    levels = f", and {count_words(document['options']['levels'], 'level')} in chunks beside it" if inside else ""
     return [
         f"would read {scene['ply']}: {f'{number} views of {size}' if number else 'no views'}",
         f"would write {out}{levels}",

@@ -25,6 +25,7 @@ from gsmerge.raster.metrics import describe_distance, describe_loss
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene
+from gsmerge.words import count_words
 
 if TYPE_CHECKING:
     import torch
@@ -105,7 +106,7 @@ class CompactResult:
         return view(make_scene(self.gaussians, self.cameras))
 
     def __repr__(self) -> str:
-        levels = f", {len(self.coarser)} coarser level(s)" if self.coarser else ""
+        levels = f", {count_words(len(self.coarser), 'coarser level')}" if self.coarser else ""
         return f"CompactResult({self.gaussians!r}, {self.cameras!r}{levels})"
 
     def _repr_html_(self) -> str:

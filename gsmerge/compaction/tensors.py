@@ -39,6 +39,7 @@ from gsmerge.io.formats.read import clear_invalid, clear_rows, find_empty
 from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
+from gsmerge.words import count_words
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -218,10 +219,10 @@ def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, l
     off = np.flatnonzero(np.abs(np.linalg.norm(out["quats"], axis=1) - 1) > _EXACT)
     out["quats"][off] = normalize(out["quats"][off])
     out["quats"][(out["quats"] == 0).all(1)] = (1, 0, 0, 0)
-    notes = [f"{num_bad:,} row(s) with NaN or inf, set aside"] if num_bad else []
+    notes = [count_words(num_bad, "row", "with NaN or inf, set aside")] if num_bad else []
     empty = find_empty("means", out | {"valid": valid})
     clear_rows(out | {"valid": valid}, empty)
-    notes += [f"{len(empty):,} empty row(s) at the origin, set aside"] if len(empty) else []
+    notes += [count_words(len(empty), "empty row", "at the origin, set aside")] if len(empty) else []
     return Gaussians(**out), valid, notes
 
 

@@ -82,17 +82,17 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
     low, high = factors.min(), factors.max()
     if low == high:
         return scene
-    differ = f"the photos differ in exposure by factors of {low:.2f} to {high:.2f}"
+    differ = f"the same surfaces differ in brightness by factors of {low:.2f} to {high:.2f} between photos"
     if exposure == "auto":
         if root_mean_square(gains[list(views)]) < DIFFERENT:
             return scene
         objection = _find_objection(scene, views, pairs, gains)
         if objection:
-            remedy = "--set exposure=per-photo brings them to their mean"
-            note(f"{differ} and stay unchanged, because {objection}; {remedy}")
+            remedy = "--set exposure=per-photo brings them to their mean exposure"
+            note(f"{differ}; photos stay unchanged, because {objection}; {remedy}")
             return scene
     choose(exposure=factors.tolist())
-    note(f"{differ} and are brought to their mean")
+    note(f"{differ}; photos are brought to their mean exposure")
     return _divide(scene, factors)
 
 
@@ -103,7 +103,7 @@ def _find_objection(scene: PicturedScene, views: Sequence[int], pairs: Sequence[
     if share_left(pairs, gains) > NEARER:
         return "other exposures do not bring the colours of the same surfaces clearly nearer"
     if is_metered(brightness, view_gains):
-        return "photos of a longer exposure are not brighter, so the camera metered the light"
+        return "this looks like automatic exposure (photos with larger factors are not brighter)"
     if share_unexpected(view_gains, camera_distances(scene.cameras[list(views)])) < UNEXPECTED:
         return "neighbouring photos have nearly the same exposure, so new views between them have it, too"
     return ""

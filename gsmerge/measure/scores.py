@@ -151,7 +151,7 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     for split in document["num_views"]:
         yield from _quality_tables(document, split)
     outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE)) for result in results]
-    heading = "Seen from outside, where the input is not so: shares of the picture, less is better"
+    heading = "Faults seen from outside that the input does not have: shares of the picture, less is better"
     yield heading, ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
     yield (
         "Render time",

@@ -257,6 +257,10 @@ def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
         return ()
     if is_frame(files.images):
         return _READ_IMAGES(files.plys)
+    if files.images.suffix.lower() == ".txt" and files.images.is_file():
+        raise SceneError(
+            files.images, "expected a folder of photos, found a text file", "name the folder of the photos"
+        )
     same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
     stored = (camera_file if same_file else read_cameras(files.images, scene=files.ply.stem)).images
     may_lack = same_file and files.images.suffix == CHUNK and not len(stored)

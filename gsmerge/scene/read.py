@@ -70,6 +70,7 @@ from gsmerge.scene.rows import color_from_photos, set_rotations, take_gaussians,
 from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, Cameras, LargePhotos, Scene, StrPath
+from gsmerge.words import count_words
 
 
 @dataclass(frozen=True)
@@ -316,9 +317,17 @@ def _note_left_out(load: Loaded, files: SceneFiles, cause: SceneError) -> Loaded
     is_known = cause.path in map(str, (files.ply, files.ply.parent, files.cameras, files.images, files.masks))
     where = "" if is_known else f"{cause.path}: "
     verb = "is" if names == [str(files.cameras)] else "are"
-    remedy = cause.remedy or "name the files that fit, or say none"
+    remedy = cause.remedy or _name_files(load, files)
     note = " ".join(f"{' and '.join(names)} {verb} left out: {where}{cause.problem}; {remedy}".split())
     return replace(load, notes=(*(text for text in load.notes if text not in repeated), note), left_out=note)
+
+
+def _name_files(load: Loaded, files: SceneFiles) -> str:
+    """Return the remedy for files that are left out: the options that name others, or none."""
+    option, value = "cameras", "FILE"
+    if load.files.cameras == files.cameras:
+        option, value = ("masks" if load.files.masks != files.masks else "images"), "FOLDER"
+    return f"pass --{option} {value}, or --{option} {NONE}"
 
 
 def _align(
@@ -535,7 +544,8 @@ def _make_scene(
     views, camera_names = list(result.views), _camera_names(result)
     gaussians, pixels = take_gaussians(ply, result)
     num_faint = int(ply.valid.sum()) - len(gaussians)
-    notes = [f"{num_faint:,} Gaussian(s) that nothing draws, fainter than 1/255, set aside"] if num_faint else []
+    faint = "fainter than 1/255, which nothing draws, set aside"
+    notes = [count_words(num_faint, "Gaussian", faint)] if num_faint else []
     cameras, images = result.cameras, result.images
     if views != list(range(len(cameras))):
         cameras, images = cameras[views], images[views] if len(images) else images

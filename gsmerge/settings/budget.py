@@ -36,7 +36,7 @@ class BudgetOptions(Settings):
     most: int | None = setting(None, "Number of Gaussians beyond which new views gain nothing, if known.",
         internal=True)  # fmt: skip
     quality: str | None = setting(None, "Use the fewest Gaussians that render photos at a PSNR such as 30dB, or at "
-        "most so far below the best number, such as -0.2dB.",
+        "most so far below the best number, such as -0.2dB, judged by PSNR + 40 SSIM.",
         "The photos are held out if there are four or more, otherwise they are those of the input. If the rows belong "
         "to no pixels and no number is asked for, the result keeps the quality of the input. Without photos it "
         "reaches 32.5 dB against renders of the input; with photos it loses at most 0.3 dB on them.",

@@ -29,6 +29,7 @@ from gsmerge.networks.weights import NetworkWeights
 from gsmerge.scene.read import load_scene
 from gsmerge.states.features import FeatureState, ViewSamples
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, StrPath
+from gsmerge.words import count_words
 
 COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
 LARGEST = 1e37  # absolute value of any number; float32 ends at 3e38
@@ -44,7 +45,7 @@ class State:
     features: FeatureState | None = None  # None in a state of results
 
     def __repr__(self) -> str:
-        return f"State({len(self):,} Gaussians of {len(self.about['batches'])} batch(es))"
+        return f"State({len(self):,} Gaussians of {count_words(len(self.about['batches']), 'batch')})"
 
     def __len__(self) -> int:
         return len(self.scene.gaussians) if self.scene is not None else len(self.features or ())

@@ -33,7 +33,7 @@ def made(generated: Path, tmp_path: Path) -> Path:
 
 
 def test_scenes_are_made_and_counted(generated: Path) -> None:
-    assert (generated.parent / "said.txt").read_text() == f"{generated}: 1 scenes\n"
+    assert (generated.parent / "said.txt").read_text() == f"{generated}: 1 scene\n"
     assert [path.name for path in generated.iterdir()] == ["scene_0000"]
 
 

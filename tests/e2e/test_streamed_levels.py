@@ -70,7 +70,7 @@ def test_the_plan_says_how_many(
     more: tuple[object, ...], number: int, small_scene: Path, index: Path, run: Run
 ) -> None:
     said = run("compact", small_scene, "-o", index, *QUICK[:2], *more, "--dry-run", code=0)
-    assert f"{index}, and {number} level(s)" in said.out
+    assert f"{index}, and {number} level{'' if number == 1 else 's'} in" in said.out
     assert not index.parent.exists()
 
 

@@ -114,7 +114,7 @@ USAGE = {
     "lab chart -o out room --set lpips=some": "lpips*'some'",
     "lab chart -o room/scene.ply room": "--output*room/scene.ply",
     "lab chart -o room room": "room*results",
-    "lab generate -o out --views many": "--views*integer",
+    "lab generate -o out --views many": "--views*whole number*'many'",
     "lab generate -o out --size large": "--size*320x240*'large'",
     "lab generate -o out --set noise=loud": "--set noise*10*'loud'",
     "lab train -o out": "*'--data'",
@@ -230,3 +230,7 @@ def test_a_film_is_no_folder_of_photos(smallest_scene: Path, tmp_path: Path, run
     (tmp_path / "a.mov").write_bytes(b"\0")
     outcome = run("compact", smallest_scene, "--images", tmp_path / "a.mov", "-o", tmp_path / "a.ply", code=3)
     assert "found a film; save the frames" in outcome.err
+
+
+def test_words_for_a_number(run: Run) -> None:
+    assert_refused(run("compact", "a.ply", "--threads", "two"), 2, "--threads", "expected a whole number, got 'two'")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -47,6 +48,14 @@ class CameraSource:
     def ply(self) -> PlyData:
         """Elements of a PLY file."""
         return open_ply(self.path)
+
+
+def check_objects(path: Path, entries: Sequence[Any], place: str = "the file") -> None:
+    """Raise SceneError with the number of the first entry of a JSON list that is no object."""
+    for i, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            found = "a list" if isinstance(entry, list) else json.dumps(entry)
+            raise SceneError(path, f"expected {place} to be a list of objects, found {found:.40} as entry {i + 1}")
 
 
 class StoredCameras(NamedTuple):

@@ -102,7 +102,7 @@ def check_unknown(path: Path) -> None:
     """Raise SceneError if a file of an unknown format seems to have camera poses."""
     if starts_like_poses(path):
         raise SceneError(
-            path, "expected cameras of a supported format, found those of a program that is not known", _WRITE
+            path, "expected cameras in a supported format, found poses in a format that is not known", _WRITE
         )
 
 

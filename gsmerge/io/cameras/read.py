@@ -10,7 +10,7 @@ from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.cameras.camera_source import CameraSource
+from gsmerge.io.cameras.camera_source import CameraSource, check_objects
 from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program, check_unknown, starts_like_poses
 from gsmerge.io.cameras.table import (
     CAMERA_ENDINGS,
@@ -94,8 +94,10 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
     path = _resolve(Path(path))
     ending = "" if path.is_dir() else path.suffix.lower().replace(LOG, ".txt")
     source = CameraSource(path, scene, folder)
-    format_ = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
-    if format_ is None:
+    chosen = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
+    if chosen is None:
+        if isinstance(entries := source.json if ending == ".json" else None, list):
+            check_objects(path, entries)
         check_unknown(path)
         raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
     return format_.cameras(source)

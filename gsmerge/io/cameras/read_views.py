@@ -11,7 +11,14 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import Lens, StoredView, check_count, make_lens, make_pinhole
-from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras, convert, number_errors, to_number
+from gsmerge.io.cameras.camera_source import (
+    CameraSource,
+    StoredCameras,
+    check_objects,
+    convert,
+    number_errors,
+    to_number,
+)
 from gsmerge.io.cameras.view_layout import Entry, Key, Matrix, ViewLayout
 from gsmerge.io.image_names import find_image
 from gsmerge.io.photo_files import Size, image_size
@@ -56,9 +63,10 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
 def _list_entries(source: CameraSource, key: str) -> list[Entry]:
     """List the views under a key of a file's object; "" if the file itself is the list."""
     views = source.object.get(key) if key else source.json
-    if not isinstance(views, list) or not all(isinstance(view, dict) for view in views):
-        place = repr(key) if key else "the file"
+    place = repr(key) if key else "the file"
+    if not isinstance(views, list):
         raise SceneError(source.path, f"expected {place} to be a list of objects, found something else")
+    check_objects(source.path, views, place)
     check_count(source.path, len(views))
     return [Entry(view, source.object) for view in views]
 

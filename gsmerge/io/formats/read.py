@@ -22,6 +22,7 @@ from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Gaussians, StrPath
+from gsmerge.words import count_words
 
 _READ_FRAMES = LazyFunction("gsmerge.io.formats.depth_maps", "read_frames")
 MIN_PADDING = 16  # number of equal rows at the origin that are padding; fewer may be Gaussians
@@ -90,15 +91,15 @@ def kept_comments(info: FileInfo) -> tuple[str, ...]:
 def file_notes(info: FileInfo) -> tuple[str, ...]:
     """Describe adapted or unusual content of a file: one sentence each, without a full stop."""
     counted = {
-        "row(s) with NaN or inf, set aside": info.num_nonfinite,
-        "empty row(s) at the origin, set aside": info.num_empty,
-        "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
-        "Gaussian(s) with a zero quaternion, read as the identity": info.num_zero_quats,
+        ("row", "with NaN or inf, set aside"): info.num_nonfinite,
+        ("empty row", "at the origin, set aside"): info.num_empty,
+        ("Gaussian", "with extreme scales or colours, clipped"): info.num_clipped_scales,
+        ("Gaussian", "with a zero quaternion, read as the identity"): info.num_zero_quats,
     }
     raw = ("opacities lie in [0, 1] and are read as such; if they are logits, use --hint opacity=logit",)
     raw_notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
     scale_notes = (info.odd_scales,) if info.odd_scales else ()
-    count_notes = (f"{count:,} {what}" for what, count in counted.items() if count)
+    count_notes = (count_words(count, noun, rest) for (noun, rest), count in counted.items() if count)
     return (*info.adapted, *raw_notes, *scale_notes, *count_notes)
 
 

@@ -30,6 +30,7 @@ from gsmerge.io.formats.splat_transform import name_file, run_program
 from gsmerge.io.formats.table import INDEX, Contents
 from gsmerge.io.formats.write import write_ply
 from gsmerge.types import Gaussians, StrPath
+from gsmerge.words import count_words
 
 VERSION = 1
 MAX_DEGREE = sog.MAX_DEGREE
@@ -229,7 +230,7 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
         for name, size in content.sizes.items():
             sizes[name] = sizes.get(name, 0) + size
     counts = " + ".join(f"{count:,}" for count in index.counts)
-    name = f"Streamed SOG version {VERSION}, {counts} Gaussians at {len(index.levels)} level(s)"
+    name = f"Streamed SOG version {VERSION}, {counts} Gaussians at {count_words(len(index.levels), 'level')}"
     rows = arrays.to_stored([content.packed for content in contents], name, sizes, contents[0].mode)
     return replace(rows, bytes_beside=sum(content.num_bytes for content in contents))
 

@@ -128,7 +128,7 @@ COLMAP = Format(
     beside=_model("colmap_output.files_beside"), notes=_model("colmap_output.note_photos"),
 )  # fmt: skip
 HTML = Format(
-    ".html", "a page with a viewer and the .sog that it shows", None, None, 3,
+    ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
     write=_page("site.write_output"), levels="", cameras="inside", round_means=_lazy("sog.round_means"),
     kept_as=".sog", site="index.html", beside=_page("site.files_beside"),
     each=tuple(_IN_TEXT * sog_bytes for sog_bytes in _SOG), rest=_page("site.least_bytes"),

@@ -11,6 +11,7 @@ from gsmerge.cli.console import print_document, stage_progress
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.setting import Settings, setting
+from gsmerge.words import count_words
 
 OPTIONS = LazyFunction("gsmerge.research.generate", "GenerateOptions")
 
@@ -50,6 +51,6 @@ def generate(args: opt.Args) -> None:
     document = {**document_head(), "options": options.to_dict(), "seed": series.seed, "notes": []}
     document["scenes"] = [{"folder": str(scene.folder), "kept": scene.kept} for scene in scenes]
     kept = sum(scene.kept for scene in scenes)
-    line = f"{out}: {len(scenes) - kept} scenes"
+    line = f"{out}: {count_words(len(scenes) - kept, 'scene')}"
     line += f", {kept} were there already" if kept else ""
     print_document(document, line, as_json=args.json, quiet=args.quiet)

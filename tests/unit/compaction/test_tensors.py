@@ -91,7 +91,7 @@ def test_input_is_left_alone_and_odd_rows_are_set_aside(scene: Scene) -> None:
     given = changed(scene, "scales", lambda s: np.where(np.arange(len(s))[:, None] == 7, np.nan, s))
     before = {name: np.array(value) for name, value in given.items()}
     small = compact_tensors(**given, **FAST)
-    assert noted(small.report.notes, "1 row(s)", "NaN")
+    assert noted(small.report.notes, "1 row with", "NaN")
     assert all(np.array_equal(before[name], given[name], equal_nan=True) for name in before)
     assert np.isfinite(small.gaussians.means).all()
 

@@ -80,7 +80,7 @@ def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
     assert (actual["num_nonfinite"], actual["num_zero_quats"], actual["num_clipped_scales"]) == (1, 1, 1)
     assert (actual["num_opaque"], actual["num_transparent"]) == (3, 5)
     assert len(actual["notes"]) == 5
-    assert noted(actual["notes"], "5 Gaussian(s) that nothing draws")
+    assert noted(actual["notes"], "5 Gaussians fainter than 1/255, which nothing draws")
     assert actual["alignment"] is not None
 
 

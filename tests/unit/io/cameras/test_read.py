@@ -18,7 +18,7 @@ def test_what_is_no_camera_file(tmp_path: Path) -> None:
         ("none.json", None, "no such file"),
         ("text.json", "hello", "JSON"),
         ("other.json", '{"a": 1}', "'frames'"),
-        ("list.json", "[1, 2]", "'frames'"),
+        ("list.json", '[{"a": 1}, 2]', "found 2 as entry 2"),
         ("cameras.yml", "<a/>", ".npz"),
     ):
         if text is not None:

@@ -432,7 +432,7 @@ def test_empty_rows_are_set_aside(tmp_path: Path, turned: bool) -> None:
     assert (actual.info.num_empty, actual.info.num_nonfinite, actual.info.num_zero_quats) == (3, 0, 0)
     assert not actual.gaussians.opacities[[3, 7, 48]].any()
     assert not noted(file_notes(actual.info), "interrupted")
-    assert noted(file_notes(actual.info), "3 empty row(s)")
+    assert noted(file_notes(actual.info), "3 empty rows")
 
 
 @pytest.mark.parametrize(("last", "others", "broken"), [(30, 0, True), (30, 9, True), (3, 9, False), (1, 0, False)])

@@ -174,7 +174,7 @@ def test_the_name_chooses_the_format_where_levels_are_written(monkeypatch: pytes
 def test_check_reads_all_levels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_set(tmp_path / "lod-meta.json", [corners(), corners()[:1]])
     assert main(["inspect", str(tmp_path / "lod-meta.json")]) == 0
-    assert "3 + 1 Gaussians at 2 level(s)" in capsys.readouterr().out
+    assert "3 + 1 Gaussians at 2 levels" in capsys.readouterr().out
     second = next(iter(read_index(tmp_path / "lod-meta.json").levels[1]))
     second.with_name("sh0.webp").unlink()
     assert len(read_gaussians(tmp_path / "lod-meta.json").gaussians) == 3
