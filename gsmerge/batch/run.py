@@ -26,7 +26,7 @@ from gsmerge.io.jsonl import append_line
 from gsmerge.io.locks import lock_file
 from gsmerge.report import file_sha256, finite
 from gsmerge.runtime.memory import free_memory
-from gsmerge.runtime.processes import ProcessPool
+from gsmerge.runtime.processes import LostProcess, ProcessPool
 from gsmerge.runtime.threads import available_threads
 from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, RayPool, WorkerPool
 from gsmerge.words import count_words

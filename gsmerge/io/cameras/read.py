@@ -94,8 +94,8 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
     path = _resolve(Path(path))
     ending = "" if path.is_dir() else path.suffix.lower().replace(LOG, ".txt")
     source = CameraSource(path, scene, folder)
-    chosen = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
-    if chosen is None:
+    format_ = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
+    if format_ is None:
         if isinstance(entries := source.json if ending == ".json" else None, list):
             check_objects(path, entries)
         check_unknown(path)
