@@ -142,8 +142,8 @@ def _fit_format(args: opt.Args, settings: CompactOptions, out: Path) -> CompactO
     if format_.levels == "inside" and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
     if not format_.levels and settings.budget.levels > 1:
-        levels, kind = settings.budget.levels, format_.ending
-        raise UsageError(f"{out}: expected one level for {kind}, found --levels {levels}; drop --levels")
+        levels, kind = settings.budget.levels, format_.about.partition(":")[0]
+        raise UsageError(f"{out}: expected one level in {kind}, found --levels {levels}; drop --levels")
     if settings.budget.in_bytes and not output_format(out, levels=True, cameras=True).each:
         raise UsageError(f"{out}: expected a --budget in Gaussians for this format, got {settings.budget.budget}")
     return settings

@@ -133,14 +133,15 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"--effort best`: {plan.EFFORTS['best'].steps} steps",
         f"An estimate needs {word(left_out.LEAST_VIEWS)} photos, a result of at most {percent(new_views.MOST_SHARE)} of"
         " the Gaussians",
-        f"If they confirm less than {part(confirm_depths.POOR)} of it, the result will be poor",
+        f"If they confirm less than {part(confirm_depths.POOR)}, a note says that the result will be poor",
         f"shows its photos more than {metrics.MAX_LOSS:g} dB worse than the input".replace(" 0.", " ."),
         f"They show the photos at most {plan.FIDELITY_LOSS:g} dB worse than it does",
         f"at least {plan.FIDELITY_PSNR:g} dB against the input's",
         f"moved by up to {cameras_off.MAX_PX:g} pixels",
         f"With more than {word(plan.USUAL_VIEWS)} views the fit takes more steps. Scenes of more than"
         f" {million(plan.WHOLE_GAUSSIANS)} Gaussians or {plan.WHOLE_VIEWS} views are compacted in blocks",
-        f"a quarter of {word(views.REPORT_VIEWS)} photos, of {word(plan.EFFORTS['draft'].report_views)} in drafts",
+        f"a quarter of the pixels of {word(views.REPORT_VIEWS)} photos (in drafts:"
+        f" {word(plan.EFFORTS['draft'].report_views)})",
     ),
     CONVERT: (
         f"at the upper border of at least {word(sky.LEAST_VIEWS)} photos and a {part(sky.LEAST_SHARE)} of all",
@@ -176,8 +177,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"differs by {colors.STEP:g} of the range, averaged over {len(compare_photos.WINDOW)} x"
         f" {len(compare_photos.WINDOW)} pixels",
         f"at least {photo_sizes.MIN_AUTO_SCALE:g} times as many pixels a side",
-        f"narrower than a {part(holes.LARGE)} of the picture",
-        f"less than {percent(holes.PART)} of the picture",
+        f"wider than a {part(holes.LARGE)} of the picture",
+        f"cover at least {percent(holes.PART)} of it",
         f"exposures differ by more than {percent(exposure.DIFFERENT)} at random",
         f"at least a {part(1 - exposure.NEARER)} closer",
         f"A white pixel counts as {word(int(types.PROTECTED))}",

@@ -223,7 +223,7 @@ def test_exposure_that_a_camera_metered_stays() -> None:
     scene, held_out = metered_views(eyes, targets), metered_views([-0.3, 0.3], [0.4, -0.4])
     auto, fixed, mean = (compact(scene, **FIT, exposure=setting) for setting in ("auto", "fixed", "per-photo"))
     (note,) = (one for one in auto.report.notes if names(one, "exposure", "factors"))
-    assert "camera" in note
+    assert "automatic exposure" in note
     assert scenes.identical(auto.gaussians, fixed.gaussians)
     assert scenes.psnr_of(auto.gaussians, held_out) > scenes.psnr_of(mean.gaussians, held_out) + 0.5
 

@@ -389,7 +389,7 @@ def test_documents_have_fog_and_holes(actual: Evaluation) -> None:
     rows = list(csv.DictReader(io.StringIO(evaluation_csv(document))))
     assert (rows[0]["holes"], float(rows[-1]["holes"])) == ("", result["holes"])
     heading, head, row = evaluation_lines(document)[-3:]
-    assert heading.startswith("Seen")
+    assert heading.startswith("Faults seen from outside")
     assert head.split() == ["near", "fog", "far", "fog", "holes", "veil", "worst", "veil", "spikes", "strokes"]
     assert row.split() == ["half", *(f"{result[name]:.3f}" for name in names)]
 
