@@ -1,7 +1,8 @@
 """The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
 
-:func:`fill_options` and :func:`decide` make every choice once. Each stage gets its own part of the plan, and no stage
-knows the options of another.
+Every choice is a function here. :func:`choose_for_scene` runs before a scene is cut into blocks, and again as part of
+:func:`decide`, which makes the plan of a piece from the options that :func:`fill_options` has completed. Each stage
+gets its own part of the plan, and no stage knows the options of another.
 """
 
 from __future__ import annotations
@@ -369,9 +370,9 @@ def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     of the Gaussians would say little if there are fewer Gaussians than pixels: a scene that is compact already needs
     most of them, a scene of many small ones only a few. Measurements are in docs/internals/notebook.md.
     """
-    budget = options.budget
-    is_decided = options.decides_count or options.replaces_stages  # other stages seldom keep the quality
-    return not is_decided and (scene.rendered or not (scene.is_dense or budget.auto))
+    if options.decides_count or options.replaces_stages:  # other stages seldom keep the quality
+        return False
+    return scene.rendered or not (scene.is_dense or options.budget.auto)
 
 
 def check_pictures(prepared: Prepared, options: CompactOptions) -> None:

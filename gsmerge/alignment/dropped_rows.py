@@ -171,7 +171,7 @@ def _solve_lines(points: np.ndarray, starts: np.ndarray) -> _View | None:
 
 
 def _drop_rare_columns(view: _View) -> _View:
-    """Leave out outer columns that few lines have; count columns from the first remaining column."""
+    """Leave out outer columns that few lines have, and number the other columns from 0."""
     first = int(view.x.min())
     counts = np.bincount(view.x - first)
     common = first + np.flatnonzero(counts >= _RARE * counts.max())

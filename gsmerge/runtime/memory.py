@@ -21,7 +21,7 @@ LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_by
 # values, clearing new pages for each array took a tenth of the time of `gsmerge view` for a page.
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 MAPPED_BYTES = 1 << 28  # arrays of this size or more are mapped from files
-_own_pages: WeakSet[mmap.mmap] = WeakSet()  # may be freed; private pages of other code would lose their values
+_own_pages: WeakSet[mmap.mmap] = WeakSet()  # maps made here: only their pages may be discarded
 
 
 def peak_memory() -> int:

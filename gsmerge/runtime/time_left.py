@@ -113,6 +113,11 @@ class Forecast:
             _, time_before, done_before = self._counted
             self._end = now + (now - time_before) / (done - done_before) * max(0, total - done)
 
+    def _seconds_per_cost(self, *, is_fit: bool) -> float:
+        """Return the seconds that a unit of cost has taken so far, in fits or in other stages; 0 if not known."""
+        cost = self._costs[is_fit]
+        return self._seconds[is_fit] / cost if cost else 0.0
+
     @property
     def seconds_left(self) -> float | None:
         """Seconds until the run ends; None if they are not known yet."""
@@ -120,8 +125,8 @@ class Forecast:
             return None if self._end is None else max(0.0, self._end - self.clock())
         part, later = self._part, self._parts
         fit_cost = part.fit * (1 - self._share) + sum(later_part.fit for later_part in later)
-        rates = {is_fit: self._seconds[is_fit] / cost if cost else 0.0 for is_fit, cost in self._costs.items()}
-        fit_rate, stage_rate = rates[True], rates[False] or rates[True]  # seconds per cost
+        fit_rate = self._seconds_per_cost(is_fit=True)
+        stage_rate = self._seconds_per_cost(is_fit=False) or fit_rate
         part_cost = part.after if self._share else part.before + part.after
         later_cost = sum(later_part.before + later_part.after for later_part in later)
         if (fit_cost and not fit_rate) or (part_cost + later_cost > 0 and not stage_rate):

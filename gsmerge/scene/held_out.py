@@ -124,7 +124,7 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) ->
     ``named`` maps indices in the file to views of the scene with the same name. The result is this map, or empty if the
     poses of these views differ.
     """
-    stored = _stored_world(load)
+    stored = _similarity_from_stored(load)
     if not named:
         return stored, {}
     theirs = camera_file.viewmats[list(named)]
@@ -141,7 +141,7 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) ->
     return stored, {}
 
 
-def _stored_world(load: Loaded) -> Similarity:
+def _similarity_from_stored(load: Loaded) -> Similarity:
     """Find the similarity from the world of the scene's own camera file to the world of its Gaussians."""
     if load.recovery is not None:
         return load.recovery.best.frame
@@ -149,7 +149,7 @@ def _stored_world(load: Loaded) -> Similarity:
         return IDENTITY
     camera_file = read_cameras(load.files.cameras, scene=load.files.ply.stem, folder=load.files.ply.parent)
     if (camera_file.names, camera_file.convention) != (load.cameras.names, load.cameras.convention):
-        return IDENTITY
+        return IDENTITY  # other views, or another convention: the poses cannot be compared
     if np.array_equal(camera_file.viewmats, load.cameras.viewmats):
         return IDENTITY  # a fit would differ from it by rounding
     return fit_similarity(camera_file.viewmats, load.cameras.viewmats)

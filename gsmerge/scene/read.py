@@ -573,19 +573,26 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
         camera_file = read_scene_cameras(ply, files)
         if camera_file is None:
             return _without_cameras(ply, files, hints)
-        for with_photos in (True,) if photos else (True, False):
+        for with_photos in [True] if photos else [True, False]:  # photos can show the frame even if they are not kept
             with suppress(SceneError):
-                load = _align(ply, files, camera_file, hints=hints, photos=with_photos)
-                break
-        else:
-            pictures = stored_photos(files, camera_file) if photos else ()
-            cameras = to_cameras(camera_file, photo_size(pictures))
-            from gsmerge.alignment import check_cameras  # few scenes need it
-
-            if "cameras" not in files.named and not check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
-                return align_scene(ply, files, hints=hints, photos=photos)
-            note = "the cameras do not fit the Gaussians; they stay as stored in their file"
-            as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
-            load = replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)
-        return load
+                return _align(ply, files, camera_file, hints=hints, photos=with_photos)
+        return _keep_stored_cameras(ply, files, camera_file, hints=hints, photos=photos)
     return align_scene(ply, files, hints=hints, photos=photos)  # leaves out unreadable files that were not named
+
+
+def _keep_stored_cameras(
+    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, *, hints: ReadHints, photos: bool
+) -> Loaded:
+    """Return the scene with its cameras as their file stores them, with a note.
+
+    Cameras that were not named and do not see the Gaussians are left out.
+    """
+    from gsmerge.alignment import check_cameras  # few scenes need it
+
+    pictures = stored_photos(files, camera_file) if photos else ()
+    cameras = to_cameras(camera_file, photo_size(pictures))
+    if "cameras" not in files.named and not check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
+        return align_scene(ply, files, hints=hints, photos=photos)
+    note = "the cameras do not fit the Gaussians; they stay as stored in their file"
+    as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
+    return replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)

@@ -143,7 +143,7 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
     version = meta.get("version", 1) if isinstance(meta, dict) else "none"
     if version != VERSION:
         problem = f"expected .sog version {VERSION}, found {version}"
-        raise SceneError(budget.path, problem, "export it with a newer program")
+        raise SceneError(budget.path, problem, f"export it as version {VERSION}")
     count = check_whole(meta["count"], "count", 1)
     bands = check_whole(meta["shN"]["bands"], "bands", 1, MAX_DEGREE) if meta.get("shN") else 0
     arrays.check_count(budget, count, (bands + 1) ** 2 - 1, PACKED_BYTES)

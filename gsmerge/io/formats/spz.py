@@ -152,7 +152,7 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
         problem = f"expected .spz of version 1 to 4 and SH degree 0 to {MAX_READ_DEGREE}, found {found}"
         raise SceneError(path, problem, "export it again")
     if header.count == 0:
-        raise SceneError(path, f"expected Gaussians in {len(packed)} bytes, found a count of 0", AGAIN)
+        raise SceneError(path, f"expected at least one Gaussian in {len(packed)} bytes, found a count of 0", AGAIN)
     arrays.check_count(budget, count_before + header.count, header.num_higher, sum(header.widths))
     return header
 

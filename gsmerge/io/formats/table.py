@@ -257,7 +257,7 @@ def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False)
         inside = [row.ending for row in FORMATS if row.cameras == "inside" and row.ending[0] == "."]
         endings = join_words((*OUTPUT_FORMATS, *(inside if cameras else [])))
         index = f", or the name {INDEX}" if levels else ""
-        folder = f", or a folder, or a folder named {' or '.join(FOLDERS)}" if cameras else ""
+        folder = f", or a folder; one named {' or '.join(FOLDERS)} gets that kind of model" if cameras else ""
         raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{index}{folder}")
     by_name.require()
     return by_name

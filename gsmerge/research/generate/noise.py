@@ -127,7 +127,7 @@ def edge_mask(depth: Array) -> Float:
     inverse = (1 / depth).astype(np.float32)
     square = np.ones((3, 3), np.uint8)
     jump = log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
-    middle = blur(inverse, 1.0)  # slanted planes are smooth in inverse depth
+    middle = blur(inverse, 1.0)  # blur does not change the inverse depth of a slanted plane, so only bends remain
     bend = np.abs(middle / inverse - 1)
     return np.clip((np.minimum(jump / 2, 4 * bend) - 0.01) / 0.09, 0, 1).astype(np.float32)
 
