@@ -151,7 +151,7 @@ def test_every_command_notes_odd_rows(command: str, small_copy: Path, run: Run) 
     said = outcome.out if command == "inspect" else outcome.err
     notes = [line for line in said.splitlines() if line.startswith("note")]
     assert len(notes) == 3
-    assert names(said, "activated", "1 row with", "NaN", "1 Gaussian with", "scales")
+    assert names(said, "opacities lie in [0, 1]", "1 row with", "NaN", "1 Gaussian with", "scales")
 
 
 def test_odd_rows_reach_the_scene_s_notes_and_the_report(small_copy: Path, run: Run) -> None:
