@@ -47,13 +47,18 @@ def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None
 
     Raises SceneError if networks are required and cannot be used, UsageError if they do not fit the options.
     """
-    from gsmerge.networks.checkpoint import find_checkpoint, load_checkpoint
-
     if not cuts_views(options, size):
         if options.checkpoint not in CHECKPOINTS:  # refuse a damaged file, although nothing would use it
+            from gsmerge.networks.checkpoint import load_checkpoint
+
             load_checkpoint(options.checkpoint)
         return None
-    checkpoint, notes = find_checkpoint(choose_networks(options, size), required=options.require_checkpoint)
+    name = choose_networks(options, size)
+    if name == "none":  # as in most runs, which then need not import the modules of networks
+        return None
+    from gsmerge.networks.checkpoint import find_checkpoint
+
+    checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
     for text in notes:
         note(text)
     if checkpoint is not None:

@@ -49,7 +49,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Covisibility:
-    """How much of the surfaces of each of v views every other view sees, from coarse depth maps."""
+    """The share of the surfaces of each of v views that every other view sees, from coarse depth maps."""
 
     cameras: Cameras
     depths: np.ndarray  # [v,h,w] float64, depths of a coarse grid of each view; infinite where nothing is

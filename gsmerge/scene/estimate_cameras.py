@@ -48,7 +48,7 @@ def estimate_cameras(ply: GaussianFile, path: Path, folder: Path | None) -> Came
 
 @dataclass(frozen=True)
 class GridFit:
-    """How a model resized and cropped photos to the pixels of a grid of rows."""
+    """The resizing and cropping by which a model made the pixels of a grid of rows from photos."""
 
     size: Size  # of the grid
     crops: bool = False  # True: resized in proportion and cropped at the centre; False: width and height independently

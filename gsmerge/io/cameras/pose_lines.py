@@ -22,7 +22,7 @@ from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.foreign import INTRINSICS, POSE_FOLDERS
 from gsmerge.io.cameras.npz_files import array_shape
 from gsmerge.io.formats.table import FRAMES, POSES
-from gsmerge.io.image_names import natural_key
+from gsmerge.io.image_names import natural_order
 
 _FRAME = re.compile(r"frame_(\d{1,9})\.npz")
 _POSE_COLUMNS = (12, 16)  # numbers in a line that is a pose
@@ -110,7 +110,7 @@ def _join_rows(path: Path, rows: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _files(path: Path) -> list[Path]:
-    texts = sorted(path.glob("[!.]*.txt"), key=lambda file: natural_key(file.name))
+    texts = natural_order(path.glob("[!.]*.txt"))
     check_count(path, len(texts))
     return texts
 

@@ -13,7 +13,7 @@ from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import CENTRED_PX, MAX_NORMALISED_FOCAL, MAX_NUMBER, StoredView, check_count
 from gsmerge.io.cameras.camera_source import CameraSource, number_errors
 from gsmerge.io.cameras.view_layout import Entry
-from gsmerge.io.image_names import natural_key
+from gsmerge.io.image_names import natural_key, natural_order
 
 
 def list_shots(source: CameraSource) -> list[Entry]:
@@ -34,7 +34,7 @@ def list_shots(source: CameraSource) -> list[Entry]:
 
 def list_keyframes(source: CameraSource) -> list[Entry]:
     """List the views of a folder of Polycam, which has a file for each."""
-    paths = sorted(source.path.glob("*.json"), key=lambda path: natural_key(path.name))
+    paths = natural_order(source.path.glob("*.json"))
     check_count(source.path, len(paths))
     return [Entry(_read_object(path), name=path.stem, path=path) for path in paths]
 
