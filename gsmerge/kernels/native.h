@@ -11,6 +11,8 @@
 #define API __attribute__((visibility("default")))
 #endif
 
+#define INLINE static inline __attribute__((always_inline))
+
 enum { LANES = 16 };
 enum { OUTSIDE = 1 };  // status of a function that met an index outside its array; 0 otherwise
 typedef float v16f __attribute__((vector_size(64), aligned(4)));

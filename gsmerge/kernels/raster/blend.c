@@ -7,65 +7,56 @@
 enum { CHANNELS = 4 };  // channels that weighted_sums adds up at a time
 
 // Sum and maximum of the weights of one Gaussian over rows, by column.
-typedef struct { v8f sum, peak; } Weights;
+typedef struct { pixels sum, peak; } Weights;
 
 static inline v4f max4(v4f a, v4f b) { return (v4f)(((a > b) & (v4i)a) | (~(a > b) & (v4i)b)); }
 
-// Add the sums of both halves of a tile to own[0]; raise own[1] to their maximum.
-static inline void add_total(float *own, const Weights w[2]) {
-  v4f peaks[2];
-  for (int i = 0; i < 2; i++)
-    peaks[i] = max4(PICK(w[i].peak, w[i].peak, 0, 1, 2, 3), PICK(w[i].peak, w[i].peak, 4, 5, 6, 7));
-  v4f peak = max4(peaks[0], peaks[1]);
-  own[0] += total(join8(w[0].sum, w[1].sum));
-  own[1] = maxf(own[1], maxf(maxf(peak[0], peak[1]), maxf(peak[2], peak[3])));
+static inline float maximum(v16f v) {
+  v4f a = max4(PICK(v, v, 0, 1, 2, 3), PICK(v, v, 4, 5, 6, 7));
+  v4f b = max4(PICK(v, v, 8, 9, 10, 11), PICK(v, v, 12, 13, 14, 15)), peak = max4(a, b);
+  return maxf(maxf(peak[0], peak[1]), maxf(peak[2], peak[3]));
 }
 
-// Blend Gaussian j of a batch over rows y0 to y1 of eight columns. Planes 1 to 3, if there are any, collect the colour.
-// Return its weights, if they are used.
-static inline Weights blend_rows(float *columns, const v8f *alphas, const Batch *b, int64_t j, int32_t y0, int32_t y1,
-                                 bool colored) {
-  Weights weights = {{0}, {0}};
+// Blend Gaussian j of a batch in a part of its rows. Planes 1 to 3, if there are any, collect the colour. Return its
+// weights, if they are used.
+INLINE Weights blend_part(float *state, const Curve *curve, Rows r, const Batch *b, int64_t j, bool colored, int part) {
   float red = b->red[j], green = b->green[j], blue = b->blue[j];
-  for (int32_t y = y0; y <= y1; y++) {
-    float *row = columns + y * TILE;
-    Share s = take_share(load8(row), alphas[y]);
-    store8(row, s.left);
+  int32_t last = last_of(r, part);
+  int64_t gap = gap_of(r);
+  Weights w = {{0}, {0}};
+  for (int32_t y = first_of(r, part); y <= last; y += step_of(r)) {
+    float *row = state + y * TILE + r.x;
+    Share s = take_share(load_part(row, gap, part), alphas_of(curve, y, r.wide, part));
+    store_part(row, gap, part, s.left);
     if (colored) {
-      store8(row + PLANE, load8(row + PLANE) + s.weight * red);
-      store8(row + 2 * PLANE, load8(row + 2 * PLANE) + s.weight * green);
-      store8(row + 3 * PLANE, load8(row + 3 * PLANE) + s.weight * blue);
+      store_part(row + PLANE, gap, part, load_part(row + PLANE, gap, part) + s.weight * red);
+      store_part(row + 2 * PLANE, gap, part, load_part(row + 2 * PLANE, gap, part) + s.weight * green);
+      store_part(row + 3 * PLANE, gap, part, load_part(row + 3 * PLANE, gap, part) + s.weight * blue);
     }
-    weights.sum += s.weight;
-    weights.peak = sel8(s.weight > weights.peak, s.weight, weights.peak);
+    w.sum += s.weight;
+    w.peak = pick(s.weight > w.peak, s.weight, w.peak);
   }
-  return weights;
+  return w;
 }
 
-// Blend Gaussian j of a batch over the eight columns in which it shows, or over both halves of the tile.
-static inline void blend_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
+INLINE void blend_rows(float *state, Rows r, const Batch *b, int64_t j, bool colored, Weights w[PARTS]) {
   Curve curve;
-  v8f alphas[TILE];
-  trace(&curve, b, j);
-  bool wide = b->x0[j] == WIDE;
-  for (int32_t x = wide ? 0 : b->x0[j]; x <= (wide ? HALF : b->x0[j]); x += HALF) {
-    fill_alphas(alphas, &curve, x, y0, y1);
-    blend_rows(state + x, alphas, b, j, y0, y1, true);
-  }
+  trace(&curve, b, j, r);
+  for (int part = 0; part < PARTS; part++) w[part] = blend_part(state, &curve, r, b, j, colored, part);
 }
 
-// Blend Gaussian j of a batch over the whole tile, and add its weights to a row of totals.
-static inline void survey_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, bool colored,
-                              float *own) {
-  Curve curve;
-  v8f alphas[TILE];
-  Weights weights[2];
-  trace(&curve, b, j);
-  for (int half = 0; half < 2; half++) {
-    fill_alphas(alphas, &curve, half * HALF, y0, y1);
-    weights[half] = blend_rows(state + half * HALF, alphas, b, j, y0, y1, colored);
-  }
-  add_total(own, weights);
+// Blend Gaussian j of a batch over rows y0 to y1.
+INLINE void blend_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, bool colored, Weights w[PARTS]) {
+  if (b->x0[j] == WIDE) blend_rows(state, (Rows){true, 0, y0, y1}, b, j, colored, w);
+  else blend_rows(state, (Rows){false, b->x0[j], y0, y1}, b, j, colored, w);
+}
+
+// Blend Gaussian j of a batch over the whole tile, and add its weights to a row of totals: their sum, and their maximum.
+INLINE void survey_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, bool colored, float *own) {
+  Weights w[PARTS];
+  blend_rows(state, (Rows){true, 0, y0, y1}, b, j, colored, w);
+  own[0] += total(JOIN(w, sum));
+  own[1] = maxf(own[1], maximum(JOIN(w, peak)));
 }
 
 API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_ids,
@@ -76,6 +67,7 @@ API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_
   if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
   float state[4 * PLANE] __attribute__((aligned(64)));
   Batch batch;
+  Weights weights[PARTS];
   clear_batch(&batch);
   for (int64_t tile = first; tile < last; tile++) {
     Tile t = open_tile(state, 4, tile, tile_width, top + h, w);
@@ -87,7 +79,7 @@ API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_
       gather_colors(&batch, colors, flatten_ids, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++) {
         int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
-        if (y0 <= y1) blend_one(state, &batch, j, y0, y1);
+        if (y0 <= y1) blend_one(state, &batch, j, y0, y1, true, weights);
       }
       narrow_tile(&t, state);
     }
@@ -103,22 +95,22 @@ API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_
   return 0;
 }
 
+// A weighted sum of one channel over rows, by column.
+typedef struct { pixels sum; } Channel;
+
 // Weights of Gaussian j times the planes of some channels, summed over the tile.
-static inline void sum_weights(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, int channels,
-                               float *slot) {
-  v8f sums[2][CHANNELS] = {{{0}}}, alphas[TILE];
+INLINE void sum_weights(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, int channels, float *slot) {
+  Channel sums[CHANNELS][PARTS] = {{{{0}}}};
   Curve curve;
-  trace(&curve, b, j);
-  for (int half = 0; half < 2; half++) {
-    fill_alphas(alphas, &curve, half * HALF, y0, y1);
+  trace(&curve, b, j, (Rows){true, 0, y0, y1});
+  for (int part = 0; part < PARTS; part++)
     for (int32_t y = y0; y <= y1; y++) {
-      float *row = state + y * TILE + half * HALF;
-      Share s = take_share(load8(row), alphas[y]);
-      store8(row, s.left);
-      for (int c = 0; c < channels; c++) sums[half][c] += s.weight * load8(row + (c + 1) * PLANE);
+      float *row = state + y * TILE;
+      Share s = take_share(load_part(row, HALF, part), alphas_of(&curve, y, true, part));
+      store_part(row, HALF, part, s.left);
+      for (int c = 0; c < channels; c++) sums[c][part].sum += s.weight * load_part(row + (c + 1) * PLANE, HALF, part);
     }
-  }
-  for (int c = 0; c < CHANNELS; c++) slot[c] = c < channels ? total(join8(sums[0][c], sums[1][c])) : 0.f;
+  for (int c = 0; c < CHANNELS; c++) slot[c] = c < channels ? total(JOIN(sums[c], sum)) : 0.f;
 }
 
 API int32_t weighted_sums(const float *restrict conics, const int32_t *restrict flatten_ids,

@@ -13,23 +13,24 @@ enum { SUMS = 9 };
 
 // Sums over rows, by column, of the gradients of one Gaussian; v are the gradients of ln alpha.
 typedef struct {
-  v8f red, green, blue, v, vy, vyy;
+  pixels red, green, blue, v, vy, vyy;
 } Wants;
 
-// Remove Gaussian j of a batch from the pixels of rows y0 to y1, or of every second row, of eight columns; return the
-// gradients.
-static inline Wants walk_rows(float *columns, const v8f *alphas, const Batch *b, int64_t j, int32_t y0, int32_t y1,
-                              int32_t step) {
-  float my = b->my[j], red = b->red[j], green = b->green[j], blue = b->blue[j];
+// Remove Gaussian j of a batch from a part of its rows; return the gradients.
+INLINE Wants walk_part(float *state, const Curve *curve, Rows r, const Batch *b, int64_t j, int part) {
+  float red = b->red[j], green = b->green[j], blue = b->blue[j];
+  int32_t last = last_of(r, part);
+  int64_t gap = gap_of(r);
   Wants w = {{0}, {0}, {0}, {0}, {0}, {0}};
-  for (int32_t y = y0; y <= y1; y += step) {
-    float *row = columns + y * TILE, dy = (float)y - my;
-    Share s = take_share(load8(row), alphas[y]);
-    v8f g0 = load8(row + 2 * PLANE), g1 = load8(row + 3 * PLANE), g2 = load8(row + 4 * PLANE);
-    v8f own = s.weight * (red * g0 + green * g1 + blue * g2), rest = load8(row + PLANE) - own;
-    v8f v = sel8(s.goes & s.unclamped, own - s.alpha * rest / (1.f - s.alpha), splat8(0.f)), vy = v * dy;
-    store8(row, s.left);
-    store8(row + PLANE, rest);
+  for (int32_t y = first_of(r, part); y <= last; y += step_of(r)) {
+    float *row = state + y * TILE + r.x;
+    Share s = take_share(load_part(row, gap, part), alphas_of(curve, y, r.wide, part));
+    pixels g0 = load_part(row + 2 * PLANE, gap, part), g1 = load_part(row + 3 * PLANE, gap, part);
+    pixels g2 = load_part(row + 4 * PLANE, gap, part), dy = spread_rows(&curve->dy, y, r.wide, part);
+    pixels own = s.weight * (red * g0 + green * g1 + blue * g2), rest = load_part(row + PLANE, gap, part) - own;
+    pixels v = pick(s.goes & s.unclamped, own - s.alpha * rest / (1.f - s.alpha), all(0.f)), vy = v * dy;
+    store_part(row, gap, part, s.left);
+    store_part(row + PLANE, gap, part, rest);
     w.red += s.weight * g0;
     w.green += s.weight * g1;
     w.blue += s.weight * g2;
@@ -41,31 +42,25 @@ static inline Wants walk_rows(float *columns, const v8f *alphas, const Batch *b,
 }
 
 // Sum over all columns; x is the same in all rows of a lane, so moments with x are computed here.
-static inline void add_columns(Wants a, Wants b, v16f dx, float *slot) {
-  v16f v = join8(a.v, b.v), vy = join8(a.vy, b.vy), vx = v * dx;
-  v16f sums[8] = {join8(a.red, b.red), join8(a.green, b.green), join8(a.blue, b.blue), v, vx, vy, vx * dx, vy * dx};
+INLINE void add_columns(const Wants w[PARTS], v16f dx, float *slot) {
+  v16f v = JOIN(w, v), vy = JOIN(w, vy), vx = v * dx;
+  v16f sums[8] = {JOIN(w, red), JOIN(w, green), JOIN(w, blue), v, vx, vy, vx * dx, vy * dx};
   store8(slot, totals(sums));
-  slot[8] = total(join8(a.vyy, b.vyy));
+  slot[8] = total(JOIN(w, vyy));
 }
 
-// Remove Gaussian j of a batch from the pixels of rows y0 to y1 and write its gradients. There are sixteen sums by
-// column: of both halves of the tile, or of the even and the odd rows of the eight columns in which it shows.
-static inline void walk_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
+// Remove Gaussian j of a batch from its rows and write its gradients.
+INLINE void walk_rows(float *state, Rows r, const Batch *b, int64_t j, float *slot) {
   Curve curve;
-  v8f alphas[TILE];
-  trace(&curve, b, j);
-  if (b->x0[j] == WIDE) {
-    fill_alphas(alphas, &curve, 0, y0, y1);
-    Wants left = walk_rows(state, alphas, b, j, y0, y1, 1);
-    fill_alphas(alphas, &curve, HALF, y0, y1);
-    add_columns(left, walk_rows(state + HALF, alphas, b, j, y0, y1, 1), COLUMNS - b->mx[j], slot);
-  } else {
-    int32_t odd = y0 > 0 && (y1 - y0) % 2 == 0, x = b->x0[j];  // odd: the rows begin with the second one of a pair
-    fill_alphas(alphas, &curve, x, y0, y1);
-    Wants first = walk_rows(state + x, alphas, b, j, y0 + odd, y1, 2);
-    Wants second = walk_rows(state + x, alphas, b, j, y0 + 1 - odd, y1, 2);
-    add_columns(first, second, PAIR_COLUMNS + (float)x - b->mx[j], slot);
-  }
+  Wants w[PARTS];
+  trace(&curve, b, j, r);
+  for (int part = 0; part < PARTS; part++) w[part] = walk_part(state, &curve, r, b, j, part);
+  add_columns(w, columns_in(r) - b->mx[j], slot);
+}
+
+INLINE void walk_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
+  if (b->x0[j] == WIDE) walk_rows(state, (Rows){true, 0, y0, y1}, b, j, slot);
+  else walk_rows(state, (Rows){false, b->x0[j], y0, y1}, b, j, slot);
 }
 
 API int32_t blend_backward(const float *restrict conics, const int32_t *restrict flatten_ids,

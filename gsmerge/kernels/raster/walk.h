@@ -1,22 +1,14 @@
-// Shared by the blending kernels: evaluate a Gaussian of a batch over the rows of a tile, eight pixels at a time.
+// Shared by the blending kernels: evaluate a Gaussian of a batch over the rows of a tile, sixteen pixels at a time.
 //
 // The state of a tile consists of planes of 16 x 16 floats. The weights are gsplat's: alpha is clamped at 0.99 and cut
 // below 1/255, and a pixel stops before the Gaussian that would lower its transmittance to 1e-4 or below. Plane 0 of
 // the state is the transmittance; its sign bit marks pixels that have stopped.
 #pragma once
-#include "native.h"
+#include "pixels.h"
 
-enum { TILE = 16, HALF = TILE / 2, PLANE = TILE * TILE, BATCH = 32, CONIC = 8, SPLAT_COLORS = 3, WIDE = -1 };
+enum { BATCH = 32, CONIC = 8, SPLAT_COLORS = 3, WIDE = -1 };
 
-#define LN_CUT -5.541263545158426f  // ln(1/255)
-#define MAX_ALPHA 0.99f
-#define MIN_TRANSMITTANCE 1e-4f
-#define HIDDEN -1e4f  // an exponent with a weight of zero
 #define SPARE 0.02f  // tolerance for rounding, in rows and columns, around a Gaussian
-
-static const v16f COLUMNS = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
-static const v16f PAIR_COLUMNS = {0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7};  // of two rows of half a tile
-static const v8f EIGHT = {0, 1, 2, 3, 4, 5, 6, 7};
 
 // Gaussians relative to the tile's first pixel centre: ln w = lnop - (rate (x - mx - slope (y - my)))^2 - decay (y - my)^2.
 typedef struct {
@@ -26,11 +18,11 @@ typedef struct {
   int32_t x0[BATCH];  // first of the eight columns in which each shows; WIDE if it shows in more columns
 } Batch;
 
-// Share of a Gaussian in eight pixels of a row.
+// Share of a Gaussian in some pixels.
 typedef struct {
-  v8f alpha, weight;  // weight: alpha times the transmittance, 0 if the pixel stops
-  v8f left;           // transmittance behind the Gaussian; negative if the pixel has stopped
-  v8i unclamped, goes;  // masks: alpha is below 0.99; the pixel does not stop here or before
+  pixels alpha, weight;  // weight: alpha times the transmittance, 0 if the pixel stops
+  pixels left;           // transmittance behind the Gaussian; negative if the pixel has stopped
+  masks unclamped, goes;  // alpha is below 0.99; the pixel does not stop here or before
 } Share;
 
 // The tile on which a kernel works.
@@ -40,43 +32,87 @@ typedef struct {
   int32_t y_low, y_high;  // rows with pixels that have not stopped
 } Tile;
 
-// exp(p) = poly(p)^8 on [ln(1/255), 0]: a minimax polynomial with a relative error of 8e-8 for exp(p / 8), whose
-// coefficients are scaled by 8^-k.
-static inline v8f alphas_at(v8f p) {
-  v8f e = 0.99999992f
-      + p * (0.12499907f + p * (0.0078106653f + p * (3.2416797e-4f + p * (9.7100983e-6f + p * 1.7842896e-7f))));
-  e = e * e;
-  e = e * e;
-  e = e * e;
-  return sel8(p >= LN_CUT, sel8(e < MAX_ALPHA, e, splat8(MAX_ALPHA)), splat8(0.f));
-}
-
-static inline Share take_share(v8f t, v8f alpha) {
+INLINE Share take_share(pixels t, pixels alpha) {
   Share s = {alpha, alpha * t, t, alpha < MAX_ALPHA, {0}};
   s.left = t - s.weight;
   s.goes = s.left > MIN_TRANSMITTANCE;
-  s.weight = sel8(s.goes, s.weight, splat8(0.f));
-  s.left = sel8(s.goes, s.left, (v8f)((v8i)t | INT32_MIN));
+  s.weight = pick(s.goes, s.weight, all(0.f));
+  s.left = pick(s.goes, s.left, (pixels)((masks)t | INT32_MIN));
   return s;
 }
 
-// The exponents of Gaussian j of a batch: top - (rate x - base)^2 in each row of the tile, never positive beyond lnop.
-typedef struct { float base[TILE], top[TILE], rate; } Curve;
+// The part of a tile in which a Gaussian is computed, sixteen pixels at a time: whole rows, or pairs of rows of eight
+// columns.
+typedef struct {
+  bool wide;
+  int32_t x, y0, y1;  // first column, 0 for whole rows; first and last row
+} Rows;
 
-static inline void trace(Curve *c, const Batch *b, int64_t j) {
-  v16f dy = COLUMNS - b->my[j];
-  store(c->base, b->rate[j] * (b->mx[j] + b->slope[j] * dy));
-  store(c->top, b->lnop[j] - b->decay[j] * dy * dy);
-  c->rate = b->rate[j];
+// First and last row, or first and last pair of rows, which has a row of the part. The last pair ends at the last row,
+// unless the only pair begins at row 0.
+INLINE int32_t first_of(Rows r, int part) {
+  bool odd = !r.wide && r.y0 > 0 && (r.y1 - r.y0) % 2 == 0;
+  return r.y0 - odd + 2 * (PARTS == 2 && odd && part == 0);
+}
+INLINE int32_t last_of(Rows r, int part) { return r.wide || PARTS == 1 ? r.y1 : r.y1 - part; }
+INLINE int32_t step_of(Rows r) { return r.wide ? 1 : 2; }
+INLINE int64_t gap_of(Rows r) { return r.wide ? HALF : TILE; }
+INLINE v16f columns_in(Rows r) { return r.wide ? load(ROW_X) : load(PAIR_X) + (float)r.x; }
+
+// A Gaussian of a batch in the rows of a tile. Its exponents in row y are top - (rate x - base)^2, never positive beyond
+// lnop; dy is the distance of the row from the mean.
+typedef struct {
+  v16f base, top, dy;
+#if PARTS == 1
+  pixels across;  // rate x
+#else
+  pixels alphas[PARTS][TILE] __attribute__((aligned(64)));  // of both halves of each row, or of a row of pairs; there
+                                                            // are too few registers to compute them later
+#endif
+} Curve;
+
+// A number of row y, or of the pair of rows from y on, in all their pixels.
+INLINE pixels spread_rows(const v16f *numbers, int32_t y, bool wide, int part) {
+#if PARTS == 1
+  (void)part;
+  v16i rows = (wide ? (v16i){0} : (v16i){0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1}) + y;
+  return (pixels)_mm512_permutexvar_ps((__m512i)rows, (__m512)*numbers);
+#else
+  return all(((const float *)numbers)[wide ? y : y + part]);
+#endif
 }
 
-// Alphas of rows y0 to y1 over the eight columns from x on.
-static inline void fill_alphas(v8f *alphas, const Curve *c, int32_t x, int32_t y0, int32_t y1) {
-  v8f across = c->rate * (EIGHT + (float)x);
-  for (int32_t y = y0; y <= y1; y++) {
-    v8f d = across - c->base[y];
-    alphas[y] = alphas_at(c->top[y] - d * d);
+INLINE pixels alphas_on(const Curve *c, pixels across, int32_t y, bool wide, int part) {
+  pixels side = across - spread_rows(&c->base, y, wide, part);
+  return alphas_at(spread_rows(&c->top, y, wide, part) - side * side);
+}
+
+INLINE void trace(Curve *c, const Batch *b, int64_t j, Rows r) {
+  v16f y = load(ROW_X);
+  float rate = b->rate[j];
+  c->dy = y - b->my[j];
+  c->base = rate * (b->mx[j] + b->slope[j] * c->dy);
+  c->top = b->lnop[j] - b->decay[j] * c->dy * c->dy;
+#if PARTS == 1
+  c->across = rate * columns_in(r);
+  if (!r.wide)  // a pair of rows may have one that is none of the Gaussian's
+    c->top = sel((y >= (float)r.y0) & (y <= (float)r.y1), c->top, splat(HIDDEN));
+#else
+  pixels left = rate * (part_of(ROW_X, 0) + (float)r.x), right = rate * part_of(ROW_X, 1);
+  for (int32_t row = r.y0; row <= r.y1; row++) {
+    c->alphas[0][row] = alphas_on(c, left, row, true, 0);
+    if (r.wide) c->alphas[1][row] = alphas_on(c, right, row, true, 0);
   }
+#endif
+}
+
+// The alphas of row y, or of the pair of rows from y on.
+INLINE pixels alphas_of(const Curve *c, int32_t y, bool wide, int part) {
+#if PARTS == 1
+  return alphas_on(c, c->across, y, wide, part);
+#else
+  return wide ? c->alphas[part][y] : c->alphas[0][y + part];
+#endif
 }
 
 static inline float clamp_column(float x) {
@@ -226,17 +262,14 @@ static inline int32_t last_row(const Tile *tile, const Batch *b, int64_t j) {
 // Blend Gaussian j of a batch over rows y0 to y1; plane 1 receives its weights.
 static inline void weigh_rows(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
   Curve curve;
-  v8f alphas[TILE];
-  trace(&curve, b, j);
-  for (int32_t x = 0; x < TILE; x += HALF) {
-    fill_alphas(alphas, &curve, x, y0, y1);
+  trace(&curve, b, j, (Rows){true, 0, y0, y1});
+  for (int part = 0; part < PARTS; part++)
     for (int32_t y = y0; y <= y1; y++) {
-      float *row = state + y * TILE + x;
-      Share s = take_share(load8(row), alphas[y]);
-      store8(row, s.left);
-      store8(row + PLANE, s.weight);
+      float *row = state + y * TILE;
+      Share s = take_share(load_part(row, HALF, part), alphas_of(&curve, y, true, part));
+      store_part(row, HALF, part, s.left);
+      store_part(row + PLANE, HALF, part, s.weight);
     }
-  }
 }
 
 // First and last column of the tile that Gaussian j of a batch can touch.
