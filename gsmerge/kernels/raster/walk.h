@@ -59,18 +59,6 @@ INLINE int32_t step_of(Rows r) { return r.wide ? 1 : 2; }
 INLINE int64_t gap_of(Rows r) { return r.wide ? HALF : TILE; }
 INLINE v16f columns_in(Rows r) { return r.wide ? load(ROW_X) : load(PAIR_X) + (float)r.x; }
 
-// A Gaussian of a batch in the rows of a tile. Its exponents in row y are top - (rate x - base)^2, never positive beyond
-// lnop; dy is the distance of the row from the mean.
-typedef struct {
-  v16f base, top, dy;
-#if PARTS == 1
-  pixels across;  // rate x
-#else
-  pixels alphas[PARTS][TILE] __attribute__((aligned(64)));  // of both halves of each row, or of a row of pairs; there
-                                                            // are too few registers to compute them later
-#endif
-} Curve;
-
 // A number of row y, or of the pair of rows from y on, in all their pixels.
 INLINE pixels spread_rows(const v16f *numbers, int32_t y, bool wide, int part) {
 #if PARTS == 1
@@ -82,26 +70,32 @@ INLINE pixels spread_rows(const v16f *numbers, int32_t y, bool wide, int part) {
 #endif
 }
 
-INLINE pixels alphas_on(const Curve *c, pixels across, int32_t y, bool wide, int part) {
-  pixels side = across - spread_rows(&c->base, y, wide, part);
-  return alphas_at(spread_rows(&c->top, y, wide, part) - side * side);
-}
+// A Gaussian of a batch in the rows of a tile: the distances dy of the rows from the mean, and its alphas. These are
+// computed before they are used, so that those of the next row do not wait for a pixel's transmittance.
+typedef struct {
+  v16f dy;
+  float alphas[TILE][TILE] __attribute__((aligned(64)));  // by row; PARTS == 1: of the pair of rows from it on
+} Curve;
 
+// Exponents in row y are top - (rate x - base)^2, never positive beyond lnop.
 INLINE void trace(Curve *c, const Batch *b, int64_t j, Rows r) {
-  v16f y = load(ROW_X);
-  float rate = b->rate[j];
-  c->dy = y - b->my[j];
-  c->base = rate * (b->mx[j] + b->slope[j] * c->dy);
-  c->top = b->lnop[j] - b->decay[j] * c->dy * c->dy;
+  v16f y = load(ROW_X), dy = y - b->my[j];
+  v16f base = b->rate[j] * (b->mx[j] + b->slope[j] * dy), top = b->lnop[j] - b->decay[j] * dy * dy;
+  c->dy = dy;
 #if PARTS == 1
-  c->across = rate * columns_in(r);
-  if (!r.wide)  // a pair of rows may have one that is none of the Gaussian's
-    c->top = sel((y >= (float)r.y0) & (y <= (float)r.y1), c->top, splat(HIDDEN));
+  v16f across = b->rate[j] * columns_in(r);
+  if (!r.wide)  // a pair may have one row that is none of the Gaussian's
+    top = sel((y >= (float)r.y0) & (y <= (float)r.y1), top, splat(HIDDEN));
+  for (int32_t row = first_of(r, 0); row <= r.y1; row += step_of(r)) {
+    pixels side = across - spread_rows(&base, row, r.wide, 0);
+    store(c->alphas[row], alphas_at(spread_rows(&top, row, r.wide, 0) - side * side));
+  }
 #else
-  pixels left = rate * (part_of(ROW_X, 0) + (float)r.x), right = rate * part_of(ROW_X, 1);
+  pixels left = b->rate[j] * (part_of(ROW_X, 0) + (float)r.x), right = b->rate[j] * part_of(ROW_X, 1);
   for (int32_t row = r.y0; row <= r.y1; row++) {
-    c->alphas[0][row] = alphas_on(c, left, row, true, 0);
-    if (r.wide) c->alphas[1][row] = alphas_on(c, right, row, true, 0);
+    pixels middle = spread_rows(&base, row, true, 0), highest = spread_rows(&top, row, true, 0);
+    store8(c->alphas[row], alphas_at(highest - (left - middle) * (left - middle)));
+    if (r.wide) store8(c->alphas[row] + HALF, alphas_at(highest - (right - middle) * (right - middle)));
   }
 #endif
 }
@@ -109,9 +103,10 @@ INLINE void trace(Curve *c, const Batch *b, int64_t j, Rows r) {
 // The alphas of row y, or of the pair of rows from y on.
 INLINE pixels alphas_of(const Curve *c, int32_t y, bool wide, int part) {
 #if PARTS == 1
-  return alphas_on(c, c->across, y, wide, part);
+  (void)wide, (void)part;
+  return load(c->alphas[y]);
 #else
-  return wide ? c->alphas[part][y] : c->alphas[0][y + part];
+  return load8(wide ? c->alphas[y] + HALF * part : c->alphas[y + part]);
 #endif
 }
 
