@@ -123,6 +123,15 @@ static inline void gather(Block *b, int64_t j, Step s, const float *scale, float
   for (int c = 0; c < 3; c++) b->rows[j][COLOR + c] = color[c];
 }
 
+// Fetch a row, which may lie in two lines of the cache, before it is used.
+static inline void fetch(int64_t at, const float *x, const float *x0, const float *m, const float *v) {
+  const float *tables[4] = {x, x0, m, v};
+  for (int k = 0; k < 4; k++) {
+    __builtin_prefetch(tables[k] + at);
+    __builtin_prefetch(tables[k] + at + COLUMNS - 1);
+  }
+}
+
 API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m, float *restrict v,
                  const float *restrict units, const float *restrict box_shares,
                  const float *restrict min_sizes, const uint8_t *restrict fixed,
@@ -158,6 +167,7 @@ API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m,
       gradients[size] = next;
       size += !fixed[ids[next]];
     }
+    for (int64_t k = next; k < mini(next + BLOCK, last); k++) fetch(COLUMNS * (int64_t)ids[k], x, x0, m, v);
     for (int64_t j = 0; j < size; j++) {
       int64_t i = rows[j], g = gradients[j];
       b.unit[j] = units[i];
