@@ -65,7 +65,7 @@ def means(records: list[dict[str, Any]], version: str, key: str, worst: str | No
     """Return the mean of a number over the captures at each point.
 
     Args:
-        worst: Name of the version whose worse half of the captures, by the PSNR of its defaults, is averaged; None: all.
+        worst: Version whose worse half of the captures, by the PSNR of its defaults, is averaged; None: all are.
     """
     captures = sorted({record["capture"] for record in records})
     if worst is not None:
@@ -81,7 +81,7 @@ def value_of(records: list[dict[str, Any]], version: str, point: str, capture: s
 
 
 def seconds_for(seconds: np.ndarray, values: np.ndarray, wanted: float) -> float:
-    """Return the seconds at which a quality, of which more is better, first reaches a value; infinite if it does not."""
+    """Return the seconds at which a quality, of which more is better, reaches a value; infinite if it does not."""
     if values[0] >= wanted:
         return float(seconds[0])
     for i in range(1, len(values)):
