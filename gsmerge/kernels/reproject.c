@@ -36,6 +36,27 @@ static inline int show(const float *point, const double *viewmat, const double *
   return 1;
 }
 
+enum { BLOCK = 64 };  // points that are projected together, in loops that vectorise
+
+API void mark_pixels(const double *points, const double *viewmat, const double *K, double near, uint8_t *hit, int64_t n,
+                     int64_t height, int64_t width) {
+  double x[BLOCK], y[BLOCK], z[BLOCK];
+  for (int64_t start = 0; start < n; start += BLOCK) {
+    const double *block = points + 3 * start;
+    int64_t count = mini(BLOCK, n - start);
+    for (int64_t i = 0; i < count; i++) {
+      double camera[3];
+      for (int c = 0; c < 3; c++) camera[c] = row_times(viewmat + 4 * c, block + 3 * i) + viewmat[4 * c + 3];
+      z[i] = row_times(K + 6, camera);
+      x[i] = row_times(K, camera) / z[i];
+      y[i] = row_times(K + 3, camera) / z[i];
+    }
+    for (int64_t i = 0; i < count; i++)
+      if (z[i] > near && x[i] >= 0.0 && x[i] < (double)width && y[i] >= 0.0 && y[i] < (double)height)
+        hit[(int64_t)y[i] * width + (int64_t)x[i]] = 1;
+  }
+}
+
 API void nearest_centres(const float *points, const double *viewmats, const double *Ks, int64_t *ids,
                          double *squares, int32_t *seen, int64_t width, int64_t height, int64_t n, int64_t v) {
   for (int64_t i = 0; i < n; i++) {

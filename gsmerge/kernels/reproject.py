@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsmerge.kernels.signature import COUNT, STATUS, f4, f8, i4, i8, native
+from gsmerge.kernels.signature import COUNT, STATUS, f4, f8, i4, i8, native, u1
 
 
 @native(
@@ -14,6 +14,11 @@ def pixel_errors(points, views, viewmats, Ks, pixels, errors):
 
     They are inf for points behind the camera.
     """
+
+
+@native(points=f8("n", 3), viewmat=f8(4, 4), K=f8(3, 3), near=f8(), hit=u1("height", "width", out=True))
+def mark_pixels(points, viewmat, K, near, hit):
+    """Write 1 to the pixels of a view in which points beyond the depth ``near`` lie; other pixels stay unchanged."""
 
 
 @native(

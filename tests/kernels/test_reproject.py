@@ -7,7 +7,7 @@ import pytest
 
 from gsmerge.geometry import motion_matrices, project_points
 from gsmerge.kernels.elementary import exp
-from gsmerge.kernels.reproject import follow_pixels, linearise, nearest_centres, pixel_errors
+from gsmerge.kernels.reproject import follow_pixels, linearise, mark_pixels, nearest_centres, pixel_errors
 
 K = np.array([[300.0, 0, 150], [0, 310, 110], [0, 0, 1]])
 STEP = 1e-6
@@ -50,6 +50,22 @@ def places_of(points: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.nda
         places, depths = project_points(points.astype(np.float64)[None], poses, np.tile(K, (len(poses), 1, 1)))
         x, y = np.moveaxis(places, -1, 0)
         return places, (depths > 0) & (x >= 0) & (x < 300) & (y >= 0) & (y < 220)
+
+
+@pytest.mark.parametrize("near", [0.0, 2.5])
+def test_marked_pixels_are_those_of_the_points_beyond_the_near_plane(near: float) -> None:
+    rng = np.random.default_rng(0)
+    points, pose = rng.normal(0, 3, (4000, 3)), make_poses(1, rng)
+    points[:3] = np.nan, np.inf, 1e300
+    hit, expected = np.zeros((220, 300), np.uint8), np.zeros((220, 300), np.uint8)
+    hit[5, 7] = expected[5, 7] = 3
+    mark_pixels(points, pose[0], K, near, hit)
+    (places,), (shown,) = places_of(points, pose)
+    shown &= project_points(points, pose[0], K)[1] > near
+    column, row = places[shown].astype(np.int64).T
+    expected[row, column] = 1
+    assert np.array_equal(hit, expected)
+    assert 100 < expected.sum() < 4000
 
 
 @pytest.mark.parametrize("seed", range(3))
