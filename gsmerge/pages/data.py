@@ -330,10 +330,13 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     means = mean_colors(photo, labels)
     light = means.mean(1, keepdims=True) > 0.5
     shifted = means + OUTLINE_SHIFT * (np.where(light, 0.0, 1.0) - means)
-    levels = np.round((OUTLINE_LEVELS - 1) * shifted) * (255 // (OUTLINE_LEVELS - 1))
-    colors, color_ids = np.unique(levels.astype(np.uint8), axis=0, return_inverse=True)
+    red, green, blue = np.round((OUTLINE_LEVELS - 1) * shifted).astype(np.int64).T
+    codes = (red * OUTLINE_LEVELS + green) * OUTLINE_LEVELS + blue
+    is_used = np.bincount(codes, minlength=OUTLINE_LEVELS**3) > 0
+    levels = np.stack(np.unravel_index(np.flatnonzero(is_used), (OUTLINE_LEVELS,) * 3), 1)
+    colors, color_ids = (levels * (255 // (OUTLINE_LEVELS - 1))).astype(np.uint8), np.cumsum(is_used, dtype=np.uint8)
     factor = max(1, OUTLINE_SIDE // max(labels.shape))
-    drawn = draw_borders(labels, 1 + color_ids.reshape(-1).astype(np.uint8), factor)
+    drawn = draw_borders(labels, color_ids[codes], factor)  # numbers of colours from 1 on
     return encode_indexed(drawn, np.pad(colors, ((1, 0), (0, 0))))  # index 0 is transparent
 
 
