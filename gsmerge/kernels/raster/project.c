@@ -178,3 +178,12 @@ API int32_t project(const float *restrict means, const float *restrict quats,
   }
   return 0;
 }
+
+API void shift_means(const float *restrict means, const double *restrict origin, float *restrict out, int64_t n) {
+  double shift[3 * ROW];
+  for (int i = 0; i < 3 * ROW; i++) shift[i] = origin[i % 3];
+  int64_t i = 0;
+  for (; i + 3 * ROW <= 3 * n; i += 3 * ROW)
+    for (int j = 0; j < 3 * ROW; j++) out[i + j] = (float)((double)means[i + j] - shift[j]);
+  for (int j = 0; i < 3 * n; i++, j++) out[i] = (float)((double)means[i] - shift[j]);
+}
