@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmerge.arrays import Array, as_array
 from gsmerge.kernels.elementary import log10
-from gsmerge.kernels.pictures import blur
+from gsmerge.kernels.pictures import compare_windows
 
 WINDOW, SIGMA = 11, 1.5  # side of the windows of SSIM and their standard deviation, pixels
 INNER = (slice(WINDOW // 2, -(WINDOW // 2)), slice(WINDOW // 2, -(WINDOW // 2)))  # centres of windows in the image
@@ -117,23 +117,9 @@ def ssim_within(image: Array, reference: Array, masks: Sequence[Array | None]) -
     first, second = image_pair(image, reference)
     if min(first.shape[:2]) < WINDOW:
         return [None] * len(masks)
-    similarities = _similarity_map(first, second)
+    similarities = compare_windows(first, second, SIGMA, WINDOW, C1, C2)
     inner = [None if mask is None else pixel_mask(mask, first)[INNER] for mask in masks]
     return [
         float(_select(similarities, mask).mean(dtype=np.float64)) if mask is None or mask.any() else None
         for mask in inner
     ]
-
-
-def _similarity_map(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the similarity ``[h-10,w-10,c]`` of each window of two images; their mean is the :func:`ssim`."""
-    # Variances are small differences of large numbers. With centred values float32 is exact enough.
-    x, y = first.astype(np.float32) - np.float32(0.5), second.astype(np.float32) - np.float32(0.5)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return blur(values, SIGMA, WINDOW)[INNER]
-
-    ux, uy = mean(x), mean(y)
-    variances, covariance = mean(x * x + y * y) - ux * ux - uy * uy, mean(x * y) - ux * uy
-    ux, uy = ux + np.float32(0.5), uy + np.float32(0.5)
-    return np.asarray((2 * ux * uy + C1) * (2 * covariance + C2) / ((ux * ux + uy * uy + C1) * (variances + C2)))
