@@ -50,7 +50,8 @@ class Payloads:
 
     def add_uris(self, pictures: Sequence[bytes | None], kind: str = "image/webp") -> list[str | None]:
         """Add pictures, and return ``data:`` addresses with their marks; None stays None."""
-        return [picture and f"data:{kind};base64,{self.add(picture)}" for picture in pictures]
+        head = f"data:{kind};base64,"
+        return [None if picture is None else head + self.add(picture) for picture in pictures]
 
     def insert(self, page: str) -> bytes:
         """Put the contents in place of their marks, each where it stands; the page in UTF-8."""

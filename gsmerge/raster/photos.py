@@ -265,9 +265,9 @@ def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: in
     mask = _scored_pixels(photos, view, quarter=quarter)
     covered = covered if mask is None else covered & mask
     share = float(covered.sum() / (covered.size if mask is None else max(1, mask.sum())))
-    partly = [covered] if 0 < share < WHOLE else []
-    psnr_of_all, *psnrs = psnr_within(np.clip(image, 0, 1, out=image), photos.images[view], [mask, *partly])
-    return RenderScore(psnr_of_all, *(psnrs or [psnr_of_all if share else math.nan]), share, covered)
+    masks = [mask, covered] if 0 < share < WHOLE else [mask]
+    psnrs = psnr_within(np.clip(image, 0, 1, out=image), photos.images[view], masks)
+    return RenderScore(psnrs[0], psnrs[-1] if share else math.nan, share, covered)
 
 
 def _scored_pixels(photos: Photos, view: int, *, quarter: bool) -> np.ndarray | None:
