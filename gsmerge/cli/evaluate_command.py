@@ -164,7 +164,8 @@ def _write(
     from gsmerge.report import to_json
 
     writers = {".json": to_json, ".csv": evaluation_csv, ".md": evaluation_markdown}
-    texts = {path: writers[path.suffix](document) for path in outputs if path.suffix in writers}
+    texts: dict[Path, str | bytes] = {}
+    texts |= {path: writers[path.suffix](document) for path in outputs if path.suffix in writers}
     if stills:
         from gsmerge.pages.data import page_data
         from gsmerge.pages.page import view_page

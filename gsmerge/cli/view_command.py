@@ -64,13 +64,7 @@ def view(args: opt.Args) -> None:
     say_notes(data.notes, quiet=args.silent)
     summary = headline(data) + speed_words(speed(data)).replace("\u00a0", " ")
     notes = [*pair.notes, *data.notes]
-    document = {
-        **document_head(),
-        "output": str(output),
-        "notes": notes,
-        "bytes": len(page.encode()),
-        "headline": summary,
-    }
+    document = {**document_head(), "output": str(output), "notes": notes, "bytes": len(page), "headline": summary}
     print_document(document, f"{output}: {summary}", as_json=args.json, quiet=args.quiet)
     if args.open and not _open(output):
         say(f"open {output.absolute().as_uri()} in a browser", quiet=args.silent)

@@ -67,3 +67,52 @@ API int32_t sample_picture(const float *restrict picture, const float *restrict 
     sample_at(picture, x[i], y[i], height, width, channels, out + i * channels);
   return 0;
 }
+
+enum { PLANES = 4 };  // of windows: means of x, y, x x + y y and x y
+
+// The numbers of a row of both pictures, whose means the windows need. Products are separate statements, so that each is
+// rounded by itself.
+static void multiply_row(const float *restrict x, const float *restrict y, float *restrict squares,
+                         float *restrict products, int64_t n) {
+  for (int64_t i = 0; i < n; i++) {
+    float xx = x[i] * x[i], yy = y[i] * y[i], xy = x[i] * y[i];
+    squares[i] = xx + yy;
+    products[i] = xy;
+  }
+}
+
+// Similarities of the windows of a row, from their means.
+static void compare_row(const float *restrict means, float c1, float c2, float *restrict out, int64_t n) {
+  for (int64_t i = 0; i < n; i++) {
+    float ux = means[i], uy = means[n + i], uxx = ux * ux, uyy = uy * uy, uxy = ux * uy;
+    float variances = means[2 * n + i] - uxx, covariance = means[3 * n + i] - uxy;
+    variances = variances - uyy;
+    ux = ux + 0.5f, uy = uy + 0.5f;  // pictures are centred
+    float twice = 2.f * ux, mean = twice * uy, related = 2.f * covariance;
+    float over = mean + c1, by = related + c2, above = over * by;
+    float xx = ux * ux, yy = uy * uy, lengths = xx + yy;
+    lengths = lengths + c1;
+    float spread = variances + c2, below = lengths * spread;
+    out[i] = above / below;
+  }
+}
+
+API int32_t compare_windows(const float *restrict x, const float *restrict y, const float *restrict taps, float c1,
+                            float c2, float *restrict row, float *restrict across, float *restrict means,
+                            float *restrict out, int64_t height, int64_t width, int64_t channels, int64_t size,
+                            int64_t room, int64_t rows, int64_t inner_width, int64_t inner_height) {
+  int64_t whole = width * channels, n = inner_width * channels;
+  if (inner_height != height - size + 1 || inner_width != width - size + 1 || size < 1 || inner_height < 1
+      || inner_width < 1 || room != 2 * whole || rows != PLANES)
+    return OUTSIDE;
+  for (int64_t line = 0; line < height; line++) {
+    const float *from[PLANES] = {x + line * whole, y + line * whole, row, row + whole};
+    multiply_row(from[0], from[1], row, row + whole, whole);
+    for (int p = 0; p < PLANES; p++) weigh(from[p], taps, size, channels, across + (p * height + line) * n, n);
+  }
+  for (int64_t line = 0; line < inner_height; line++) {
+    for (int p = 0; p < PLANES; p++) weigh(across + (p * height + line) * n, taps, size, n, means + p * n, n);
+    compare_row(means, c1, c2, out + line * n, n);
+  }
+  return 0;
+}

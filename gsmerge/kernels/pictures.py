@@ -22,6 +22,15 @@ _filter_picture = declare(
 )  # fmt: skip
 
 
+_compare_windows = declare(
+    "compare_windows", STATUS, x=f4("height", "width", "channels"), y=f4("height", "width", "channels"),
+    taps=f4("size"), c1=f4(), c2=f4(), row=f4("room", out=True),
+    across=f4("rows", "height", "inner_width", "channels", out=True),
+    means=f4("rows", "inner_width", "channels", out=True),
+    out=f4("inner_height", "inner_width", "channels", out=True),
+)  # fmt: skip
+
+
 _sample_picture = declare(
     "sample_picture", STATUS, picture=f4("height", "width", "channels"), x=f4("n"), y=f4("n"),
     out=f4("n", "channels", out=True),
@@ -49,11 +58,31 @@ def blur(picture: Picture, sigma: float, size: int | None = None) -> Picture:
 
     ``size`` is the odd number of pixels of the filter, by default all pixels within four ``sigma``.
     """
-    size = round(8 * sigma + 1) | 1 if size is None else size
+    taps = _gaussian_taps(sigma, round(8 * sigma + 1) | 1 if size is None else size)
+    return convolve(picture, taps, taps)
+
+
+def _gaussian_taps(sigma: float, size: int) -> np.ndarray:
+    """Return the weights ``[size]`` of a Gaussian of ``sigma`` pixels, in an odd number of pixels."""
     offsets = np.arange(size) - size // 2
     weights = exp(offsets**2 * (-0.5 / sigma**2))
-    taps = weights / weights.sum()
-    return convolve(picture, taps, taps)
+    return weights / weights.sum()
+
+
+def compare_windows(first: Picture, second: Picture, sigma: float, size: int, c1: float, c2: float) -> Picture:
+    """Return the similarity (SSIM) of each Gaussian window of two pictures ``[h,w,c]`` in [0, 1]; float32.
+
+    Windows have ``size`` pixels per side and a ``sigma`` in pixels. Those that lie inside the pictures are compared,
+    ``[h-size+1,w-size+1,c]``. ``c1`` and ``c2`` stabilise quotients of means and of variances.
+    """
+    # Variances are small differences of large numbers. With centred values float32 is exact enough.
+    x, y = (np.ascontiguousarray(picture, np.float32) - np.float32(0.5) for picture in (first, second))
+    (height, width, channels), inner_width = x.shape, x.shape[1] - size + 1
+    row, across = np.empty(2 * width * channels, np.float32), np.empty((4, height, inner_width, channels), np.float32)
+    means, out = np.empty_like(across[:, 0]), np.empty_like(across[0, size - 1 :])
+    taps = _gaussian_taps(sigma, size).astype(np.float32)
+    _compare_windows(x, y, taps, c1, c2, row, across, means, out)
+    return out
 
 
 def sobel(picture: Picture) -> tuple[Picture, Picture]:

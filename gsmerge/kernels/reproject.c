@@ -1,5 +1,5 @@
-// Measure the distances of projected points from their pixels.
-#include "native.h"
+// Project points into views: measure distances from their pixels, mark pixels, and compare colours with photos.
+#include "bilinear.h"
 
 // Rows of a matrix times a vector, in the order of multiply_matrices.
 static inline double row_times(const double *row, const double *v) {
@@ -23,27 +23,69 @@ API int32_t pixel_errors(const double *points, const int64_t *views, const doubl
   return 0;
 }
 
-// Project a point into a camera, pixels; return 1 if it is inside the image, otherwise 0.
-static inline int show(const float *point, const double *viewmat, const double *K, int64_t width, int64_t height,
-                       double place[2]) {
-  double world[3] = {point[0], point[1], point[2]}, camera[3], image[3];
-  for (int c = 0; c < 3; c++) camera[c] = row_times(viewmat + 4 * c, world) + viewmat[4 * c + 3];
+// Project a point into a camera: its place, pixels, and its depth. Return 1 if it is inside the image, otherwise 0.
+static inline int show(const double point[3], const double *viewmat, const double *K, int64_t width, int64_t height,
+                       double place[3]) {
+  double camera[3], image[3];
+  for (int c = 0; c < 3; c++) camera[c] = row_times(viewmat + 4 * c, point) + viewmat[4 * c + 3];
   if (!(camera[2] > 0.0)) return 0;
   for (int c = 0; c < 3; c++) image[c] = row_times(K + 3 * c, camera);
   double x = image[0] / image[2], y = image[1] / image[2];
   if (!(x >= 0.0 && x < (double)width && y >= 0.0 && y < (double)height)) return 0;
-  place[0] = x, place[1] = y;
+  place[0] = x, place[1] = y, place[2] = camera[2];
   return 1;
+}
+
+enum { BLOCK = 64 };  // points that are projected together, in loops that vectorise
+
+API void mark_pixels(const double *points, const double *viewmat, const double *K, double near, uint8_t *hit, int64_t n,
+                     int64_t height, int64_t width) {
+  double x[BLOCK], y[BLOCK], z[BLOCK];
+  for (int64_t start = 0; start < n; start += BLOCK) {
+    const double *block = points + 3 * start;
+    int64_t count = mini(BLOCK, n - start);
+    for (int64_t i = 0; i < count; i++) {
+      double camera[3];
+      for (int c = 0; c < 3; c++) camera[c] = row_times(viewmat + 4 * c, block + 3 * i) + viewmat[4 * c + 3];
+      z[i] = row_times(K + 6, camera);
+      x[i] = row_times(K, camera) / z[i];
+      y[i] = row_times(K + 3, camera) / z[i];
+    }
+    for (int64_t i = 0; i < count; i++)
+      if (z[i] > near && x[i] >= 0.0 && x[i] < (double)width && y[i] >= 0.0 && y[i] < (double)height)
+        hit[(int64_t)y[i] * width + (int64_t)x[i]] = 1;
+  }
+}
+
+API void add_photo_errors(const double *points, const float *colors, const double *viewmat, const double *K,
+                          const float *photo, const float *depths, const uint8_t *mask, float behind, float most,
+                          float *sums, float *counts, int64_t n, int64_t height, int64_t width) {
+  for (int64_t i = 0; i < n; i++) {
+    if (counts[i] >= most) continue;
+    double place[3];
+    if (!show(points + 3 * i, viewmat, K, width, height, place)) continue;
+    int64_t pixel = (int64_t)place[1] * width + (int64_t)place[0];
+    float farthest = behind * depths[pixel], shown[3];
+    if (!(place[2] < (double)farthest) || (mask && !mask[pixel])) continue;
+    sample_at(photo, (float)(place[0] - 0.5), (float)(place[1] - 0.5), height, width, 3, shown);
+    float sum = 0.f;
+    for (int c = 0; c < 3; c++) {
+      float difference = shown[c] - colors[3 * i + c];
+      sum += absf4(difference);
+    }
+    sums[i] += sum / 3.f;
+    counts[i] += 1.f;
+  }
 }
 
 API void nearest_centres(const float *points, const double *viewmats, const double *Ks, int64_t *ids,
                          double *squares, int32_t *seen, int64_t width, int64_t height, int64_t n, int64_t v) {
   for (int64_t i = 0; i < n; i++) {
-    double nearest = __builtin_inf(), place[2];
+    double nearest = __builtin_inf(), point[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]}, place[3];
     int64_t id = -1;
     int32_t count = 0;
     for (int64_t view = 0; view < v; view++) {
-      if (!show(points + 3 * i, viewmats + 16 * view, Ks + 9 * view, width, height, place)) continue;
+      if (!show(point, viewmats + 16 * view, Ks + 9 * view, width, height, place)) continue;
       int64_t column = (int64_t)place[0], row = (int64_t)place[1];
       double right = place[0] - ((double)column + 0.5), down = place[1] - ((double)row + 0.5);
       double xx = right * right, yy = down * down, square = xx + yy;  // separate products are not fused with the sum
@@ -62,12 +104,13 @@ API int64_t follow_pixels(const float *points, const double *viewmats, const dou
                           int64_t height, int32_t mixed, int64_t n, int64_t v, int64_t m) {
   int64_t length = 0, area = width * height;
   if (m != n * v) return -1;
-  double place[2];
+  double place[3];
   for (int64_t i = 0; i < n; i++) {
+    double point[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
     int64_t count = 0;
     ids[i] = -1;
     for (int64_t view = 0; view < v; view++) {
-      if (!show(points + 3 * i, viewmats + 16 * view, Ks + 9 * view, width, height, place)) continue;
+      if (!show(point, viewmats + 16 * view, Ks + 9 * view, width, height, place)) continue;
       int64_t pixel = (int64_t)place[1] * width + (int64_t)place[0], at = count++;
       int64_t key = mixed ? pixel * v + view : view * area + pixel;
       for (; at > 0 && keys[at - 1] < key; at--) keys[at] = keys[at - 1], views[at] = views[at - 1];
@@ -87,7 +130,8 @@ API int64_t follow_pixels(const float *points, const double *viewmats, const dou
   }
   for (int64_t number = length ? ends[length - 1] : -1; number >= 0; number = before[number]) {
     int64_t i = number / v, view = number % v;
-    show(points + 3 * i, viewmats + 16 * view, Ks + 9 * view, width, height, place);
+    double point[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
+    show(point, viewmats + 16 * view, Ks + 9 * view, width, height, place);
     ids[i] = (view * height + (int64_t)place[1]) * width + (int64_t)place[0];
   }
   return length;

@@ -15,8 +15,8 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frame import scene_frame
-from gsmerge.geometry import is_inside, project
-from gsmerge.kernels.pictures import blur, sample_bilinear
+from gsmerge.kernels.pictures import blur
+from gsmerge.kernels.reproject import add_photo_errors
 from gsmerge.measure.preview import Picture, contact_sheet, to_picture
 from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
 from gsmerge.measure.visibility import lift_pixels
@@ -74,13 +74,8 @@ def expected_errors(reference: ErrorReference, camera: Cameras, own: int | None 
     ids = np.flatnonzero(depth > 0)
     points, colors = lift_pixels(depth, depth > 0, camera), image.reshape(-1, 3).take(ids, 0)
     sums, counts = np.zeros((2, len(ids)), np.float32)
-    open_rows = np.arange(len(ids))  # surface points that need more photos
     for view in _nearest(reference.views.cameras, camera, own):
-        rows, photo_colors = _see_points(reference, view, points, open_rows)
-        differences = np.abs(photo_colors - colors.take(rows, 0))
-        sums[rows] += (differences[:, 0] + differences[:, 1] + differences[:, 2]) / np.float32(3)
-        counts[rows] += 1
-        open_rows = open_rows.compress(counts.take(open_rows) < COUNTED)
+        _add_errors(reference, view, points, colors, sums, counts)
     means, known = np.zeros((2, depth.size), np.float32)
     means[ids], known[ids] = sums / np.maximum(counts, 1), counts > 0
     layers = np.stack([means, known], 1).reshape(*depth.shape, 2)
@@ -89,24 +84,18 @@ def expected_errors(reference: ErrorReference, camera: Cameras, own: int | None 
     return np.where(layers[..., 1] > 0, smooth, np.float32(np.nan))
 
 
-def _see_points(
-    reference: ErrorReference, view: int, points: np.ndarray, rows: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Select the ``rows [m]`` of ``points [n,3]`` that a view's photo shows; also return its colours there, ``[k,3]``.
+def _add_errors(
+    reference: ErrorReference, view: int, points: np.ndarray, colors: np.ndarray, sums: np.ndarray, counts: np.ndarray
+) -> None:
+    """Add the errors of ``points [n,3]`` with ``colors [n,3]`` in a view's photo to ``sums [n]``, and 1 to ``counts``.
 
     A photo shows a point that is inside the picture and the mask, and that no drawn surface hides.
     """
-    cameras = reference.views.cameras
-    (pixels,), (depths,) = project(points.take(rows, 0), cameras[[view]])
-    inside = np.flatnonzero((depths > 0) & is_inside(pixels, cameras))
-    pixels, rows = pixels.take(inside, 0), rows.take(inside)
-    column, row = pixels.astype(np.int64).T
-    pixel_ids = row * cameras.width + column
-    shown = depths.take(inside) < BEHIND * reference.draw(view)[1].reshape(-1).take(pixel_ids)
-    if reference.masks is not None:
-        shown &= reference.masks[view].reshape(-1).take(pixel_ids)
-    pixels, rows = pixels.compress(shown, 0), rows.compress(shown)
-    return rows, sample_bilinear(reference.views.images[view], *(pixels.T - 0.5))
+    views, masks = reference.views, reference.masks
+    viewmat, K = (array[view].astype(np.float64) for array in (views.cameras.viewmats, views.cameras.Ks))
+    mask = None if masks is None else np.ascontiguousarray(masks[view]).view(np.uint8)
+    photo, depths = (np.ascontiguousarray(array, np.float32) for array in (views.images[view], reference.draw(view)[1]))
+    add_photo_errors(points, colors, viewmat, K, photo, depths, mask, BEHIND, COUNTED, sums, counts)
 
 
 def draw_errors(errors: np.ndarray) -> Picture:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from itertools import count
 
@@ -22,7 +21,7 @@ from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.raster import render
-from gsmerge.raster.metrics import describe_loss, psnr, ssim
+from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
 from gsmerge.raster.photos import COVERED, NEAR_PLANE, WHOLE
 from gsmerge.report import html_table
 from gsmerge.runtime.record import Progress
@@ -370,13 +369,13 @@ def _score_view(
     nets: Sequence[str],
 ) -> ViewScore:
     """Add to a score the quality of a render over all pixels, over the seen pixels, and over the ``covered`` pixels."""
-    photo = split.views.images[view]
-    full, masked = _both(image, photo, split.visible[view], nets)
+    photo, seen = split.views.images[view], split.visible[view]
+    share = None if covered is None else float(covered.mean())
+    inside = covered if share is not None and share < WHOLE else None
+    full, masked, covered_quality = _qualities(image, photo, (None, seen, inside))
+    full, masked = _add_lpips((full, masked), image, photo, seen, nets)
     score = replace(score, full=full, masked=masked)
-    if covered is None:
-        return score
-    share, quality = _covered(image, photo, covered)
-    return replace(score, covered_share=share, covered=quality or _without_lpips(full))
+    return score if share is None else replace(score, covered_share=share, covered=covered_quality)
 
 
 def _score_zooms(
@@ -403,12 +402,6 @@ def _join(
     return float(np.median([seconds for seconds, _ in rows])), tuple(score for _, score in rows)
 
 
-def _covered(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) -> tuple[float, Quality | None]:
-    """Measure the share of pixels in a mask, and PSNR and SSIM over them; None, for all, if nearly all are in it."""
-    share = float(mask.mean())
-    return share, None if share >= WHOLE else _quality(image, photo, mask, ()) if share > 0 else Quality()
-
-
 def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, renderer: _Renderer) -> Pair:
     """Score a render at another size against the photo, or the render of the input, at that size."""
     cameras = zoom_cameras(split.views.cameras, zoom)
@@ -418,27 +411,31 @@ def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, ren
     else:
         photo = renderer.image(split.drawn, cameras, view)
     image, seen = renderer.image(gaussians, cameras, view), resize_mask(split.visible[view], *size)
-    return _both(image, photo, seen, ())
+    full, masked = _qualities(image, photo, (None, seen))
+    return full, masked
 
 
-def _both(image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]) -> Pair:
-    """Measure the quality over all pixels, and over the pixels that the input views have seen."""
-    full = _quality(image, photo, None, nets)
-    return full, full if seen.all() else _quality(image, photo, seen, nets) if seen.any() else Quality()
+def _qualities(image: np.ndarray, photo: np.ndarray, masks: Sequence[NDArray[np.bool_] | None]) -> list[Quality]:
+    """Measure PSNR and SSIM of an image over the pixels in each mask; None: all. An empty mask has no measures."""
+    pixels = [None if mask is None or mask.all() else mask for mask in masks]
+    shown = [mask for mask in pixels if mask is None or mask.any()]
+    scores = iter(zip(psnr_within(image, photo, shown), ssim_within(image, photo, shown), strict=True))
+    return [Quality(*next(scores)) if mask is None or mask.any() else Quality() for mask in pixels]
 
 
-def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None, nets: Sequence[str]) -> Quality:
-    """Measure the quality of an image over the pixels in a mask; None: over all."""
-    similarity: float | None = None
-    distances: dict[str, float] = {}
-    with suppress(ValueError):  # the image is smaller than a window of SSIM
-        similarity = ssim(image, photo, mask)
-    if nets:
-        from gsmerge.measure.lpips import lpips, min_size
+def _add_lpips(pair: Pair, image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]) -> Pair:
+    """Add LPIPS to the qualities over all pixels, and over the pixels that the input views have seen."""
+    if not nets:
+        return pair
+    from gsmerge.measure.lpips import lpips, min_size
 
-        side = min(image.shape[:2])
-        distances = {f"lpips_{net}": lpips(image, photo, net, mask) for net in nets if side >= min_size(net)}
-    return Quality(psnr(image, photo, mask), similarity, **distances)
+    fitting = [net for net in nets if min(image.shape[:2]) >= min_size(net)]
+
+    def add(quality: Quality, mask: NDArray[np.bool_] | None) -> Quality:
+        return replace(quality, **{f"lpips_{net}": lpips(image, photo, net, mask) for net in fitting})
+
+    full = add(pair[0], None)
+    return full, full if seen.all() else add(pair[1], seen) if seen.any() else pair[1]
 
 
 def _mean(scores: Sequence[Quality]) -> Quality:

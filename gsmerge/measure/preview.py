@@ -144,11 +144,14 @@ def draw_borders(labels: np.ndarray, ids: np.ndarray, factor: int) -> NDArray[np
 
     A border has the value in ``ids [k]`` uint8 of the label to its right or below it. All other pixels are 0.
     """
-    (height, width), own = labels.shape, ids[labels]
-    drawn = np.zeros((height, factor, width, factor), np.uint8)
-    drawn[:, :, 1:, 0] = np.where(labels[:, 1:] != labels[:, :-1], own[:, 1:], 0)[:, None]
-    drawn[1:, 0] = np.where((labels[1:] != labels[:-1])[..., None], own[1:, :, None], drawn[1:, 0])
-    return drawn.reshape(height * factor, width * factor)
+    (height, width), own = labels.shape, ids.take(labels)
+    right, down = np.zeros((height, width, factor), np.uint8), np.zeros((height, width), np.uint8)
+    np.multiply(own[:, 1:], labels[:, 1:] != labels[:, :-1], out=right[:, 1:, 0])
+    np.multiply(own[1:], labels[1:] != labels[:-1], out=down[1:])
+    drawn = np.empty((height, factor, width * factor), np.uint8)
+    drawn[:] = right.reshape(height, 1, -1)
+    np.maximum(drawn[:, 0], down.repeat(factor, 1), out=drawn[:, 0])
+    return drawn.reshape(height * factor, -1)
 
 
 def mean_colors(image: np.ndarray, labels: np.ndarray) -> np.ndarray:

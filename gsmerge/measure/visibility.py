@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gsmerge.geometry import is_inside, project
 from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.kernels.reproject import mark_pixels
 from gsmerge.raster import render
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -19,7 +20,7 @@ _OPAQUE = 0.5  # least alpha of a pixel whose rendered depth is that of a surfac
 _NEAR = 0.01  # near plane, as a share of the median depth of a view
 _BEHIND = 1.05  # a surface hides a centre whose depth exceeds the surface's by this factor
 MAX_SAMPLE_GAUSSIANS = 200_000  # largest sample on which a share is measured
-_CHUNK = 1 << 16  # points processed at a time; all of them, in every thread, would take too much memory
+_CHUNK = 1 << 16  # points processed at a time; the first ones often show all pixels
 _DILATION = 3  # side of the square that a point marks, pixels of the input views
 
 
@@ -56,7 +57,7 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
     Points nearer than ``near`` (world units) do not count. If the views have smaller pixels than the ``sources``, the
     cameras of the points, a point marks proportionally more pixels, so that there are no gaps.
     """
-    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
+    viewmats, Ks = cameras.viewmats.astype(np.float64, "C"), cameras.Ks.astype(np.float64, "C")
 
     def one_view(view: int) -> NDArray[np.bool_]:
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
@@ -64,12 +65,7 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
         side = _side(Ks[view], sources)
         own = len(points) * view // len(cameras)  # in most scenes the view's own points begin here; start with them
         for start in (*range(own, len(points), _CHUNK), *range(0, own, _CHUNK)):
-            chunk = points[start : start + _CHUNK]
-            image = matmul(matmul(chunk, viewmats[view, :3, :3].T) + viewmats[view, :3, 3], Ks[view].T)
-            image = image.compress(image[:, 2] > near, 0)
-            pixels = image[:, :2] / image[:, 2:]
-            column, row = pixels.compress(is_inside(pixels, cameras), 0).astype(np.int64).T
-            hit[row, column] = 1
+            mark_pixels(points[start : start + _CHUNK], viewmats[view], Ks[view], near, hit)
             seen = cv2.dilate(hit, np.ones((side, side), np.uint8)) > 0
             if seen.all():
                 break

@@ -24,14 +24,13 @@ from gsmerge.measure.evaluate import (
     Quality,
     ResultScores,
     evaluate,
-    near_plane,
 )
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, draw_borders, mean_colors, to_picture
 from gsmerge.pages.marks import Marks, draw_marks, find_marks
 from gsmerge.pages.splats import MAX_GAUSSIANS, drawn_rows, highest_degree, pack_splats, pack_support
 from gsmerge.raster import Splats, make_splats, render
-from gsmerge.raster.photos import WHOLE
+from gsmerge.raster.photos import NEAR_PLANE, WHOLE
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.superpixels import segment
@@ -208,11 +207,11 @@ def page_data(
         for name in (inspected if len(pictures) > 1 else ())
     }
     shown = tuple(replace(view, maps=tuple(_map(references.get(name), view) for name in named)) for view in shown)
-    splats, near = {name: make_splats(canonical[name]) for name in inspected}, near_plane(scene) / frame.unit
+    splats = {name: make_splats(canonical[name]) for name in inspected}
     *marked, outside = (
-        _with_marks(view, splats, marks, near) for view in (*shown, _outside_view(scene, named, frame, len(views)))
+        _with_marks(view, splats, marks) for view in (*shown, _outside_view(scene, named, frame, len(views)))
     )
-    faded = tuple(_fade(canonical[name], marks[name], outside.camera, near) for name in named)
+    faded = tuple(_fade(canonical[name], marks[name], outside.camera) for name in named)
     measured_notes = evaluation.notes if results else ()  # they concern results
     notes = (*measured_notes, *_limits(sides, len(shown), len(views)))
     covered_share, _ = evaluation.results[0].mean_covered("context")
@@ -236,16 +235,16 @@ def _split_views(
     return splits
 
 
-def _fade(gaussians: Gaussians, marks: Marks, camera: Cameras, near: float) -> bytes | None:
+def _fade(gaussians: Gaussians, marks: Marks, camera: Cameras) -> bytes | None:
     """Draw canonical Gaussians, faint where no view shows them; None if views show all."""
     faint = marks.fade(gaussians)
-    return None if faint is None else encode_still(to_picture(render(faint, camera, near=near).images[0]))
+    return None if faint is None else encode_still(to_picture(render(faint, camera, near=NEAR_PLANE).images[0]))
 
 
-def _with_marks(view: PageView, splats: Mapping[str, Splats], marks: Mapping[str, Marks], near: float) -> PageView:
+def _with_marks(view: PageView, splats: Mapping[str, Splats], marks: Mapping[str, Marks]) -> PageView:
     """Add to a view the pictures of the marked Gaussians of each side."""
     pictures = [
-        draw_marks(splats[name], side_marks, view.camera, near) if name in splats else (None, None)
+        draw_marks(splats[name], side_marks, view.camera) if name in splats else (None, None)
         for name, side_marks in marks.items()
     ]
     drops, seen = zip(*pictures, strict=True)
@@ -283,8 +282,8 @@ def _page_views(
 
 def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
     """Draw Gaussians in a scene's world from outside its capture."""
-    camera, distance = outside_camera(scene.cameras.numpy(), scene.file_gaussians.means)
-    renders = (render(gaussians, camera, near=near_plane(scene)) for gaussians in named.values())
+    camera, distance = outside_camera(scene.cameras.numpy(), named[INPUT].means)
+    renders = (render(gaussians, camera, near=NEAR_PLANE * frame.unit) for gaussians in named.values())
     return PageView(
         name=OUTSIDE,
         place=place,
@@ -330,10 +329,13 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     means = mean_colors(photo, labels)
     light = means.mean(1, keepdims=True) > 0.5
     shifted = means + OUTLINE_SHIFT * (np.where(light, 0.0, 1.0) - means)
-    levels = np.round((OUTLINE_LEVELS - 1) * shifted) * (255 // (OUTLINE_LEVELS - 1))
-    colors, color_ids = np.unique(levels.astype(np.uint8), axis=0, return_inverse=True)
+    red, green, blue = np.round((OUTLINE_LEVELS - 1) * shifted).astype(np.int64).T
+    codes = (red * OUTLINE_LEVELS + green) * OUTLINE_LEVELS + blue
+    is_used = np.bincount(codes, minlength=OUTLINE_LEVELS**3) > 0
+    levels = np.stack(np.unravel_index(np.flatnonzero(is_used), (OUTLINE_LEVELS,) * 3), 1)
+    colors, color_ids = (levels * (255 // (OUTLINE_LEVELS - 1))).astype(np.uint8), np.cumsum(is_used, dtype=np.uint8)
     factor = max(1, OUTLINE_SIDE // max(labels.shape))
-    drawn = draw_borders(labels, 1 + color_ids.reshape(-1).astype(np.uint8), factor)
+    drawn = draw_borders(labels, color_ids[codes], factor)  # numbers of colours from 1 on
     return encode_indexed(drawn, np.pad(colors, ((1, 0), (0, 0))))  # index 0 is transparent
 
 

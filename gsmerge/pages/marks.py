@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
 import numpy as np
 
 from gsmerge.facts.support import TINTS, count_views
 from gsmerge.io.photo_files import encode_indexed
-from gsmerge.raster import Splats, TiledView, composite, tile_view
+from gsmerge.raster import Splats, TiledView, tile_view
+from gsmerge.raster.composite import blend
+from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.stages.clean import floaters
 from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
@@ -62,28 +65,47 @@ def find_marks(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None
     return Marks(drops, None if own else np.minimum(count_views(gaussians, cameras), MAX_SUPPORT).astype(np.uint8))
 
 
-def draw_marks(splats: Splats, marks: Marks, camera: Cameras, near: float) -> tuple[bytes | None, bytes | None]:
+def draw_marks(splats: Splats, marks: Marks, camera: Cameras) -> tuple[bytes | None, bytes | None]:
     """Draw marked Gaussians of canonical ``splats`` in one view: PNGs of ``marks.drops`` and of ``marks.seen``."""
-    if not (marks.drops or marks.seen):
+    masks = {**marks.drops, **marks.seen}
+    if not masks:
         return None, None
-    viewmat, K = camera.viewmats[0], camera.Ks[0]
-    tiled = tile_view(splats, viewmat, K, camera.width, camera.height, near=near)
-    return draw_masks(tiled, marks.drops, DROPS), draw_masks(tiled, marks.seen, SEEN)
+    tiled = tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=NEAR_PLANE)
+    shares = light_shares(tiled, masks)
+    return draw_shares(shares, DROPS), draw_shares(shares, SEEN)
 
 
-def draw_masks(tiled: TiledView, masks: Mapping[str, np.ndarray], colors: Mapping[str, Color]) -> bytes | None:
-    """Draw two ``masks [n]`` in the ``colors`` of their words, each as opaque as its share of a pixel's light.
+def light_shares(tiled: TiledView, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the share ``[h,w]`` of each pixel's light that comes from the Gaussians in each of the ``masks [n]``.
+
+    Masks without a Gaussian in the view are left out.
+    """
+    flags = {word: mask.take(tiled.ids) for word, mask in masks.items()}
+    shown, shares = [word for word, flag in flags.items() if flag.any()], dict[str, np.ndarray]()
+    for start in range(0, len(shown), 3):  # a mask for each channel of a picture
+        colors = np.zeros((len(tiled.ids), 3), np.float32)
+        for channel, word in enumerate(shown[start : start + 3]):
+            colors[:, channel] = flags[word]
+        drawn, _ = blend(tiled, colors, np.zeros(3, np.float32))
+        shares |= {word: drawn[..., channel] for channel, word in enumerate(shown[start : start + 3])}
+    return shares
+
+
+def draw_shares(shares: Mapping[str, np.ndarray], colors: Mapping[str, Color]) -> bytes | None:
+    """Draw the :func:`light_shares` of two words in their ``colors``, each as opaque as its share.
 
     Returns a PNG; None if no marked Gaussian is visible.
     """
-    flags = np.zeros((len(tiled.splats), 3), np.float32)
-    for channel, word in enumerate(colors):
-        flags[:, channel] = masks.get(word, 0)
-    if not flags[tiled.ids].any():
+    shown = [shares[word] for word in colors if word in shares]
+    if not shown:
         return None
-    first, second, _ = np.moveaxis(composite(tiled, flags)[0], 2, 0)
-    share = np.maximum(first, second)
+    share = reduce(np.maximum, shown)
+    pixels = np.nonzero(share >= VISIBLE)
+    if not len(pixels[0]):
+        return None
+    first, second = (shares[word][pixels] if word in shares else np.float32(0) for word in colors)
     # 0: transparent; 1 to STEPS: opacities of the first colour; then opacities of the second colour
-    ids = np.where(share >= VISIBLE, STEPS * (second > first) + np.ceil(STEPS * share.clip(0, 1)), 0).astype(np.uint8)
+    ids = np.zeros(share.shape, np.uint8)
+    ids[pixels] = STEPS * (second > first) + np.ceil(STEPS * share[pixels].clip(0, 1))
     tints = [(*color, MAX_ALPHA * step // STEPS) for color in colors.values() for step in range(1, STEPS + 1)]
-    return encode_indexed(ids, np.array([(0, 0, 0, 0), *tints], np.uint8)) if ids.any() else None
+    return encode_indexed(ids, np.array([(0, 0, 0, 0), *tints], np.uint8))

@@ -106,7 +106,7 @@ def view(
         [_num_bytes(scene), *(_num_bytes(result) for result in loaded.values())], held_out,
         cameras=cameras, new_gains=gains, light=is_light, progress=progress or (lambda *_: None),
     )  # fmt: skip
-    return Page(view_page(data), headline(data))
+    return Page(view_page(data).decode(), headline(data))
 
 
 def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, float]]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from gsmerge.arrays import Array, as_array
 from gsmerge.kernels.elementary import log10
-from gsmerge.kernels.pictures import blur
+from gsmerge.kernels.pictures import compare_windows
 
 WINDOW, SIGMA = 11, 1.5  # side of the windows of SSIM and their standard deviation, pixels
+INNER = (slice(WINDOW // 2, -(WINDOW // 2)), slice(WINDOW // 2, -(WINDOW // 2)))  # centres of windows in the image
 C1, C2 = 0.01**2, 0.03**2  # stabilisers of SSIM (K1 = .01, K2 = .03) for a data range of 1
 MAX_LOSS = 0.5  # dB of PSNR that a result may lose against its input without a warning
 WORSE = "worse than the input does"  # commands recognise the warning among the notes by these words
@@ -38,13 +41,23 @@ def pixel_mask(mask: Array, image: Array) -> Array:
 
 def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
     """Return the PSNR (dB) of images ``[h,w,c]`` in [0, 1], within ``mask [h,w]`` if given."""
+    return psnr_within(image, reference, [mask])[0]
+
+
+def psnr_within(image: Array, reference: Array, masks: Sequence[Array | None]) -> list[float]:
+    """Return the :func:`psnr` (dB) within each of the ``masks [h,w]``; None: all pixels. Errors are computed once."""
     first, second = image_pair(image, reference)
-    if mask is not None:  # before the conversion, since a whole photo in float64 takes much memory
-        selected = pixel_mask(mask, first)
-        first, second = first[selected], second[selected]
+    chosen = [None if mask is None else pixel_mask(mask, first) for mask in masks]
     errors = np.subtract(first, second, dtype=np.float64)
-    error = float(np.square(errors, out=errors).mean())
-    return -10 * float(log10(error)) if error > 0 else float("inf")
+    np.square(errors, out=errors)
+    means = [float(_select(errors, mask).mean()) for mask in chosen]
+    return [-10 * float(log10(error)) if error > 0 else float("inf") for error in means]
+
+
+def _select(values: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """Return the values ``[h,w,c]`` of the pixels in ``mask [h,w]`` as ``[m,c]``; of all pixels without a mask."""
+    # compress takes a third of the time of a mask as an index
+    return values if mask is None else values.reshape(-1, values.shape[2]).compress(mask.reshape(-1), 0)
 
 
 def decibels(error: float) -> float:
@@ -90,17 +103,23 @@ def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
     first, second = image_pair(image, reference)
     if min(first.shape[:2]) < WINDOW:
         raise ValueError(f"expected at least {WINDOW} x {WINDOW} pixels, got {list(first.shape[:2])}")
-    border = WINDOW // 2
-    inner = slice(border, -border), slice(border, -border)
-    selected = None if mask is None else pixel_mask(pixel_mask(mask, first)[inner], first[inner])
-    # Variances are small differences of large numbers. With centred values float32 is exact enough.
-    x, y = first.astype(np.float32) - np.float32(0.5), second.astype(np.float32) - np.float32(0.5)
+    (similarity,) = ssim_within(first, second, [mask])
+    if similarity is None:
+        raise ValueError("mask: expected at least one pixel that is the centre of a window, got none")
+    return similarity
 
-    def mean(values: Array) -> Array:
-        return blur(values, SIGMA, WINDOW)[inner]
 
-    ux, uy = mean(x), mean(y)
-    variances, covariance = mean(x * x + y * y) - ux * ux - uy * uy, mean(x * y) - ux * uy
-    ux, uy = ux + np.float32(0.5), uy + np.float32(0.5)
-    scores = (2 * ux * uy + C1) * (2 * covariance + C2) / ((ux * ux + uy * uy + C1) * (variances + C2))
-    return float((scores if selected is None else scores[selected]).mean(dtype=np.float64))
+def ssim_within(image: Array, reference: Array, masks: Sequence[Array | None]) -> list[float | None]:
+    """Return the :func:`ssim` within each of the ``masks [h,w]``; None: all pixels. Windows are compared once.
+
+    It is None where there is no window: for a small image, or a mask without the centre of a window.
+    """
+    first, second = image_pair(image, reference)
+    if min(first.shape[:2]) < WINDOW:
+        return [None] * len(masks)
+    similarities = compare_windows(first, second, SIGMA, WINDOW, C1, C2)
+    inner = [None if mask is None else pixel_mask(mask, first)[INNER] for mask in masks]
+    return [
+        float(_select(similarities, mask).mean(dtype=np.float64)) if mask is None or mask.any() else None
+        for mask in inner
+    ]

@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import composite
-from gsmerge.raster.metrics import MAX_PSNR, psnr
+from gsmerge.raster.metrics import MAX_PSNR, psnr_within
 from gsmerge.raster.tiled_view import Splats, make_splats, tile_view
 from gsmerge.runtime.memory import make_array
 from gsmerge.runtime.threads import parallel_map
@@ -265,10 +265,9 @@ def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: in
     mask = _scored_pixels(photos, view, quarter=quarter)
     covered = covered if mask is None else covered & mask
     share = float(covered.sum() / (covered.size if mask is None else max(1, mask.sum())))
-    psnr_of_all = psnr(np.clip(image, 0, 1, out=image), photos.images[view], mask)
-    if share >= WHOLE or share == 0:
-        return RenderScore(psnr_of_all, psnr_of_all if share else math.nan, share, covered)
-    return RenderScore(psnr_of_all, psnr(image, photos.images[view], covered), share, covered)
+    masks = [mask, covered] if 0 < share < WHOLE else [mask]
+    psnrs = psnr_within(np.clip(image, 0, 1, out=image), photos.images[view], masks)
+    return RenderScore(psnrs[0], psnrs[-1] if share else math.nan, share, covered)
 
 
 def _scored_pixels(photos: Photos, view: int, *, quarter: bool) -> np.ndarray | None:

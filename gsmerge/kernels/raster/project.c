@@ -3,7 +3,7 @@
 #include "projection.h"
 
 enum { MOST_TILES = 1 << 15 };  // corners per side, since columns and rows of tiles have 16 bits
-enum { BLOCK = 64 };  // Gaussians that are gathered into planes, so that loops over them vectorise
+enum { BLOCK = 64, ROW = 16 };  // Gaussians that are gathered into planes, and those that may follow each other
 
 static inline int32_t tile(float pixel) {
   return whole(pixel, 0.f, (MOST_TILES - 1) * (float)TILE) / TILE;
@@ -130,6 +130,18 @@ static inline void project_one(Block *b, int64_t j, Camera c) {
   b->box[3][j] = drawn & (tile(y1) + 1);
 }
 
+// Gather Gaussians that follow each other into the lanes from j on, in loops that vectorise.
+static inline void gather_row(Block *restrict b, int64_t j, const float *restrict means, const float *restrict quats,
+                              const float *restrict scales, const float *restrict opacities) {
+  for (int k = 0; k < 3; k++)
+    for (int i = 0; i < ROW; i++) b->mean[k][j + i] = means[3 * i + k];
+  for (int k = 0; k < 4; k++)
+    for (int i = 0; i < ROW; i++) b->quat[k][j + i] = quats[4 * i + k];
+  for (int k = 0; k < 3; k++)
+    for (int i = 0; i < ROW; i++) b->scale[k][j + i] = scales[3 * i + k];
+  for (int i = 0; i < ROW; i++) b->opacity[j + i] = opacities[i];
+}
+
 API int32_t project(const float *restrict means, const float *restrict quats,
                     const float *restrict scales, const float *restrict opacities,
                     const int32_t *restrict ids, const float *restrict camera,
@@ -140,12 +152,21 @@ API int32_t project(const float *restrict means, const float *restrict quats,
   Block b;
   for (int64_t start = 0; start < m; start += BLOCK) {
     int64_t size = mini(BLOCK, m - start);
-    for (int64_t j = 0; j < BLOCK; j++) {
-      int64_t i = ids[start + mini(j, size - 1)];
-      for (int k = 0; k < 3; k++) b.mean[k][j] = means[3 * i + k];
-      for (int k = 0; k < 4; k++) b.quat[k][j] = quats[4 * i + k];
-      for (int k = 0; k < 3; k++) b.scale[k][j] = scales[3 * i + k];
-      b.opacity[j] = opacities[i];
+    for (int64_t from = 0; from < BLOCK; from += ROW) {
+      int64_t first = ids[start + mini(from, size - 1)];
+      bool in_row = from + ROW <= size;  // as usual, since most Gaussians of a scene are seen
+      for (int64_t j = 0; in_row && j < ROW; j++) in_row = ids[start + from + j] == first + j;
+      if (in_row) {
+        gather_row(&b, from, means + 3 * first, quats + 4 * first, scales + 3 * first, opacities + first);
+        continue;
+      }
+      for (int64_t j = from; j < from + ROW; j++) {
+        int64_t i = ids[start + mini(j, size - 1)];
+        for (int k = 0; k < 3; k++) b.mean[k][j] = means[3 * i + k];
+        for (int k = 0; k < 4; k++) b.quat[k][j] = quats[4 * i + k];
+        for (int k = 0; k < 3; k++) b.scale[k][j] = scales[3 * i + k];
+        b.opacity[j] = opacities[i];
+      }
     }
     for (int64_t j = 0; j < BLOCK; j++) project_one(&b, j, c);
     for (int64_t j = 0; j < size; j++)
@@ -156,4 +177,13 @@ API int32_t project(const float *restrict means, const float *restrict quats,
       for (int k = 0; k < 4; k++) boxes[4 * (start + j) + k] = (int16_t)b.box[k][j];
   }
   return 0;
+}
+
+API void shift_means(const float *restrict means, const double *restrict origin, float *restrict out, int64_t n) {
+  double shift[3 * ROW];
+  for (int i = 0; i < 3 * ROW; i++) shift[i] = origin[i % 3];
+  int64_t i = 0;
+  for (; i + 3 * ROW <= 3 * n; i += 3 * ROW)
+    for (int j = 0; j < 3 * ROW; j++) out[i + j] = (float)((double)means[i + j] - shift[j]);
+  for (int j = 0; i < 3 * n; i++, j++) out[i] = (float)((double)means[i] - shift[j]);
 }

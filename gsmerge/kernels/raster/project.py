@@ -14,7 +14,7 @@ projection.
 
 from __future__ import annotations
 
-from gsmerge.kernels.signature import STATUS, f4, i2, i4, i8, native, u1
+from gsmerge.kernels.signature import STATUS, f4, f8, i2, i4, i8, native, u1
 
 TILE = 16  # pixels per side; one row of a tile is one AVX-512 vector
 MAX_SIZE = 32767 * TILE  # most pixels per side of a view, since tile columns and rows have 16 bits
@@ -85,3 +85,8 @@ def project_backward(
 @native(STATUS, ids=i4("m"), rows=f4("m", "c"), totals=f4("n", "c", out=True))
 def add_rows(ids, rows, totals):
     """Add ``rows [m,c]`` to ``totals [n,c]`` at the ``ids [m]`` int32."""
+
+
+@native(means=f4("n", 3), origin=f8(3), out=f4("n", 3, out=True))
+def shift_means(means, origin, out):
+    """Write the means minus ``origin``; the differences are computed in float64."""

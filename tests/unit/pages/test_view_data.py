@@ -27,7 +27,7 @@ from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages import data, splats
 from gsmerge.pages.data import ViewData, collect, encode_still, short_names
-from gsmerge.pages.marks import DROPS, FAINT, draw_masks
+from gsmerge.pages.marks import DROPS, FAINT, draw_shares, light_shares
 from gsmerge.pages.splats import pack_splats
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.metrics import psnr
@@ -218,14 +218,14 @@ def test_what_would_be_dropped_is_drawn(small: Scene) -> None:
     assert any(view.drops[1] for view in shown.shown)
     splats, near = make_splats(entered), near_plane(small) / frame.unit
     tiled = tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=near)
-    mask = draw_masks(tiled, {"sky": np.arange(len(half)) < len(half) / 2}, DROPS)
+    mask = draw_shares(light_shares(tiled, {"sky": np.arange(len(half)) < len(half) / 2}), DROPS)
     picture = cv2.imdecode(np.frombuffer(mask or b"", np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture.shape == (small.cameras.height, small.cameras.width, 4)
     alphas = picture[..., 3]
     assert set(map(tuple, picture[alphas > 0][:, :3])) == {(255, 170, 20)}
     assert alphas.max() < 200  # what is behind the whole of it is seen
     assert 0 < alphas[alphas > 0].min() < alphas.max() / 2  # and more where it is a part of the light
-    assert draw_masks(tiled, {"floaters": np.zeros(len(half), bool)}, DROPS) is None
+    assert draw_shares(light_shares(tiled, {"floaters": np.zeros(len(half), bool)}), DROPS) is None
 
 
 def test_what_few_views_show_is_counted_drawn_and_faded(small: Scene) -> None:

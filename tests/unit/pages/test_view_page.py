@@ -29,9 +29,13 @@ def data() -> ViewData:
     return collect(EVIL, scene, {EVIL: scene.gaussians[::2]}, (2_000_000, 1000))
 
 
+def page_of(data: ViewData) -> str:
+    return view_page(data).decode()
+
+
 @pytest.fixture(scope="module")
 def page(data: ViewData) -> str:
-    return view_page(data)
+    return page_of(data)
 
 
 def block(page: str, name: str) -> str:
@@ -109,7 +113,7 @@ def test_a_table_over_all_results(data: ViewData) -> None:
         ["tenth", "100", "10.0 %", "0.250"],
         ["least", "10", "1.0 %", "0.250"],
     ]
-    page = view_page(three)
+    page = page_of(three)
     assert re.findall(r'<tr data-result="(\d)">', page) == ["2", "3", "4"]
     assert page.count('<button class="link"') == 3
 
@@ -120,7 +124,7 @@ def test_a_table_has_no_column_without_figures(data: ViewData) -> None:
 
 
 def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
-    page = view_page(replace(with_three_results(data), reference="renders of the input"))
+    page = page_of(replace(with_three_results(data), reference="renders of the input"))
     half, tenth, least = json.loads(block(page, "data"))["results"]
     assert half["figures"] == [["500", ""], ["2.0 kB", ""], ["25.00 dB", "up"], ["0.750", "up"]]
     assert "No photo was held out" not in page
@@ -134,7 +138,7 @@ def test_new_views_come_before_own_photos_which_never_count_as_better(data: View
     three = with_three_results(data)
     gains = (None, (2.0, 4.5), (-1.0, 1.5), None)
     sides = tuple(replace(side, new_gain=gain) for side, gain in zip(three.sides, gains, strict=True))
-    page = view_page(replace(three, sides=sides))
+    page = page_of(replace(three, sides=sides))
     half, tenth, least = json.loads(block(page, "data"))["results"]
     assert "new views expected 2.0 to 4.5 dB closer" in half["headline"].replace("\u00a0", " ")
     assert half["figures"][2:] == [["+2.0 to +4.5 dB", "up"], ["25.00 dB", "own"]]
@@ -145,14 +149,14 @@ def test_new_views_come_before_own_photos_which_never_count_as_better(data: View
 
 def test_the_slider_is_over_sizes(data: ViewData) -> None:
     """From the smallest to the largest; it begins at the first result, and one result has none."""
-    page = view_page(with_three_results(data))
+    page = page_of(with_three_results(data))
     read = json.loads(block(page, "data"))
     assert read["sizes"] == [4, 3, 2]
     assert [one["words"] for one in read["results"]] == [
         "50.0\u00a0% · 2.0 kB · 25.0\u00a0dB", "10.0\u00a0% · 400 B · 19.0\u00a0dB", "1.0\u00a0% · 400 B · 19.0\u00a0dB"
     ]  # fmt: skip
     assert re.findall('<input id="size"[^>]* max="(.)" value="(.)">', page) == [("2", "2")]
-    assert '<input id="size"' not in view_page(data)
+    assert '<input id="size"' not in page_of(data)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +173,7 @@ def test_how_much_faster_it_draws(before: float, after: float, words: str, data:
         data, sides=tuple(replace(side, seconds=one) for side, one in zip(data.sides, (before, after), strict=True))
     )
     assert speed_words(speed(timed)) == words
-    assert f">{words}</span></h1>" in view_page(timed)
+    assert f">{words}</span></h1>" in page_of(timed)
     assert speed(replace(data, sides=data.sides[:1])) is None
 
 
@@ -177,11 +181,11 @@ def test_what_would_be_dropped_has_a_switch(data: ViewData) -> None:
     bare = tuple(replace(side, dropped={}) for side in data.sides)
     dropping = (bare[0], replace(bare[1], dropped={"sky": 12}))
     views = tuple(replace(view, drops=(None, b"one")) for view in data.views)
-    page = view_page(replace(data, sides=dropping, views=views))
+    page = page_of(replace(data, sides=dropping, views=views))
     assert 'data-set="drops"' in page
     assert json.loads(block(page, "drop-pictures"))[0] == [None, None, f"{PNG}b25l"]
     assert json.loads(block(page, "data"))["sources"][2]["dropped"] == {"sky": 12}
-    assert 'data-set="drops"' not in view_page(replace(data, sides=bare))
+    assert 'data-set="drops"' not in page_of(replace(data, sides=bare))
 
 
 def test_what_no_view_shows_has_a_switch(data: ViewData) -> None:
@@ -189,14 +193,14 @@ def test_what_no_view_shows_has_a_switch(data: ViewData) -> None:
     known = (bare[0], replace(bare[1], seen={"none": 7}, support=b"two"))
     views = tuple(replace(view, seen=(None, b"one")) for view in data.views)
     outside = replace(data.outside, faded=(None, b"one"))
-    page = view_page(replace(data, sides=known, views=views, outside=outside))
+    page = page_of(replace(data, sides=known, views=views, outside=outside))
     assert 'data-set="seen"' in page
     assert "--drop unseen" in page
     assert json.loads(block(page, "seen-pictures"))[0] == [None, None, f"{PNG}b25l"]
     assert json.loads(block(page, "faded-pictures")) == [None, None, f"{WEBP}b25l"]
     assert base64.b64decode(block(page, "support-1")) == b"two"
     assert json.loads(block(page, "data"))["sources"][2]["support"] == "support-1"
-    assert 'data-set="seen"' not in view_page(replace(data, sides=bare))
+    assert 'data-set="seen"' not in page_of(replace(data, sides=bare))
 
 
 def test_colours_are_readable_in_both_schemes(page: str) -> None:
@@ -228,8 +232,8 @@ def test_what_the_input_covers_stands_beside_all_pixels(data: ViewData) -> None:
     """Where the scene itself lacks pixels."""
     before, after = (replace(side, covered_share=0.79, covered=Quality(26.1)) for side in data.sides[:2])
     lacking = replace(data, sides=(before, after, *data.sides[2:]))
-    assert "79 %" in view_page(replace(lacking, lacks_pixels=True))
-    assert "79 %" not in view_page(lacking)
+    assert "79 %" in page_of(replace(lacking, lacks_pixels=True))
+    assert "79 %" not in page_of(lacking)
 
 
 def test_the_view_from_outside_has_neither_photo_nor_score(page: str, data: ViewData) -> None:
@@ -245,20 +249,20 @@ def test_the_view_from_outside_has_neither_photo_nor_score(page: str, data: View
 
 
 def test_without_gaussians_there_is_no_3d(data: ViewData) -> None:
-    page = view_page(replace(data, sides=tuple(replace(side, splats=None) for side in data.sides)))
+    page = page_of(replace(data, sides=tuple(replace(side, splats=None) for side in data.sides)))
     assert 'id="engine"' not in page
     assert "class SplatView" not in page
     assert len(page) < 200_000
 
 
 def test_without_photos(data: ViewData) -> None:
-    page = view_page(replace(data, views=tuple(replace(view, photo=None) for view in data.views)))
+    page = page_of(replace(data, views=tuple(replace(view, photo=None) for view in data.views)))
     assert [source["name"] for source in json.loads(block(page, "data"))["sources"]] == ["input", EVIL]
     assert "overlay-share" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
 
 
 def test_without_superpixels(data: ViewData, page: str) -> None:
-    bare = view_page(replace(data, num_superpixels=None))
+    bare = page_of(replace(data, num_superpixels=None))
     for words in ('data-set="outlines"', "<kbd>O</kbd>", "Superpixels: "):
         assert words in page
         assert words not in bare
@@ -266,7 +270,7 @@ def test_without_superpixels(data: ViewData, page: str) -> None:
 
 @pytest.mark.parametrize(("counts", "words"), [((1234, 1234), "1,234 of each"), ((900, 1234), "900 to 1,234 of each")])
 def test_views_may_differ_in_superpixels(data: ViewData, counts: tuple[int, int], words: str) -> None:
-    assert f"Superpixels: {words} input photo" in view_page(replace(data, num_superpixels=counts))
+    assert f"Superpixels: {words} input photo" in page_of(replace(data, num_superpixels=counts))
 
 
 @pytest.fixture(scope="module")
@@ -276,7 +280,7 @@ def alone() -> ViewData:
 
 
 def test_one_scene_is_compared_with_its_photos(alone: ViewData) -> None:
-    page = view_page(alone)
+    page = page_of(alone)
     read = json.loads(block(page, "data"))
     assert [source["name"] for source in read["sources"]] == ["photo", "input"]
     assert headline(alone).replace(" dB", "\u00a0dB") in page
@@ -288,12 +292,12 @@ def test_one_scene_is_compared_with_its_photos(alone: ViewData) -> None:
 def test_one_scene_without_photos_is_compared_with_nothing(alone: ViewData) -> None:
     views = tuple(replace(view, photo=None, outlines=None) for view in alone.views)
     data = replace(alone, views=views, num_superpixels=None)
-    page = view_page(data)
+    page = page_of(data)
     assert (data.scored, data.start) == (False, 0)
     assert json.loads(block(page, "stills"))[0] == [None]
     seen = re.sub("<script.*?</script>", "", page, flags=re.DOTALL)
     assert [words for words in ("PSNR</small>", 'data-set="mode"', "Worst first", "PSNR and") if words in seen] == []
-    assert view_page(alone).count('data-set="mode"') == 4
+    assert page_of(alone).count('data-set="mode"') == 4
 
 
 def test_what_is_grey_says_why() -> None:
@@ -304,7 +308,7 @@ def test_what_is_grey_says_why() -> None:
 
 
 def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
-    assert "odd?" in view_page(replace(data, title="odd\udcff"))
+    assert "odd?" in page_of(replace(data, title="odd\udcff"))
 
 
 @pytest.mark.parametrize(
