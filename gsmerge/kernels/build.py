@@ -36,7 +36,11 @@ class Target:
 
 
 V3 = Target("v3", ("-mcpu=x86_64_v3",), ("-march=x86-64-v3",))
-V4 = Target("v4", ("-mcpu=x86_64_v4+prefer_no_gather+prefer_no_scatter", "-mprefer-vector-width=512"), ("-march=x86-64-v4", "-mprefer-vector-width=512"))
+V4 = Target(
+    "v4",
+    ("-mcpu=x86_64_v4+prefer_no_gather+prefer_no_scatter", "-mprefer-vector-width=512"),
+    ("-march=x86-64-v4", "-mprefer-vector-width=512"),
+)
 ARM64 = Target("arm64", (), ())
 
 
