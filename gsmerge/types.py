@@ -417,7 +417,10 @@ class Scene:
     @property
     def file_gaussians(self) -> Gaussians:
         """Gaussians of the file, without Gaussians that fill holes."""
-        return self.gaussians if self.filled is None else self.gaussians[~self.filled]
+        if self.filled is None:
+            return self.gaussians
+        count = self.num_gaussians  # rows that fill holes are usually the last, and then nothing is copied
+        return self.gaussians[~self.filled if self.filled[:count].any() else slice(count)]
 
     @property
     def pixels_per_view(self) -> int:

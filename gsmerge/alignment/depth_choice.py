@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.geometry import camera_centres, camera_depths, nearest_views, sh0_to_rgb
+from gsmerge.geometry import camera_centres, camera_depths, median, nearest_views, sh0_to_rgb
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
 from gsmerge.kernels.pictures import blur
 from gsmerge.runtime.threads import parallel_map
@@ -43,7 +43,8 @@ def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> tuple[Scene, i
     ratios = np.where(usable, maps, 1) / np.where(usable, depths, 1)
     # mask [v,p] of pixels whose Gaussians move, means [v,p,3] at the depths of the maps, and factors [v,p] of the depth
     best = np.zeros_like(usable), means, ratios
-    for scale in (unit, 1 / float(np.median(ratios[usable]))) if views > 1 and usable.any() else ():
+    for choose_unit in (lambda: unit, lambda: 1 / median(ratios[usable])) if views > 1 and usable.any() else ():
+        scale = choose_unit()
         factors = np.where(usable, np.clip(scale * ratios, 1 / _MAX_FACTOR, _MAX_FACTOR), 1)
         differ = np.abs(factors - 1) > _SAME
         if not differ.any():

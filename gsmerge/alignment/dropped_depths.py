@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import pairwise, starmap
+
 import numpy as np
 
-from gsmerge.geometry import camera_depths, rgb_to_sh0
+from gsmerge.geometry import camera_depths, median, rgb_to_sh0, vector_lengths
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Cameras, Gaussians, Scene, fill_pixels
 
@@ -22,7 +24,7 @@ def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scen
     g, V, fronts = scene.gaussians, scene.cameras.viewmats, scene.get_pixels().fronts.reshape(len(scene), -1)
     rays = _make_rays(scene.cameras)
     z = camera_depths(g.means[fronts].astype(np.float64), V[:, None])
-    lengths, maps = np.linalg.norm(rays, axis=2), maps.reshape(len(scene), -1).astype(np.float64)
+    lengths, maps = vector_lengths(rays)[..., 0], maps.reshape(len(scene), -1).astype(np.float64)
     has_depth = (maps > 0) & np.isfinite(maps)
     usable = (fronts >= 0) & has_depth & (z > 0)
     if not usable.any():
@@ -32,7 +34,7 @@ def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scen
         return scene
     empty = np.flatnonzero((fronts < 0) & has_depth)  # pixels that get a Gaussian
     new_z = (unit * maps / (lengths if is_distance else 1)).reshape(-1)[empty]
-    means = _unproject(rays.reshape(-1, 3)[empty], new_z, V[empty // scene.pixels_per_view])
+    means = _unproject(rays, new_z, V, empty)
     previous = np.flatnonzero(usable)
     previous = previous[np.maximum(np.searchsorted(previous, empty) - 1, 0)]
     models = g[fronts.reshape(-1)[previous]]
@@ -50,10 +52,19 @@ def _make_rays(cameras: Cameras) -> np.ndarray:
     return matmul(pixels, invert(cameras.Ks).transpose(0, 2, 1))
 
 
-def _unproject(rays: np.ndarray, z: np.ndarray, viewmats: np.ndarray) -> np.ndarray:
-    """Return points ``[n,3]`` of the world at depths ``z [n]`` on ``rays [n,3]`` of cameras ``viewmats [n,4,4]``."""
-    local = rays * z[:, None]
-    return np.asarray((viewmats[:, :3, :3] * (local - viewmats[:, :3, 3])[:, :, None]).sum(1))
+def _unproject(rays: np.ndarray, z: np.ndarray, viewmats: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return points ``[n,3]`` of the world at depths ``z [n]`` on the rays of some pixels.
+
+    ``rays [v,p,3]`` are those of all pixels of cameras ``viewmats [v,4,4]``. ``places [n]`` number the pixels over all
+    views, and ascend.
+    """
+    points, (views, pixels, _) = np.empty((len(places), 3)), rays.shape
+    ends = np.searchsorted(places, pixels * np.arange(views + 1)).tolist()
+    for view, (viewmat, rows) in enumerate(zip(viewmats, starmap(slice, pairwise(ends)), strict=True)):
+        local = rays[view, places[rows] - view * pixels] * z[rows, None] - viewmat[:3, 3]
+        for axis, (a, b, c) in enumerate(viewmat[:3, :3].T):
+            points[rows, axis] = a * local[:, 0] + b * local[:, 1] + c * local[:, 2]
+    return points
 
 
 def _fit_unit(z: np.ndarray, maps: np.ndarray, lengths: np.ndarray) -> tuple[float, float, bool]:
@@ -65,6 +76,6 @@ def _fit_unit(z: np.ndarray, maps: np.ndarray, lengths: np.ndarray) -> tuple[flo
     """
     fits = []
     for is_distance, ratios in ((False, z / maps), (True, z / maps * lengths)):
-        unit = float(np.median(ratios))
-        fits.append((float(np.median(np.abs(ratios / unit - 1))), unit, is_distance))
+        unit = median(ratios)
+        fits.append((median(np.abs(ratios / unit - 1)), unit, is_distance))
     return min(fits)

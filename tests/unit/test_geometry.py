@@ -8,12 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsmerge.geometry import (
+    SAMPLE_VALUES,
     camera_centres,
     clamp_inside,
     covariances,
     euler_to_rotmat,
     lies_inside,
     lower_median,
+    median,
     middle_depth,
     move_region,
     normalize,
@@ -75,6 +77,20 @@ def test_quaternions_of_rotations_and_back() -> None:
     actual = rotmat_to_quat(quat_to_rotmat(quats))
     np.testing.assert_allclose(np.abs((actual * quats).sum(1)), 1)
     assert (actual[np.arange(68), np.abs(actual).argmax(1)] > 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 1_000, 300_000, 300_001])
+@pytest.mark.parametrize("kind", ["random", "ascending", "few values", "periodic"])
+def test_median_of_few_and_of_many_values(count: int, kind: str) -> None:
+    """Also if a sample at even steps says nothing about the median, as with periodic values."""
+    values = np.random.default_rng(count).exponential(size=count)
+    if kind == "ascending":
+        values.sort()
+    elif kind == "few values":
+        values = np.round(values)
+    elif kind == "periodic":
+        values[:: max(1, count // SAMPLE_VALUES)] -= 100
+    assert median(values) == np.median(values)
 
 
 def test_lower_median_is_a_value_of_each_column() -> None:

@@ -523,7 +523,8 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     that are all equal also pad the file; VolSplat writes these. If a file has no other rows, a few of them count as
     Gaussians; SceneError for many.
     """
-    rows = np.flatnonzero((out["means"] == 0).all(1) & out["valid"])
+    rows = np.flatnonzero((out["means"][:, 0] == 0) & out["valid"])
+    rows = rows[(out["means"][rows] == 0).all(1)]
     if len(rows) == 0:
         return rows
     scales, sh0 = out["scales"][rows], out["sh0"][rows, 0]

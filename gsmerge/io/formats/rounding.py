@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from gsmerge.arrays import distinct
 from gsmerge.io.formats.read import read_gaussians
 from gsmerge.io.formats.table import PLY, output_format
 from gsmerge.io.formats.write import write_gaussians
@@ -42,7 +43,7 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
 def _sample_rows(means: np.ndarray) -> np.ndarray:
     """Return evenly spaced rows, and the rows with the extreme positions, from which formats choose their steps."""
     extremes = means.argmin(axis=0), means.argmax(axis=0)
-    return np.unique(np.concatenate([np.arange(0, len(means), len(means) // SAMPLE + 1), *extremes]))
+    return distinct(np.concatenate([np.arange(0, len(means), len(means) // SAMPLE + 1), *extremes]))
 
 
 def as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
