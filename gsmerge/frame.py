@@ -8,10 +8,11 @@ frame and back changes no bit.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths, lower_median, move_region, project
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map

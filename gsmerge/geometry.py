@@ -6,12 +6,13 @@ The module also has medians, and damped descent, which solves small problems.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
 from gsmerge.arrays import Array
+from gsmerge.frozen import dataclass
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.raster.sh import view_colors
@@ -260,7 +261,7 @@ def median(values: np.ndarray) -> float:
     if len(values) > FEW_VALUES:  # only values near the median of a sample are ordered
         sample = np.sort(values[:: len(values) // SAMPLE_VALUES])
         low, high = sample[[int(share * (len(sample) - 1)) for share in AROUND_MEDIAN]]
-        num_lower, near = np.count_nonzero(values < low), values[(values >= low) & (values <= high)]
+        num_lower, near = int(np.count_nonzero(values < low)), values[(values >= low) & (values <= high)]
         if num_lower < middle < num_lower + len(near):
             values, middle = near, middle - num_lower
     ordered = np.partition(values, (middle - 1, middle) if len(values) > 1 else 0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property
 from itertools import chain, compress
 
@@ -33,6 +33,7 @@ from gsmerge.alignment.score import (
     sample_layout,
     score_layout,
 )
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, camera_centres
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile

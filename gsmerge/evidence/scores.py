@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from gsmerge.evidence.pictures import ViewPictures, fit_size
+from gsmerge.frozen import dataclass
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import ORIENTATIONS, blur, turn_back

@@ -15,11 +15,12 @@ same gain. In both cases the mean would be farther from new photos, by 1.5 dB in
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from gsmerge.facts.photo_change import CLIPPED, PhotoChange, change_large
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_distances, correlation, order_others, rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels.compare_views import find_surfaces
 from gsmerge.kernels.elementary import exp, log

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from gsmerge.facts.views import camera_kinds
+from gsmerge.frozen import dataclass
 from gsmerge.types import Gaussians, Scene
 
 # Bounds for the Gaussians of captures. The median largest scale is at least TINY times the extent, which is twice the

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import depths_inside, is_inside, middle_depth, project, step_outside
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster import Splats, make_splats, tile_view

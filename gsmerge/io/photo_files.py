@@ -7,7 +7,7 @@ import struct
 import warnings
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
 from gsmerge.io.first_bytes import refuse_picture
 from gsmerge.io.image_names import ImageSource, match_images

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
 from gsmerge.facts.support import TINTS, count_views
+from gsmerge.frozen import dataclass
 from gsmerge.io.photo_files import encode_indexed
 from gsmerge.raster import Splats, TiledView, composite, tile_view
 from gsmerge.stages.clean import floaters

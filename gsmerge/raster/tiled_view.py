@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_centres
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import project as projection

@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from gsmerge.alignment import (
 )
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
