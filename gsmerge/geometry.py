@@ -5,7 +5,7 @@ The module also has medians, and damped descent, which solves small problems.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -193,7 +193,7 @@ def camera_centres(viewmats: np.ndarray) -> np.ndarray:
 
 def middle_depth(means: np.ndarray, camera: Cameras) -> float:
     """Measure the median depth of the points ``[n,3]`` inside one camera's picture; 1 if there are none."""
-    return float(np.quantile(depths_inside(means, camera), 0.5))
+    return float(quantiles(depths_inside(means, camera), (0.5,))[0])
 
 
 def depths_inside(means: np.ndarray, camera: Cameras) -> np.ndarray:
@@ -266,6 +266,20 @@ def median(values: np.ndarray) -> float:
             values, middle = near, middle - num_lower
     ordered = np.partition(values, (middle - 1, middle) if len(values) > 1 else 0)
     return float(ordered[middle] if is_odd else (ordered[middle - 1] + ordered[middle]) / 2)
+
+
+def quantiles(values: np.ndarray, shares: Sequence[float]) -> np.ndarray:
+    """Return the quantiles ``[s,...]`` of each column of ``[n,...]`` rows, n >= 1, interpolated as by ``np.quantile``.
+
+    ``shares [s]``, 0 to 1. No value may be NaN.
+    """
+    places = (len(values) - 1) * np.array(shares, np.float64)
+    before = np.floor(places).astype(np.int64)
+    after = np.minimum(before + 1, len(values) - 1)
+    ordered = np.partition(values, [*before, *after], axis=0)
+    low, high = ordered[before], ordered[after]
+    steps = (places - before).reshape(-1, *[1] * (values.ndim - 1))
+    return np.where(steps < 0.5, low + (high - low) * steps, high - (high - low) * (1 - steps))
 
 
 def lower_median(values: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from gsmerge.alignment.resection import projection_errors, refine_poses, start_pose
 from gsmerge.alignment.score import Correspondences
+from gsmerge.arrays import distinct
 from gsmerge.geometry import IDENTITY, Similarity, camera_centres, mean_pose_frame, robust_weights
 from gsmerge.kernels.elementary import arccos, log
 from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric, transform
@@ -161,7 +162,7 @@ def solve_frame(
 
 def own_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
     """Solve for the pose ``[4,4]`` of each view from its own pixels only; leave out views where that fails."""
-    poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in np.unique(pairs.views))
+    poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in distinct(pairs.views))
     return {view: pose for view, pose in poses if pose is not None}
 
 

@@ -33,6 +33,7 @@ from gsmerge.alignment.score import (
     sample_layout,
     score_layout,
 )
+from gsmerge.arrays import distinct
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, camera_centres
 from gsmerge.io.cameras.camera_file import CameraFile
@@ -146,7 +147,8 @@ def _match_layout(source: RowSource, grid: Grid, layout: Layout) -> list[Candida
     """
     inputs = source.inputs(grid, photos=False)
     pairs = inputs.pairs(sample_layout(layout, QUICK_GAUSSIANS))
-    views, view_of_part = np.unique(layout.views, return_inverse=True)
+    views = distinct(np.asarray(layout.views))
+    view_of_part = np.searchsorted(views, layout.views)
     count, pairs = len(views), replace(pairs, views=view_of_part[pairs.parts])
 
     @cache

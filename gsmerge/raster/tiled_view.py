@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gsmerge.arrays import distinct
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_centres
 from gsmerge.kernels.matrices import matmul
@@ -120,7 +121,7 @@ def tile_ranges(tiled: TiledView, threads: int, least: int = PIECE) -> list[tupl
     count = len(tiled.flatten_ids)
     num = num_pieces(count, threads, least)
     cuts = np.searchsorted(tiled.isect_offsets, count * np.arange(1, num) / num)
-    edges = np.unique(np.concatenate([[0], cuts, [len(tiled.isect_offsets) - 1]]))
+    edges = distinct(np.concatenate([[0], cuts, [len(tiled.isect_offsets) - 1]]))
     return list(pairwise(edges.tolist()))
 
 

@@ -20,6 +20,7 @@ from gsmerge.geometry import (
     move_region,
     normalize,
     project,
+    quantiles,
     quat_to_rotmat,
     rotmat_to_quat,
     step_outside,
@@ -91,6 +92,16 @@ def test_median_of_few_and_of_many_values(count: int, kind: str) -> None:
     elif kind == "periodic":
         values[:: max(1, count // SAMPLE_VALUES)] -= 100
     assert median(values) == np.median(values)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 1001])
+def test_quantiles_are_those_of_numpy(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=(count, 3))
+    shares = (0.0, 0.05, 0.5, 0.7, 1.0)
+    assert np.array_equal(quantiles(values, shares), np.quantile(values, shares, axis=0))
+    assert np.array_equal(
+        quantiles(values[:, 0].astype(np.float32), shares), np.quantile(np.float32(values[:, 0]), shares)
+    )
 
 
 def test_lower_median_is_a_value_of_each_column() -> None:
