@@ -25,6 +25,7 @@ from gsmerge.evidence.offsets import NEAR_PIXELS, SIDE, TOLERANCE, PhotoOffsets,
 from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
 from gsmerge.frozen import dataclass
+from gsmerge.geometry import median
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.runtime.threads import parallel_map
 
@@ -292,7 +293,7 @@ def _least_score(scores: np.ndarray) -> float:
 
     If the proposed photos together are right, it is half their median, half-way from wrong pairs to right pairs.
     """
-    return min(SIGNIFICANT, float(np.median(scores)) / 2) if _exceed_noise(scores) else SIGNIFICANT
+    return min(SIGNIFICANT, median(scores) / 2) if _exceed_noise(scores) else SIGNIFICANT
 
 
 def _exceed_noise(scores: np.ndarray) -> bool:
@@ -300,7 +301,7 @@ def _exceed_noise(scores: np.ndarray) -> bool:
 
     The median is used because a single score hardly moves it.
     """
-    return bool(len(scores) and np.median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
+    return bool(len(scores) and median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
 
 
 def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:

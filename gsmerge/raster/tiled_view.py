@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gsmerge.arrays import distinct
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import camera_centres
+from gsmerge.geometry import camera_centres, medians
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import project as projection
 from gsmerge.kernels.raster.binning import count_tiles, deal_open_tiles, deal_tiles, depth_order
@@ -79,8 +79,8 @@ def _spread_origin(means: Array) -> Array:
     sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
         return np.zeros(3)
-    centre = np.median(sample, axis=0)
-    spread = np.median(np.abs(sample - centre), axis=0).max()
+    centre = medians(sample)
+    spread = medians(np.abs(sample - centre)).max()
     return centre if np.abs(centre).max() > FAR_ORIGIN * spread else np.zeros(3)
 
 

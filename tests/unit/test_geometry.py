@@ -16,6 +16,7 @@ from gsmerge.geometry import (
     lies_inside,
     lower_median,
     median,
+    medians,
     middle_depth,
     move_region,
     normalize,
@@ -92,6 +93,16 @@ def test_median_of_few_and_of_many_values(count: int, kind: str) -> None:
     elif kind == "periodic":
         values[:: max(1, count // SAMPLE_VALUES)] -= 100
     assert median(values) == np.median(values)
+    values[count // 3] = np.nan
+    assert math.isnan(median(values))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 1001])
+def test_medians_are_those_of_numpy(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=(count, 3))
+    values[count // 2, 1] = np.nan
+    assert np.array_equal(medians(values), np.median(values, axis=0), equal_nan=True)
+    assert math.isnan(median(np.empty(0)))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 10, 1001])

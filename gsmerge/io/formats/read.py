@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import lower_median, quantiles, rgb_to_sh0
+from gsmerge.geometry import lower_median, median, quantiles, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.table import DEPTHS, META, PLY, SCENE_SUFFIXES, find_format
@@ -475,7 +475,7 @@ def _describe_wrong_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndar
     sample = np.asarray(rows[:: max(1, len(rows) // _SCALE_GAUSSIANS)])
     low, high = quantiles(gather(means, sample).astype(np.float64), (0.05, 0.95))
     width, sizes = float((high - low).max()), gather(scales, sample)
-    size = float(np.median(sizes.max(1)))
+    size = median(sizes.max(1))
     text = f"half of the Gaussians have a standard deviation above {size:.3g} in a scene of width {width:.3g}"
     max_size = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
     stored = float(log(size))
