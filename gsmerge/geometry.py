@@ -112,9 +112,14 @@ def is_inside(pixels: np.ndarray, cameras: Cameras) -> np.ndarray:
     return np.asarray((column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height))
 
 
-def camera_depths(points: np.ndarray, viewmats: np.ndarray) -> np.ndarray:
-    """Return the depths ``[...]`` along z of points ``[...,3]`` in cameras ``[...,4,4]``, world to camera."""
+def camera_depths(points: np.ndarray, viewmats: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
+    """Return the depths ``[...]`` along z of points ``[...,3]`` in cameras ``[...,4,4]``, world to camera.
+
+    ``ids [n]`` choose the camera of each of ``[n,3]`` points.
+    """
     (x, y, z), (a, b, c, d) = np.moveaxis(points, -1, 0), np.moveaxis(viewmats[..., 2, :], -1, 0)
+    if ids is not None:
+        a, b, c, d = a[ids], b[ids], c[ids], d[ids]
     return x * a + y * b + z * c + d
 
 

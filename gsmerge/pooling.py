@@ -58,7 +58,7 @@ def scene_members(scene: Scene) -> Members:
     def measure_footprints(start: int) -> None:
         rows = slice(start, start + ROWS)
         views = homes[rows] // scene.pixels_per_view
-        depths = np.abs(camera_depths(means[rows], viewmats[views]))
+        depths = np.abs(camera_depths(means[rows], viewmats, views))
         footprints[rows] = np.maximum(depths, np.float32(1e-6)) / focals.astype(np.float32)[views]
 
     parallel_map(measure_footprints, range(0, len(g), ROWS))

@@ -83,7 +83,7 @@ def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussian
         return gaussians, Pixels.of_grid(mask.reshape(grid))
     in_pixels = np.flatnonzero(homes >= 0)  # several Gaussians share a pixel, or some have none
     viewmats = result.cameras.viewmats[list(result.views)]
-    depths = camera_depths(gaussians.means[in_pixels].astype(np.float64), viewmats[homes[in_pixels] // prod(grid[1:])])
+    depths = camera_depths(gaussians.means[in_pixels].astype(np.float64), viewmats, homes[in_pixels] // prod(grid[1:]))
     fronts = np.full(prod(grid), -1, np.int32)
     farthest_first = in_pixels[np.argsort(-depths, kind="stable")]
     fronts[homes[farthest_first]] = farthest_first  # the nearest Gaussian of a pixel is written last
