@@ -53,6 +53,14 @@ def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor
     return torch.as_tensor(values, device=device)
 
 
+def distinct(values: np.ndarray) -> np.ndarray:
+    """Return the distinct values of an array ``[n]``, ascending; ``np.unique`` takes several times as long."""
+    ordered = np.sort(values)
+    is_new = np.ones(len(ordered), bool)
+    np.not_equal(ordered[1:], ordered[:-1], out=is_new[1:])
+    return ordered[is_new]
+
+
 def to_float32(values: np.ndarray) -> np.ndarray:
     """Round an array to float32; numbers beyond its range become infinite."""
     with np.errstate(over="ignore"):

@@ -8,10 +8,11 @@ frame and back changes no bit.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths, lower_median, move_region, project
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map
@@ -83,8 +84,9 @@ def scene_depth(scene: Scene) -> float:
     means = scene.gaussians.means[rows].astype(np.float64)
     if scene.has_own_pixels:
         homes = scene.get_pixels().homes[rows]
-        viewmats = scene.cameras.viewmats[homes[homes >= 0] // scene.pixels_per_view]
-        return float(lower_median(np.abs(camera_depths(means[homes >= 0], viewmats))))
+        if homes.min() < 0:
+            means, homes = means[homes >= 0], homes[homes >= 0]
+        return float(lower_median(np.abs(camera_depths(means, scene.cameras.viewmats, homes // scene.pixels_per_view))))
     views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
     pixels, depths = project(means, views)
     x, y = pixels[..., 0], pixels[..., 1]
@@ -92,12 +94,12 @@ def scene_depth(scene: Scene) -> float:
     return float(lower_median(depths[seen])) if seen.any() else 0.0
 
 
-def sample_rows(scene: Scene) -> np.ndarray:
+def sample_rows(scene: Scene) -> slice:
     """Choose evenly spread rows of a scene; ValueError if it has none."""
     count = len(scene.gaussians)
     if count == 0:
         raise ValueError("expected at least one Gaussian, got none")
-    return np.arange(0, count, max(1, count // SAMPLE_GAUSSIANS))
+    return slice(0, count, max(1, count // SAMPLE_GAUSSIANS))
 
 
 def canonicalise(scene: SceneT, frame: Frame | None = None) -> tuple[SceneT, Frame]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from gsmerge.arrays import to_float32
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.pool import decompose, pool
@@ -58,7 +58,7 @@ def scene_members(scene: Scene) -> Members:
     def measure_footprints(start: int) -> None:
         rows = slice(start, start + ROWS)
         views = homes[rows] // scene.pixels_per_view
-        depths = np.abs(camera_depths(means[rows], viewmats[views]))
+        depths = np.abs(camera_depths(means[rows], viewmats, views))
         footprints[rows] = np.maximum(depths, np.float32(1e-6)) / focals.astype(np.float32)[views]
 
     parallel_map(measure_footprints, range(0, len(g), ROWS))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import html
 import io
 import json
 import re
@@ -112,8 +111,10 @@ def wrap_line(line: str, columns: int | None, hang: int = 0) -> list[str]:
 def html_table(rows: Sequence[Sequence[str]]) -> str:
     """Format rows as an HTML table for notebooks, with the first column left-aligned and others right-aligned."""
 
+    from html import escape
+
     def cell(text: str, side: str) -> str:
-        return f'<td style="text-align:{side}">{html.escape(text)}</td>'
+        return f'<td style="text-align:{side}">{escape(text)}</td>'
 
     lines = [cell(row[0], "left") + "".join(cell(text, "right") for text in row[1:]) for row in rows]
     return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import numpy as np
 
 from gsmerge.arrays import Array, as_array, as_pictures, as_tensor, check_shape, concat_rows
+from gsmerge.frozen import dataclass
 
 if TYPE_CHECKING:
     import torch
@@ -417,7 +418,10 @@ class Scene:
     @property
     def file_gaussians(self) -> Gaussians:
         """Gaussians of the file, without Gaussians that fill holes."""
-        return self.gaussians if self.filled is None else self.gaussians[~self.filled]
+        if self.filled is None:
+            return self.gaussians
+        count = self.num_gaussians  # rows that fill holes are usually the last, and then nothing is copied
+        return self.gaussians[~self.filled if self.filled[:count].any() else slice(count)]
 
     @property
     def pixels_per_view(self) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from gsmerge.alignment.resection import (
     start_pose,
 )
 from gsmerge.alignment.score import Correspondences, is_as_near, pixel_limit
+from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import make_pinhole
 from gsmerge.io.photo_files import Size
 from gsmerge.kernels.elementary import log

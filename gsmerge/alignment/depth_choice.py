@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.geometry import camera_centres, camera_depths, nearest_views, sh0_to_rgb
+from gsmerge.geometry import camera_centres, camera_depths, median, nearest_views, sh0_to_rgb
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
 from gsmerge.kernels.pictures import blur
 from gsmerge.runtime.threads import parallel_map
@@ -36,18 +36,27 @@ def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> tuple[Scene, i
     itself is returned if no Gaussian moves.
     """
     views, g, fronts = len(scene), scene.gaussians, scene.get_pixels().fronts.reshape(len(scene), -1)
-    viewmats, maps = scene.cameras.viewmats.astype(np.float64), maps.reshape(views, -1).astype(np.float64)
-    centres, means = camera_centres(viewmats), g.means[fronts]
-    depths = camera_depths(means, viewmats[:, None])
-    usable = (fronts >= 0) & (depths > 0) & (maps > 0) & np.isfinite(maps)
-    ratios = np.where(usable, maps, 1) / np.where(usable, depths, 1)
+    viewmats, maps = scene.cameras.viewmats.astype(np.float64), maps.reshape(views, -1)
+    usable, ratios = np.empty(fronts.shape, bool), np.empty(fronts.shape)
+
+    def measure(view: int) -> None:
+        depths, view_maps = camera_depths(g.means[fronts[view]], viewmats[view]), maps[view].astype(np.float64)
+        usable[view] = (fronts[view] >= 0) & (depths > 0) & (view_maps > 0) & np.isfinite(view_maps)
+        ratios[view] = np.where(usable[view], view_maps, 1) / np.where(usable[view], depths, 1)
+
+    def change(view: int, scale: float) -> np.ndarray:
+        """Return the factors ``[p]`` on the depths of the Gaussians that lead to the maps."""
+        return np.where(usable[view], np.clip(scale * ratios[view], 1 / _MAX_FACTOR, _MAX_FACTOR), 1)
+
+    parallel_map(measure, range(views))
     # mask [v,p] of pixels whose Gaussians move, means [v,p,3] at the depths of the maps, and factors [v,p] of the depth
-    best = np.zeros_like(usable), means, ratios
-    for scale in (unit, 1 / float(np.median(ratios[usable]))) if views > 1 and usable.any() else ():
-        factors = np.where(usable, np.clip(scale * ratios, 1 / _MAX_FACTOR, _MAX_FACTOR), 1)
-        differ = np.abs(factors - 1) > _SAME
-        if not differ.any():
+    best: tuple[np.ndarray, ...] | None = None
+    for choose_unit in (lambda: unit, lambda: 1 / median(ratios[usable])) if views > 1 and usable.any() else ():
+        scale = choose_unit()
+        if not any((np.abs(change(view, scale) - 1) > _SAME).any() for view in range(views)):
             return scene, 0
+        factors, centres = np.stack([change(view, scale) for view in range(views)]), camera_centres(viewmats)
+        differ, means = np.abs(factors - 1) > _SAME, g.means[fronts]
         map_means = np.stack([
             centre + (view_means - centre) * view_factors[:, None]
             for centre, view_means, view_factors in zip(centres, means, factors, strict=True)
@@ -58,6 +67,8 @@ def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> tuple[Scene, i
             best = _select_pixels(votes, differ) & usable, map_means, factors
         if lead > _CLEAR_LEAD:
             break
+    if best is None:
+        return scene, 0
     is_moved, map_means, factors = best
     rows = fronts[is_moved]
     if len(rows) == 0:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
-from gsmerge.geometry import camera_depths, rgb_to_sh0
+from gsmerge.geometry import camera_depths, median, rgb_to_sh0, vector_lengths
 from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene, fill_pixels
 
 _MAX_SPREAD = 0.15  # median relative deviation of depth ratios; above it the map does not belong to the Gaussians
@@ -19,41 +22,74 @@ def fill_from_depths(scene: Scene, maps: np.ndarray, images: np.ndarray) -> Scen
     are copied from the previous pixel with a Gaussian. The scene is returned unchanged if its Gaussians do not lie at
     the depths of the maps.
     """
-    g, V, fronts = scene.gaussians, scene.cameras.viewmats, scene.get_pixels().fronts.reshape(len(scene), -1)
-    rays = _make_rays(scene.cameras)
-    z = camera_depths(g.means[fronts].astype(np.float64), V[:, None])
-    lengths, maps = np.linalg.norm(rays, axis=2), maps.reshape(len(scene), -1).astype(np.float64)
-    has_depth = (maps > 0) & np.isfinite(maps)
-    usable = (fronts >= 0) & has_depth & (z > 0)
+    maps = maps.reshape(len(scene), -1)
+    places, added = _make_gaussians(scene, maps, images)
+    return scene if added is None else fill_pixels(scene, added, places)
+
+
+def _make_gaussians(scene: Scene, maps: np.ndarray, images: np.ndarray) -> tuple[np.ndarray, Gaussians | None]:
+    """Return the pixels ``[n]`` to fill, and their Gaussians; None if the Gaussians do not lie at the depths."""
+    g, fronts = scene.gaussians, scene.get_pixels().fronts.reshape(maps.shape)
+    empty = np.flatnonzero((fronts < 0) & _have_depth(maps))  # pixels that get a Gaussian
+    z, lengths, usable = _measure_depths(scene, maps)
     if not usable.any():
-        return scene
-    spread, unit, is_distance = _fit_unit(z[usable], maps[usable], lengths[usable])
+        return empty, None
+    spread, unit, is_distance = _fit_unit(z[usable], maps[usable].astype(np.float64), lengths[usable])
     if spread > _MAX_SPREAD:
-        return scene
-    empty = np.flatnonzero((fronts < 0) & has_depth)  # pixels that get a Gaussian
-    new_z = (unit * maps / (lengths if is_distance else 1)).reshape(-1)[empty]
-    means = _unproject(rays.reshape(-1, 3)[empty], new_z, V[empty // scene.pixels_per_view])
+        return empty, None
+    new_z = unit * maps.reshape(-1)[empty].astype(np.float64) / (lengths.reshape(-1)[empty] if is_distance else 1)
     previous = np.flatnonzero(usable)
     previous = previous[np.maximum(np.searchsorted(previous, empty) - 1, 0)]
     models = g[fronts.reshape(-1)[previous]]
     scales = models.scales * (new_z / z.reshape(-1)[previous]).astype(np.float32)[:, None]
     sh0 = rgb_to_sh0(images.reshape(-1, 1, 3)[empty]).astype(g.sh0.dtype)
-    means = means.astype(g.means.dtype)
-    added = Gaussians(means, models.quats, scales, models.opacities, sh0, np.zeros_like(models.shN))
-    return fill_pixels(scene, added, empty)
+    means = _unproject(scene.cameras, empty, new_z).astype(g.means.dtype)
+    return empty, Gaussians(means, models.quats, scales, models.opacities, sh0, np.zeros_like(models.shN))
 
 
-def _make_rays(cameras: Cameras) -> np.ndarray:
-    """Return the points ``[v,p,3]`` at depth 1 on the rays of all pixels, in the frame of each camera."""
+def _measure_depths(scene: Scene, maps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Measure the pixels of all views ``[v,p]``, view by view since a page of memory is slow at first use.
+
+    Returns the depths of the Gaussians in front, the distances of points at depth 1, and a mask of the pixels with both
+    a Gaussian and a depth in ``maps [v,p]``.
+    """
+    g, viewmats, fronts = scene.gaussians, scene.cameras.viewmats, scene.get_pixels().fronts.reshape(maps.shape)
+    z, lengths, usable = np.empty(maps.shape), np.empty(maps.shape), np.empty(maps.shape, bool)
+
+    def measure(view: int) -> None:
+        z[view] = camera_depths(g.means[fronts[view]].astype(np.float64), viewmats[view])
+        lengths[view] = vector_lengths(_make_rays(scene.cameras, view))[:, 0]
+        usable[view] = (fronts[view] >= 0) & _have_depth(maps[view]) & (z[view] > 0)
+
+    parallel_map(measure, range(len(maps)))
+    return z, lengths, usable
+
+
+def _have_depth(maps: np.ndarray) -> np.ndarray:
+    """Return a mask of the pixels of depth maps that have a depth."""
+    return np.asarray((maps > 0) & np.isfinite(maps))
+
+
+def _make_rays(cameras: Cameras, view: int) -> np.ndarray:
+    """Return the points ``[p,3]`` at depth 1 on the rays of all pixels of a view, in the frame of its camera."""
     y, x = np.mgrid[: cameras.height, : cameras.width].reshape(2, -1) + 0.5
     pixels = np.stack([x, y, np.ones(x.size)], 1)
-    return matmul(pixels, invert(cameras.Ks).transpose(0, 2, 1))
+    return matmul(pixels, invert(cameras.Ks[view]).T)
 
 
-def _unproject(rays: np.ndarray, z: np.ndarray, viewmats: np.ndarray) -> np.ndarray:
-    """Return points ``[n,3]`` of the world at depths ``z [n]`` on ``rays [n,3]`` of cameras ``viewmats [n,4,4]``."""
-    local = rays * z[:, None]
-    return np.asarray((viewmats[:, :3, :3] * (local - viewmats[:, :3, 3])[:, :, None]).sum(1))
+def _unproject(cameras: Cameras, places: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Return points ``[n,3]`` of the world at depths ``z [n]`` on the rays of pixels.
+
+    ``places [n]`` number the pixels over all views, and ascend.
+    """
+    points, pixels = np.empty((len(places), 3)), cameras.width * cameras.height
+    ends = np.searchsorted(places, pixels * np.arange(len(cameras) + 1)).tolist()
+    for view, (start, end) in enumerate(pairwise(ends)):
+        rows, viewmat = slice(start, end), cameras.viewmats[view]
+        local = _make_rays(cameras, view)[places[rows] - view * pixels] * z[rows, None] - viewmat[:3, 3]
+        for axis, (a, b, c) in enumerate(viewmat[:3, :3].T):
+            points[rows, axis] = a * local[:, 0] + b * local[:, 1] + c * local[:, 2]
+    return points
 
 
 def _fit_unit(z: np.ndarray, maps: np.ndarray, lengths: np.ndarray) -> tuple[float, float, bool]:
@@ -65,6 +101,6 @@ def _fit_unit(z: np.ndarray, maps: np.ndarray, lengths: np.ndarray) -> tuple[flo
     """
     fits = []
     for is_distance, ratios in ((False, z / maps), (True, z / maps * lengths)):
-        unit = float(np.median(ratios))
-        fits.append((float(np.median(np.abs(ratios / unit - 1))), unit, is_distance))
+        unit = median(ratios)
+        fits.append((median(np.abs(ratios / unit - 1)), unit, is_distance))
     return min(fits)

@@ -8,7 +8,7 @@ shows the lines before and after them in their pixels, also the incomplete ones,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from gsmerge.alignment.centres import follow_rows
 from gsmerge.alignment.layouts import Layout, dropped_layout, subsample
 from gsmerge.alignment.resection import projective_camera
 from gsmerge.alignment.score import find_correspondences, is_as_near
+from gsmerge.frozen import dataclass
 from gsmerge.kernels.matrices import matmul
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from gsmerge.alignment.layouts import exact_layouts, subsample, view_orders
 from gsmerge.alignment.row_grid import find_layouts
 from gsmerge.alignment.score import Correspondences, find_correspondences, is_clearly_nearer, pixel_limit
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import is_inside, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
 from gsmerge.io.formats.read import GaussianFile

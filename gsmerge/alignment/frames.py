@@ -14,7 +14,8 @@ import numpy as np
 
 from gsmerge.alignment.resection import projection_errors, refine_poses, start_pose
 from gsmerge.alignment.score import Correspondences
-from gsmerge.geometry import IDENTITY, Similarity, camera_centres, mean_pose_frame, robust_weights
+from gsmerge.arrays import distinct
+from gsmerge.geometry import IDENTITY, Similarity, camera_centres, mean_pose_frame, median, medians, robust_weights
 from gsmerge.kernels.elementary import arccos, log
 from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric, transform
 from gsmerge.types import Cameras
@@ -161,7 +162,7 @@ def solve_frame(
 
 def own_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
     """Solve for the pose ``[4,4]`` of each view from its own pixels only; leave out views where that fails."""
-    poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in np.unique(pairs.views))
+    poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in distinct(pairs.views))
     return {view: pose for view, pose in poses if pose is not None}
 
 
@@ -172,7 +173,8 @@ def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray |
     if len(rows) < _MIN_POSE_POINTS:
         return None
     points, pixels = pairs.points[rows], pairs.pixels[rows]
-    middle, unit = np.median(points, 0), float(np.median(np.abs(points - np.median(points, 0)))) or 1.0
+    middle = medians(points)
+    unit = median(np.abs(points - middle)) or 1.0
     points, K = (points - middle) / unit, K.astype(np.float64)
     for _ in range(2):  # the second time without points far from their pixels
         start = start_pose(points, pixels, K)
@@ -180,7 +182,7 @@ def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray |
             return None
         pose = start
         errors = projection_errors(points, pixels, K, pose)
-        is_near = errors <= max(1.0, 3 * float(np.median(errors)))
+        is_near = errors <= max(1.0, 3 * median(errors))
         points, pixels = points[is_near], pixels[is_near]
     try:
         _, (pose,) = refine_poses([points], [pixels], K, pose[None])

@@ -6,7 +6,7 @@ Files give some sizes, and the rows themselves show others.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from gsmerge.alignment.cameras import Poses, describe_other_convention
 from gsmerge.alignment.layouts import TRIMS, da3_box
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import PATCH, CameraFile, Convention, sizes_of, to_cameras
 from gsmerge.io.cameras.table import FFGS

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property
 from itertools import chain, compress
 
@@ -33,6 +33,8 @@ from gsmerge.alignment.score import (
     sample_layout,
     score_layout,
 )
+from gsmerge.arrays import distinct
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, camera_centres
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
@@ -145,7 +147,8 @@ def _match_layout(source: RowSource, grid: Grid, layout: Layout) -> list[Candida
     """
     inputs = source.inputs(grid, photos=False)
     pairs = inputs.pairs(sample_layout(layout, QUICK_GAUSSIANS))
-    views, view_of_part = np.unique(layout.views, return_inverse=True)
+    views = distinct(np.asarray(layout.views))
+    view_of_part = np.searchsorted(views, layout.views)
     count, pairs = len(views), replace(pairs, views=view_of_part[pairs.parts])
 
     @cache

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gsmerge.geometry import Damping, descend, motion_matrices, robust_weights
+from gsmerge.geometry import Damping, descend, median, medians, motion_matrices, robust_weights
 from gsmerge.kernels import reproject
 from gsmerge.kernels.matrices import eigh, matmul, solve
 
@@ -141,8 +141,8 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     A projective camera is any ``[3,4]`` matrix. It is solved by the direct linear transform with reweighting (Hartley
     and Zisserman 2004, section 7.1). Also returns the median distance from the pixels.
     """
-    middle = np.median(points, 0)
-    unit = float(np.median(np.abs(points - middle))) or 1.0
+    middle = medians(points)
+    unit = median(np.abs(points - middle)) or 1.0
     local, basis = _whiten((points - middle) / unit)
     centre, size = pixels.mean(0), float(pixels.std()) or 1.0
     targets = (pixels - centre) / size
@@ -164,7 +164,7 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     camera[:2] = size * camera[:2] + centre[:, None] * camera[2]
     camera[:, :3] /= unit
     camera[:, 3] -= matmul(camera[:, :3], middle)
-    return camera, size * float(np.median(error))
+    return camera, size * median(error)
 
 
 def _whiten(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

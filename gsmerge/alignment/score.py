@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from gsmerge.alignment.layouts import Layout, plain_layout, spread_step, subsample
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import Similarity, lower_median, median, sh0_to_rgb
 from gsmerge.kernels import reproject
 from gsmerge.runtime.memory import free_pages, gather

@@ -12,6 +12,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from gsmerge.cli.parameters import listed_settings
+from gsmerge.cli.plain_values import convert_plain_values
 from gsmerge.errors import UsageError
 from gsmerge.settings.reading import FileHints
 from gsmerge.settings.setting import find_near_names, flat_settings, suggest_name
@@ -65,6 +66,8 @@ class _Words:
         words = list(args)
         params = self.get_params(ctx)  # type: ignore[attr-defined]
         names = {name for param in params for name in param.opts}
+        for param in params:
+            convert_plain_values(param)
         for word in words[: words.index("--") if "--" in words else None]:
             if re.match("-[^-]", word) and f"-{word.partition('=')[0]}" in names:
                 raise UsageError(f"{word}: expected two dashes, -{word}")

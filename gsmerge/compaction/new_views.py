@@ -7,13 +7,14 @@ photos that were left out, over the pixels that the rows cover.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
 from gsmerge.compaction.forecast import AFTER, BEFORE, fit_cost
 from gsmerge.compaction.left_out import LEAST_SEEN, LeftOut, can_leave_out, choose_views, leave_out, mean_seen
 from gsmerge.facts.prepare import Prepared
+from gsmerge.frozen import dataclass
 from gsmerge.io.formats.arrays import ExpectedScores
 from gsmerge.kernels.elementary import power
 from gsmerge.pipeline import Build

@@ -8,10 +8,11 @@ as that lowers the weights between blocks.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_centres, project
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.memory import free_pages

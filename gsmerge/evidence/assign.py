@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -24,6 +24,8 @@ import numpy as np
 from gsmerge.evidence.offsets import NEAR_PIXELS, SIDE, TOLERANCE, PhotoOffsets, find_offsets
 from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
+from gsmerge.frozen import dataclass
+from gsmerge.geometry import median
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.runtime.threads import parallel_map
 
@@ -291,7 +293,7 @@ def _least_score(scores: np.ndarray) -> float:
 
     If the proposed photos together are right, it is half their median, half-way from wrong pairs to right pairs.
     """
-    return min(SIGNIFICANT, float(np.median(scores)) / 2) if _exceed_noise(scores) else SIGNIFICANT
+    return min(SIGNIFICANT, median(scores) / 2) if _exceed_noise(scores) else SIGNIFICANT
 
 
 def _exceed_noise(scores: np.ndarray) -> bool:
@@ -299,7 +301,7 @@ def _exceed_noise(scores: np.ndarray) -> bool:
 
     The median is used because a single score hardly moves it.
     """
-    return bool(len(scores) and np.median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
+    return bool(len(scores) and median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
 
 
 def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:

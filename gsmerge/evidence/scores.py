@@ -7,14 +7,14 @@ so the median absolute deviation of all z is the noise of wrong pairs.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from gsmerge.evidence.pictures import ViewPictures, fit_size
+from gsmerge.frozen import dataclass
+from gsmerge.geometry import median
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import ORIENTATIONS, blur, turn_back
@@ -137,11 +137,14 @@ def measure_noise(z_scores: np.ndarray, least: float) -> tuple[np.ndarray, float
     Both are robust and ignore NaN. ``least`` is the smallest standard deviation that is returned.
     """
     flat = z_scores.reshape(len(z_scores), -1)
-    with warnings.catch_warnings():  # about views without Gaussians, whose scores are all NaN
-        warnings.simplefilter("ignore", RuntimeWarning)
-        middle = np.nan_to_num(np.nanmedian(flat, 1))
-        spread = np.nan_to_num(np.nanmedian(np.abs(flat - middle[:, None])))
-    return middle, max(NORMAL * float(spread), least)
+    middle = np.array([_median_of_known(scores) for scores in flat], flat.dtype)
+    return middle, max(NORMAL * _median_of_known(np.abs(flat - middle[:, None]).reshape(-1)), least)
+
+
+def _median_of_known(scores: np.ndarray) -> float:
+    """Return the median of ``scores [n]`` that are not NaN; 0 without any, as for views without Gaussians."""
+    known = scores[~np.isnan(scores)]
+    return median(known) if len(known) else 0.0
 
 
 def signed_ranks(gains: np.ndarray) -> float:

@@ -15,12 +15,13 @@ same gain. In both cases the mean would be farther from new photos, by 1.5 dB in
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from gsmerge.facts.photo_change import CLIPPED, PhotoChange, change_large
-from gsmerge.geometry import camera_distances, correlation, order_others, rgb_to_sh0, sh0_to_rgb
+from gsmerge.frozen import dataclass
+from gsmerge.geometry import camera_distances, correlation, median, medians, order_others, rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels.compare_views import find_surfaces
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import solve
@@ -117,8 +118,8 @@ def root_mean_square(gains: np.ndarray) -> float:
 
 def share_left(pairs: Sequence[_Pair], gains: np.ndarray) -> float:
     """Return the share of the views' colour differences that remains after applying logarithmic gains ``[v,3]``."""
-    before = sum(float(np.median(np.abs(pair.sample))) for pair in pairs)
-    after = sum(float(np.median(np.abs(pair.sample - gains[pair.other] + gains[pair.view]))) for pair in pairs)
+    before = sum(median(np.abs(pair.sample)) for pair in pairs)
+    after = sum(median(np.abs(pair.sample - gains[pair.other] + gains[pair.view])) for pair in pairs)
     return after / max(before, 1e-9)
 
 
@@ -192,7 +193,7 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
             clear = ((here > LOW) & (here < HIGH) & (there > LOW) & (there < HIGH)).all(1)
             if clear.sum() >= MIN_PAIRS:
                 ratios = log(there[clear].astype(np.float64) / here[clear])
-                pairs.append(_Pair(view, other, np.median(ratios, 0), ratios[:MIN_PAIRS].copy(), len(ratios)))
+                pairs.append(_Pair(view, other, medians(ratios), ratios[:MIN_PAIRS].copy(), len(ratios)))
         return pairs
 
     return [pair for pairs in parallel_map(measure, range(len(views))) for pair in pairs]

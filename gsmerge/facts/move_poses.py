@@ -10,11 +10,19 @@ bit for bit, after one step at the smallest size.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.geometry import camera_depths, motion_matrices, motion_vectors, move_views, project, without_common_motion
+from gsmerge.frozen import dataclass
+from gsmerge.geometry import (
+    camera_depths,
+    median,
+    motion_matrices,
+    motion_vectors,
+    move_views,
+    project,
+    without_common_motion,
+)
 from gsmerge.kernels.compare_views import COLUMNS, compare_views
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur
@@ -206,7 +214,7 @@ def _compare(level: _Level, viewmats: np.ndarray) -> _Evidence:
 def _flows(level: _Level, evidence: _Evidence) -> np.ndarray:
     """Return the median motion ``[v]``, in pixels, of the pixels of each view over its pairs."""
     flows = [evidence.flows[(level.pairs == view).any(1)] for view in range(len(level.start))]
-    return np.array([np.median(view_flows) if len(view_flows) else 0.0 for view_flows in flows])
+    return np.array([median(view_flows) if len(view_flows) else 0.0 for view_flows in flows])
 
 
 def _any_wrong(level: _Level, before: _Evidence, after: _Evidence, *, end: bool) -> bool:

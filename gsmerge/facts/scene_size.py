@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
 from gsmerge.facts.views import camera_kinds
+from gsmerge.frozen import dataclass
+from gsmerge.geometry import median, quantiles, vector_lengths
 from gsmerge.types import Gaussians, Scene
 
 # Bounds for the Gaussians of captures. The median largest scale is at least TINY times the extent, which is twice the
@@ -63,12 +65,12 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
         return None
     sample = gaussians[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
     means = sample.means.astype(np.float64)
-    low, middle, high = np.percentile(means, (1, 50, 99), axis=0)
+    low, middle, high = quantiles(means, (0.01, 0.5, 0.99))
     diagonal = float(np.sqrt(((high - low) ** 2).sum()))
-    extent = 2 * float(np.median(np.sqrt(((means - middle) ** 2).sum(1))))
-    size, color = float(np.median(sample.scales.max(1))), float(np.median(np.abs(sample.sh0)))
-    low_color, high_color = np.percentile(sample.sh0[:, 0], (1, 99), axis=0)
-    flat, faint = float((high_color - low_color).max()) < FLAT, float(np.median(sample.opacities)) < FAINT
+    extent = 2 * median(vector_lengths(means - middle))
+    size, color = median(reduce(np.maximum, sample.scales.T)), median(np.abs(sample.sh0))
+    low_color, high_color = quantiles(sample.sh0[:, 0], (0.01, 0.99))
+    flat, faint = float((high_color - low_color).max()) < FLAT, median(sample.opacities) < FAINT
     if color > BRIGHT:
         problem = f"half of the base colours have coefficients beyond {color:.3g}"
     elif flat:

@@ -52,7 +52,9 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
 def camera_kinds(cameras: Cameras) -> np.ndarray:
     """Number the cameras ``[c]`` from 0, with equal numbers for equal poses and intrinsics."""
     rows = np.concatenate([cameras.viewmats.reshape(-1, 16), cameras.Ks.reshape(-1, 9)], 1)
-    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
+    numbers = [tuple(row) for row in rows.tolist()]
+    kinds = {kind: i for i, kind in enumerate(sorted(set(numbers)))}
+    return np.array([kinds[kind] for kind in numbers], np.int64)
 
 
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:

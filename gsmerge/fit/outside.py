@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from gsmerge.geometry import depths_inside, is_inside, middle_depth, project, step_outside
+from gsmerge.frozen import dataclass
+from gsmerge.geometry import depths_inside, is_inside, middle_depth, project, quantiles, step_outside
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster import Splats, make_splats, tile_view
 from gsmerge.raster.composite import blend, blend_depths, depth_colors
@@ -108,7 +109,7 @@ def _depth_range(points: np.ndarray, cameras: Cameras, count: int) -> tuple[np.n
     They follow from the depths of ``points [n,3]`` in the ``cameras`` from which the views step back, in turn.
     """
     depths = [depths_inside(points, cameras[[view]]) for view in range(min(count, len(cameras)))]
-    median, last = np.resize([np.quantile(view_depths, (0.5, LAST)) for view_depths in depths], (count, 2)).T
+    median, last = np.resize([quantiles(view_depths, (0.5, LAST)) for view_depths in depths], (count, 2)).T
     return NEAREST * median, FARTHEST * last
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
 
 from gsmerge.fit.outside import Outside
+from gsmerge.frozen import dataclass
 from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
 

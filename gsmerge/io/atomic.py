@@ -13,20 +13,19 @@ import os
 import re
 import secrets
 import shutil
-import socket
 import stat
 import sys
 import time
-import uuid
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cache
 from itertools import groupby, takewhile
 from pathlib import Path, PurePath
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.types import StrPath
 
 # Errors of the disk while a file is written; other OSErrors are errors of the caller
@@ -231,9 +230,13 @@ def _machine_hash() -> str:
     Host names and ids of name spaces are often equal in different containers. Therefore Linux's random boot id is used
     as well.
     """
-    names = f"{socket.gethostname()} {uuid.getnode()}"
-    with suppress(OSError):
+    try:
         names = f"{Path(_BOOT).read_text(encoding='ascii')} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        import socket  # these take some milliseconds, and Linux does not need them
+        import uuid
+
+        names = f"{socket.gethostname()} {uuid.getnode()}"
     return f"{zlib.crc32(names.encode()):08x}"
 
 

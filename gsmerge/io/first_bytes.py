@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 
 _PACKED_SCENES = (".spz", ".splat", ".sog", ".ksplat", ".npz", ".glb", ".gsm")
 _PHOTOS = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff")
@@ -93,8 +93,6 @@ OTHER_CONTENTS = (
         wrong=NO_TEXT,
     ),
 )  # fmt: skip
-_PATTERNS = tuple(re.compile(row.start.encode("latin-1")) for row in OTHER_CONTENTS)
-_PICTURES = tuple((name, re.compile(start.encode("latin-1"))) for name, _, start in OTHER_PICTURES)
 
 
 def read_start(path: Path, count: int = 1 << 12) -> bytes:
@@ -114,7 +112,7 @@ def refuse_picture(path: Path) -> None:
 
 def _list_formats(start: bytes) -> list[str]:
     """List the formats that the first bytes of a file match, of the formats of pictures that are not read."""
-    return [name for name, pattern in _PICTURES if pattern.match(start)]
+    return [name for name, _, pattern in OTHER_PICTURES if re.match(pattern.encode("latin-1"), start)]
 
 
 def _unread_picture(path: Path, name: str) -> SceneError:
@@ -136,8 +134,9 @@ def check_first_bytes(path: Path, size: int) -> None:
     start = read_start(path, _START)
     if ending in _PHOTOS and (names := _list_formats(start)):
         raise _unread_picture(path, names[0])
-    for row, pattern in zip(OTHER_CONTENTS, _PATTERNS, strict=True):
-        match = pattern.match(start) if ending not in row.right and ending in (row.wrong or (ending,)) else None
+    for row in OTHER_CONTENTS:
+        is_wrong = ending not in row.right and ending in (row.wrong or (ending,))
+        match = re.match(row.start.encode("latin-1"), start) if is_wrong else None
         if match:
             quote = (match.groupdict().get("quote") or b"").decode("utf-8", "replace").strip()
             shown = f" ({' '.join(quote.split())!r:.60})" if quote else ""

@@ -7,7 +7,8 @@ import struct
 import warnings
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +17,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
 from gsmerge.io.first_bytes import refuse_picture
 from gsmerge.io.image_names import ImageSource, match_images
@@ -47,6 +49,8 @@ _PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # of a pixel by mode; 4 in 
 _COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10  # of a pixel, while decoding
 _EMBEDDED_BYTES = 9  # additional bytes of a pixel while embedded photos are decoded
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # first bytes; the last two are those of BigTIFF
+# First bytes of a file -> Pillow's plugin; without a plugin for its first format, Pillow imports those of all formats
+_PLUGINS = {_PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp", **dict.fromkeys(_TIFF, "Tiff")}
 _TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8, 0])  # of a number by type of tag
 _TILE_TAGS = (322, 323)  # width and length of a tile, pixels
 _BITS_TAG, _SAMPLES_TAG = 258, 277
@@ -312,7 +316,7 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
             pixels = _png_pixels(data) if data[: len(_PNG)].tobytes() == _PNG else data  # without texts of many MB
             if pixels is None:
                 raise ValueError("damaged chunks")
-            with Image.open(io.BytesIO(pixels.data), formats=("PNG", *_FORMATS)) as image:
+            with _open_image(io.BytesIO(pixels.data), ("PNG", *_FORMATS)) as image:
                 channel = choose(image)
                 return None if channel is None else np.asarray(channel)
     except (SceneError, MemoryError):
@@ -361,7 +365,7 @@ def orientation_turn(path: Path) -> int:
     with read_errors(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            with Image.open(path, formats=(*_FORMATS, "PNG")) as image:
+            with path.open("rb") as file, _open_image(file, (*_FORMATS, "PNG")) as image:
                 return _TURNS.get(image.getexif().get(_ORIENTATION_TAG, 0), 0)
         except Exception:  # a damaged tag may make the library raise any error; pixels are checked later
             return 0
@@ -379,7 +383,7 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
                 _check_tags(path, file)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                image = Image.open(file, formats=_FORMATS)
+                image = _open_image(file, _FORMATS)
             pixel_bytes = _decoder_bytes(image)
             tags = getattr(image, "tag_v2", None)
             width, height = image.size if tags is None else (tags[_WIDTH_TAG], tags[_HEIGHT_TAG])
@@ -394,6 +398,16 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
         raise _unreadable(path) from error
     check_pixels(path, width, height)
     return (width, height), max(_COPIES[0] * _CHANNELS, _CHANNELS + pixel_bytes)
+
+
+def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
+    """Open an image in one of Pillow's ``formats``; errors as those of ``Image.open``."""
+    start = file.read(max(map(len, _PLUGINS)))
+    plugin = next((plugin for first, plugin in _PLUGINS.items() if start.startswith(first)), None)
+    if plugin is not None and plugin.upper() in formats:
+        import_module(f"PIL.{plugin}ImagePlugin")
+        formats = (plugin.upper(),)
+    return Image.open(file, formats=tuple(formats))
 
 
 def _check_tags(path: Path, file: BinaryIO) -> None:

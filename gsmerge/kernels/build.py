@@ -14,7 +14,6 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,10 +91,10 @@ def source_files() -> list[Path]:
 
 def hash_sources() -> str:
     """Return a hash of all sources; empty if there are none."""
-    digest = hashlib.sha256()
-    for path in source_files():
+    digest, paths = hashlib.sha256(), source_files()
+    for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16] if source_files() else ""
+    return digest.hexdigest()[:16] if paths else ""
 
 
 def compiler() -> list[str]:
@@ -148,6 +147,8 @@ def build(
         platform: Tag of a wheel; by default the platform of this machine.
         link: Options that link the objects to a library.
     """
+    from concurrent.futures import ThreadPoolExecutor  # takes some milliseconds, and runs only need `hash_sources`
+
     wheel_platform = find_platform(platform)
     with ThreadPoolExecutor() as pool:
         targets = wheel_platform.targets

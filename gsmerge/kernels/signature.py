@@ -13,12 +13,12 @@ from __future__ import annotations
 import ctypes
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial, wraps
 from typing import Any
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.kernels.library import load_library
 
 _CODES = {
@@ -114,7 +114,8 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
     """
 
     def wrap(function: Callable[..., Any]) -> Any:
-        if list(inspect.signature(function).parameters) != list(arguments):
+        code = function.__code__
+        if code.co_varnames[: code.co_argcount] != tuple(arguments):
             raise TypeError(f"{function.__name__}: expected parameters {list(arguments)}, as they are declared")
         return wraps(function)(declare(function.__name__, returns, **arguments))
 

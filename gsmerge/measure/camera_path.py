@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import (
     camera_centres,
     lower_median,

@@ -9,7 +9,6 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_output
 from gsmerge.kernels.elementary import sin
 from gsmerge.measure.preview import BLUE_FIRST, FACE, Picture, shorten_text

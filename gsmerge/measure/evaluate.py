@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from itertools import count
 
 import numpy as np
@@ -17,6 +17,7 @@ from gsmerge.facts.prepare import scored_pictures
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.facts.views import pick_views
 from gsmerge.frame import scene_frame
+from gsmerge.frozen import dataclass
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
 from gsmerge.measure.visibility import context_points, visible_pixels

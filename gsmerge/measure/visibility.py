@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.geometry import is_inside, project
+from gsmerge.geometry import is_inside, median, project
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.reproject import mark_pixels
 from gsmerge.raster import render
@@ -79,7 +79,7 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
     if sources is None:
         return _DILATION
     focals = [np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64))]  # pixels
-    return max(_DILATION, 2 * round((_DILATION * float(focals[0] / np.median(focals[1])) - 1) / 2) + 1)
+    return max(_DILATION, 2 * round((_DILATION * float(focals[0] / median(focals[1])) - 1) / 2) + 1)
 
 
 def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
@@ -88,7 +88,7 @@ def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
     for view in range(len(cameras)):
         (pixels,), (depths,) = project(gaussians.means, cameras[[view]])
         inside = (depths > 0) & is_inside(pixels, cameras)
-        near = _NEAR * float(np.median(depths[inside])) if inside.any() else 1.0
+        near = _NEAR * median(depths[inside]) if inside.any() else 1.0
         drawn = render(gaussians, cameras[[view]], near=near, with_depths=True)
         assert drawn.depths is not None
         candidates = np.flatnonzero(inside)

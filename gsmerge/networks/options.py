@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from itertools import pairwise
 from typing import Any
 
+from gsmerge.frozen import dataclass
 from gsmerge.networks.cross_view_stats import NUM_STATS
 from gsmerge.settings.setting import Settings, setting
 

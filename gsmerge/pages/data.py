@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.views import even_views
 from gsmerge.frame import Frame, scene_frame
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import middle_depth
 from gsmerge.io.photo_files import encode_indexed, encode_picture, photo_array
 from gsmerge.measure.camera_path import outside_camera

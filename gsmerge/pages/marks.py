@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import reduce
 
 import numpy as np
 
 from gsmerge.facts.support import TINTS, count_views
+from gsmerge.frozen import dataclass
 from gsmerge.io.photo_files import encode_indexed
 from gsmerge.raster import Splats, TiledView, tile_view
 from gsmerge.raster.composite import blend

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import composite
@@ -137,8 +138,17 @@ def scene_pictures(scene: Scene) -> np.ndarray:
 
 def row_pictures(scene: Scene) -> np.ndarray:
     """Return the base colours ``[v,h,w,3]`` of the Gaussians in front of a scene's pixels; 0 for pixels without any."""
-    colors, pixels = sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1), scene.get_pixels()
-    return np.where(pixels.shown[..., None], colors[pixels.fronts], np.float32(0))
+    sh0, pixels = scene.gaussians.sh0[:, 0], scene.get_pixels()
+    pictures = make_array((*pixels.fronts.shape, 3), np.float32)
+
+    def draw(view: int) -> None:
+        fronts, picture = pixels.fronts[view], pictures[view]
+        np.clip(sh0_to_rgb(sh0[fronts]), 0, 1, out=picture)
+        if (fronts < 0).any():
+            picture[fronts < 0] = 0
+
+    parallel_map(draw, range(len(pictures)))
+    return pictures
 
 
 def scene_photos(scene: Scene, level: float = 1) -> Photos:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gsmerge.geometry import camera_centres
+from gsmerge.arrays import distinct
+from gsmerge.frozen import dataclass
+from gsmerge.geometry import camera_centres, medians
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import project as projection
 from gsmerge.kernels.raster.binning import count_tiles, deal_open_tiles, deal_tiles, depth_order
@@ -78,8 +79,8 @@ def _spread_origin(means: Array) -> Array:
     sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
         return np.zeros(3)
-    centre = np.median(sample, axis=0)
-    spread = np.median(np.abs(sample - centre), axis=0).max()
+    centre = medians(sample)
+    spread = medians(np.abs(sample - centre)).max()
     return centre if np.abs(centre).max() > FAR_ORIGIN * spread else np.zeros(3)
 
 
@@ -123,7 +124,7 @@ def tile_ranges(tiled: TiledView, threads: int, least: int = PIECE) -> list[tupl
     count = len(tiled.flatten_ids)
     num = num_pieces(count, threads, least)
     cuts = np.searchsorted(tiled.isect_offsets, count * np.arange(1, num) / num)
-    edges = np.unique(np.concatenate([[0], cuts, [len(tiled.isect_offsets) - 1]]))
+    edges = distinct(np.concatenate([[0], cuts, [len(tiled.isect_offsets) - 1]]))
     return list(pairwise(edges.tolist()))
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from gsmerge.alignment import (
 )
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
@@ -430,7 +431,8 @@ def _combine(
     without_bars, bar_notes = cut_bars(pictures, camera_file)
     had_bars = without_bars is not pictures
     limited, size_notes = limit_photo_size(without_bars, len(ply.gaussians), hints.max_side, unaligned=order == "none")
-    depths, frames = partial(read_depths, Path(camera_file.path)), partial(read_dataparser, files.ply, files.cameras)
+    depths = cache(partial(read_depths, Path(camera_file.path)))
+    frames = partial(read_dataparser, files.ply, files.cameras)
     if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians
         problem = "expected one Gaussian per pixel, found the Gaussians of a state"
         cameras = to_cameras(pinholes, photo_size(limited))
@@ -449,9 +451,9 @@ def _combine(
         reason = "the photos have bars, which are cut off" if size else "there are no photos"
         notes.append(f"the pictures of {' and '.join(unused)} are not used, since {reason}")
     if had_bars:  # photos with bars have neither larger files nor masks
-        return _make_load(ply, files, hints, result, notes, absent=photos.absent)
+        return _make_load(ply, files, hints, result, notes, absent=photos.absent, depths=depths)
     large, masks, mask_notes = find_larger_and_masks(files, camera_file, photos, size, result.transform, result.cameras)
-    return _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
+    return _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent, depths)
 
 
 def _choose_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
@@ -493,10 +495,11 @@ def _make_load(
     large: LargePhotos | None = None,
     masks: Masks = NO_MASKS,
     absent: Sequence[int] = (),
+    depths: Callable[[], np.ndarray | None] = lambda: None,
 ) -> Loaded:
     """Make the scene from rows, their pixels and the views, with notes on how it was read.
 
-    ``absent``: indices of the cameras without a photo.
+    ``absent``: indices of the cameras without a photo. ``depths`` reads the depth maps beside the cameras.
     """
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
     scene, more = _make_scene(ply, files, result, large, masks)
@@ -510,7 +513,7 @@ def _make_load(
             more.append(f"the rows are the pixels of no views in any known order: {remedy}")
     else:
         assert camera_file is not None, "pixels belong to cameras"
-        scene, depth_notes = use_depths(scene, camera_file, layout, frame.scale)
+        scene, depth_notes = use_depths(scene, depths, layout, frame.scale)
         scene, rotation_notes = set_rotations(scene, hints, exporters, frame)
         more += [*depth_notes, *rotation_notes]
         if result.given is not None:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import prod
-from pathlib import Path
 
 import numpy as np
 
 from gsmerge.alignment import AlignmentResult, Layout, choose_rotations, read_rotations
 from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, camera_depths, rgb_to_sh0
-from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.cameras.read import holds_images, read_depths
+from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.formats.table import DEPTHS, find_format
 from gsmerge.raster.photos import LEAST_OPACITY
@@ -37,12 +35,14 @@ def color_from_photos(gaussians: Gaussians, pixels: Pixels | None, images: np.nd
     return replace(gaussians, sh0=rgb_to_sh0(images.reshape(-1, 1, 3)[pixels.homes]))
 
 
-def use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: float) -> tuple[Scene, list[str]]:
+def use_depths(
+    scene: Scene, read_depths: Callable[[], np.ndarray | None], layout: Layout, unit: float
+) -> tuple[Scene, list[str]]:
     """Move Gaussians to the depth maps beside the file if these fit better, and put back pixels that it lacks.
 
     ``unit``: length of one unit of the cameras' file in the scene's units. Also returns notes.
     """
-    depths = read_depths(Path(camera_file.path)) if layout.per_pixel == 1 else None
+    depths = read_depths() if layout.per_pixel == 1 else None
     size = scene.cameras.height, scene.cameras.width
     if depths is None or depths.shape[1:] != size or len(depths) <= max(layout.views):
         return scene, []
@@ -71,19 +71,28 @@ def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussian
         gaussians = ply.gaussians if taken.all() else ply.gaussians[taken]
         return gaussians, None if ids is None else Pixels.of_grid(taken.reshape(grid))
     rows = np.flatnonzero(taken)
-    rows = rows[np.argsort(ids[rows], kind="stable")]
-    homes, gaussians = ids[rows], ply.gaussians[rows]
-    if len(np.unique(homes)) == len(homes) and homes[0] >= 0:
+    homes = ids[rows]
+    are_alone = _increases(homes)  # each row has a pixel of its own, and rows are in the order of pixels
+    if not are_alone:
+        order = np.argsort(homes, kind="stable")
+        rows, homes = rows[order], homes[order]
+    gaussians = ply.gaussians if are_alone and len(rows) == len(taken) else ply.gaussians[rows]
+    if homes[0] >= 0 and (are_alone or _increases(homes)):
         mask = np.zeros(prod(grid), bool)
         mask[homes] = True
         return gaussians, Pixels.of_grid(mask.reshape(grid))
     in_pixels = np.flatnonzero(homes >= 0)  # several Gaussians share a pixel, or some have none
     viewmats = result.cameras.viewmats[list(result.views)]
-    depths = camera_depths(gaussians.means[in_pixels].astype(np.float64), viewmats[homes[in_pixels] // prod(grid[1:])])
+    depths = camera_depths(gaussians.means[in_pixels].astype(np.float64), viewmats, homes[in_pixels] // prod(grid[1:]))
     fronts = np.full(prod(grid), -1, np.int32)
     farthest_first = in_pixels[np.argsort(-depths, kind="stable")]
     fronts[homes[farthest_first]] = farthest_first  # the nearest Gaussian of a pixel is written last
     return gaussians, Pixels(homes, fronts.reshape(grid), own=True)
+
+
+def _increases(ids: np.ndarray) -> bool:
+    """Return whether each number is larger than the one before."""
+    return bool((ids[1:] > ids[:-1]).all())
 
 
 def _counts_up(ids: np.ndarray) -> bool:

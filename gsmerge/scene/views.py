@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import CameraFile, drop_repeats, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.read import read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile

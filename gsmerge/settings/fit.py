@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
+from gsmerge.frozen import dataclass
 from gsmerge.settings.setting import Settings, setting
 
 Fit = Literal["full", "none"]

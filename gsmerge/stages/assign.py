@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from threading import Lock
 
 import numpy as np
 
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import morton_codes
 from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.pooling import Members, pool_members, scene_members

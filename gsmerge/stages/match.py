@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.arrays import as_array
+from gsmerge.arrays import as_array, distinct
 from gsmerge.geometry import normalize
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
@@ -25,7 +25,7 @@ def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     count = len(features)
     clusters = np.full(count, -1, np.int64)
     num_clusters = 0
-    if options.match != "none" and len(np.unique(features.views)) > 1:
+    if options.match != "none" and len(distinct(features.views)) > 1:
         solid = np.flatnonzero(features.extinctions > 0)
         if len(solid) > 1:
             clusters[solid], num_clusters = _find_clusters(features, solid, options)
@@ -50,5 +50,5 @@ def _find_clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchO
     if boxes:
         return connected_components(neighbors, scores, options.iou)
     order = np.lexsort((*means.T, -features.weights[rows]))
-    size = options.cluster_size or len(np.unique(views))
+    size = options.cluster_size or len(distinct(views))
     return leader_clusters(order, neighbors, scores, views, options.overlap, size)

@@ -48,7 +48,7 @@ for words in (one, loaded, kinds):
     print(*words)
 """
     one, loaded, kinds = (line.split() for line in run_python(code).splitlines()[-3:])
-    parts = ("app", "compact_command", "console", "parameters", "paths", "usage")
+    parts = ("app", "compact_command", "console", "parameters", "paths", "plain_values", "usage")
     assert set(one) == {f"gsmerge.cli.{name}" for name in parts}  # a command loads no other
     assert set(loaded) & set(HEAVY) == set()
     assert kinds == ["function"] * 4
@@ -71,7 +71,7 @@ sys.modules.update(dict.fromkeys(("torch", "scipy", "skimage", "matplotlib")))
 assert main({arguments[1]!r}) == 0
 """
     heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
-    never = {"torch", "skimage", "matplotlib", *(f"scipy.{name}" for name in heavy)}
+    never = {"torch", "skimage", "matplotlib", "pydantic", *(f"scipy.{name}" for name in heavy)}
     (loaded,) = (line for line in run_python(code).splitlines() if "gsmerge.pipeline" in line)
     assert never.isdisjoint(loaded.split())
     assert outputs[0].read_bytes() == outputs[1].read_bytes()

@@ -8,16 +8,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsmerge.geometry import (
+    SAMPLE_VALUES,
     camera_centres,
     clamp_inside,
     covariances,
     euler_to_rotmat,
     lies_inside,
     lower_median,
+    median,
+    medians,
     middle_depth,
     move_region,
     normalize,
     project,
+    quantiles,
     quat_to_rotmat,
     rotmat_to_quat,
     step_outside,
@@ -75,6 +79,40 @@ def test_quaternions_of_rotations_and_back() -> None:
     actual = rotmat_to_quat(quat_to_rotmat(quats))
     np.testing.assert_allclose(np.abs((actual * quats).sum(1)), 1)
     assert (actual[np.arange(68), np.abs(actual).argmax(1)] > 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 1_000, 300_000, 300_001])
+@pytest.mark.parametrize("kind", ["random", "ascending", "few values", "periodic"])
+def test_median_of_few_and_of_many_values(count: int, kind: str) -> None:
+    """Also if a sample at even steps says nothing about the median, as with periodic values."""
+    values = np.random.default_rng(count).exponential(size=count)
+    if kind == "ascending":
+        values.sort()
+    elif kind == "few values":
+        values = np.round(values)
+    elif kind == "periodic":
+        values[:: max(1, count // SAMPLE_VALUES)] -= 100
+    assert median(values) == np.median(values)
+    values[count // 3] = np.nan
+    assert math.isnan(median(values))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 1001])
+def test_medians_are_those_of_numpy(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=(count, 3))
+    values[count // 2, 1] = np.nan
+    assert np.array_equal(medians(values), np.median(values, axis=0), equal_nan=True)
+    assert math.isnan(median(np.empty(0)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 1001])
+def test_quantiles_are_those_of_numpy(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=(count, 3))
+    shares = (0.0, 0.05, 0.5, 0.7, 1.0)
+    assert np.array_equal(quantiles(values, shares), np.quantile(values, shares, axis=0))
+    assert np.array_equal(
+        quantiles(values[:, 0].astype(np.float32), shares), np.quantile(np.float32(values[:, 0]), shares)
+    )
 
 
 def test_lower_median_is_a_value_of_each_column() -> None:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.arrays import as_array, as_tensor, like
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, Pixels, Scene
+from gsmerge.arrays import as_array, as_tensor, distinct, like
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, Pixels, Scene, make_scene
 
 
 def gaussians(n: int, coefficients: int = 0, start: int = 0) -> Gaussians:
@@ -31,6 +31,17 @@ def features(sizes: list[int]) -> FeatureGaussians:
         shN=np.zeros((g, 0, 3), np.float32), footprints=column, views=np.arange(g),
         starts=starts, members=np.arange(starts[-1]), latents=np.zeros((g, 0), np.float32),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("values", [[], [3], [2, 2], [5, -1, 5, 0, -1]])
+def test_distinct_values_ascend(values: list[int]) -> None:
+    assert distinct(np.array(values, np.int64)).tolist() == sorted(set(values))
+
+
+@pytest.mark.parametrize("filled", [[False, False, True, True], [True, False, False, True]])
+def test_gaussians_of_the_file_do_not_fill_holes(filled: list[bool]) -> None:
+    scene = replace(make_scene(gaussians(4), cameras()), filled=np.array(filled))
+    assert scene.file_gaussians.opacities.tolist() == [row for row in range(4) if not filled[row]]
 
 
 def test_concat_keeps_the_order() -> None:

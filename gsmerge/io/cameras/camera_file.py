@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import Similarity, pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.io.photo_files import PhotoArrays, PhotoReader, PhotoTransform, Size, change_photos, photo_size, same_shape

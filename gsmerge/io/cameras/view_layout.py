@@ -6,12 +6,13 @@ The rows of ``table.py`` hold such declarations, and ``read_views.py`` reads fil
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import motion_matrices
 from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, convert, to_array, to_number

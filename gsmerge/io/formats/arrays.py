@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 
 from gsmerge.arrays import Array, as_array
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import (
     apply_harmonics_rotation,
     harmonics_rotation,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.io.formats import arrays
 
 UNUSED = "not used: "  # start of the note
@@ -68,14 +68,12 @@ COLUMN_KINDS = (
         r".*",
     ),
 )  # fmt: skip
-_PATTERNS = tuple(re.compile(kind.names, re.IGNORECASE) for kind in COLUMN_KINDS)
 _NUMBERS = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}  # types of 1, 2 and 4 bytes
 
 
 def _find_kind(name: str) -> ColumnKind | None:
     """Return the first kind whose pattern a column's name matches; None for an unknown name."""
-    kinds = (kind for kind, names in zip(COLUMN_KINDS, _PATTERNS, strict=True) if names.fullmatch(name))
-    return next(kinds, None)
+    return next((kind for kind in COLUMN_KINDS if re.fullmatch(kind.names, name, re.IGNORECASE)), None)
 
 
 def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:

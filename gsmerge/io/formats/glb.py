@@ -13,13 +13,14 @@ import json
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import quat_to_rotmat, rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats import spz

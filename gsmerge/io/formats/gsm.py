@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from safetensors.numpy import save
 
 from gsmerge.arrays import as_array
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_pixels, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import StoredView

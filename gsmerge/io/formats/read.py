@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,8 @@ import numpy as np
 
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
-from gsmerge.geometry import lower_median, rgb_to_sh0
+from gsmerge.frozen import dataclass
+from gsmerge.geometry import lower_median, median, quantiles, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.table import DEPTHS, META, PLY, SCENE_SUFFIXES, find_format
@@ -473,9 +473,9 @@ def _describe_wrong_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndar
     if len(rows) < _MIN_JUDGED:
         return ""
     sample = np.asarray(rows[:: max(1, len(rows) // _SCALE_GAUSSIANS)])
-    low, high = np.quantile(gather(means, sample).astype(np.float64), (0.05, 0.95), axis=0)
+    low, high = quantiles(gather(means, sample).astype(np.float64), (0.05, 0.95))
     width, sizes = float((high - low).max()), gather(scales, sample)
-    size = float(np.median(sizes.max(1)))
+    size = median(sizes.max(1))
     text = f"half of the Gaussians have a standard deviation above {size:.3g} in a scene of width {width:.3g}"
     max_size = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
     stored = float(log(size))
@@ -523,7 +523,8 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     that are all equal also pad the file; VolSplat writes these. If a file has no other rows, a few of them count as
     Gaussians; SceneError for many.
     """
-    rows = np.flatnonzero((out["means"] == 0).all(1) & out["valid"])
+    rows = np.flatnonzero((out["means"][:, 0] == 0) & out["valid"])
+    rows = rows[(out["means"][rows] == 0).all(1)]
     if len(rows) == 0:
         return rows
     scales, sh0 = out["scales"][rows], out["sh0"][rows, 0]

@@ -7,6 +7,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from gsmerge.arrays import distinct
+from gsmerge.geometry import medians
 from gsmerge.io.formats.read import read_gaussians
 from gsmerge.io.formats.table import PLY, output_format
 from gsmerge.io.formats.write import write_gaussians
@@ -24,13 +26,13 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
         return []
     format_, columns = output_format(path, levels=True, cameras=True), gaussians.numpy()
     rows = _sample_rows(columns.means)
-    means, sizes = columns.means[rows].astype(np.float64), np.median(columns.scales[rows], axis=1)
+    means, sizes = columns.means[rows].astype(np.float64), np.sort(columns.scales[rows], axis=1)[:, 1]
     with np.errstate(over="ignore"):
         moves = np.abs(format_.round_means(means) - means).max(axis=1)
     mean_square = float(np.square(np.minimum(moves / np.maximum(sizes, 1e-30), 1)).mean())
     if mean_square <= SHOWN:
         return []
-    center = np.median(means, axis=0)
+    center = medians(means)
     shift = ",".join(f"{-float(f'{coordinate:.3g}'):.0f}" for coordinate in center)
     remedy = f"move the input and its cameras near the origin first, with gsmerge convert --translate={shift}"
     if np.abs(center).max() < np.abs(means - center).max():  # the scene is wider than its distance from the origin
@@ -42,7 +44,7 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
 def _sample_rows(means: np.ndarray) -> np.ndarray:
     """Return evenly spaced rows, and the rows with the extreme positions, from which formats choose their steps."""
     extremes = means.argmin(axis=0), means.argmax(axis=0)
-    return np.unique(np.concatenate([np.arange(0, len(means), len(means) // SAMPLE + 1), *extremes]))
+    return distinct(np.concatenate([np.arange(0, len(means), len(means) // SAMPLE + 1), *extremes]))
 
 
 def as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:

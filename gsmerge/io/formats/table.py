@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from gsmerge.arrays import to_float32
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import FLAT_COMMENT, MIP_COMMENT, StoredRows

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.kernels.elementary import cos, exp, sin
 from gsmerge.kernels.matrices import matmul

@@ -45,6 +45,14 @@ def test_rows_come_in_the_order_of_their_pixels(room: Scene, tmp_path: Path) -> 
     assert np.array_equal(pixels.fronts.reshape(-1)[pixels.homes], np.arange(1000))
 
 
+def test_rows_that_are_in_the_order_of_their_pixels_are_not_copied(room: Scene, tmp_path: Path) -> None:
+    file = file_of(room.gaussians[::2], tmp_path)
+    gaussians, pixels = take_gaussians(file, result_of(room, np.arange(0, len(room.gaussians), 2)))
+    assert pixels is not None
+    assert gaussians is file.gaussians
+    assert np.array_equal(pixels.homes, np.arange(0, len(room.gaussians), 2))
+
+
 def test_of_several_rows_of_a_pixel_the_nearest_is_in_front(room: Scene, tmp_path: Path) -> None:
     """And all stay; a row that no view sees has no pixel."""
     g = room.gaussians[:100]

@@ -1,0 +1,116 @@
+"""Frozen dataclasses of this package behave like those of the standard library."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import inspect
+import pickle
+from collections.abc import Callable
+from dataclasses import FrozenInstanceError, field, fields, replace
+from functools import cached_property
+from typing import Any
+
+import pytest
+
+from gsmerge.frozen import dataclass
+
+Decorator = Callable[..., Any]
+
+
+def make(decorator: Decorator, **options: Any) -> type:
+    @decorator(frozen=True, **options)
+    class Box:
+        values: list[int]  # a name that a compiled method might use as well
+        side: float = 1.5
+        names: list[str] = field(default_factory=list, compare=False)
+        hidden: int = field(default=3, repr=False)
+        late: list[int] = field(init=False, default_factory=list)
+        fixed: int = field(init=False, default=7)
+
+        def __post_init__(self) -> None:
+            self.late.append(len(self.values))
+
+        @cached_property
+        def total(self) -> int:
+            return sum(self.values)
+
+    return Box
+
+
+@dataclass(frozen=True)
+class Point:
+    x: int
+    y: int = 0
+
+
+@dataclass(frozen=True)
+class Named(Point):
+    name: str = ""
+
+    def __repr__(self) -> str:
+        return self.name
+
+    def __hash__(self) -> int:
+        return 5
+
+
+@pytest.mark.parametrize("options", [{}, {"eq": False}, {"repr": False}, {"kw_only": True}], ids=str)
+def test_classes_are_like_those_of_the_standard_library(options: dict[str, bool]) -> None:
+    ours, theirs = make(dataclass, **options), make(dataclasses.dataclass, **options)
+    assert str(inspect.signature(ours)) == str(inspect.signature(theirs))
+    assert ours.__init__.__annotations__ == theirs.__init__.__annotations__  # type: ignore[misc]
+    a, b = (kind(values=[1, 2], names=["x"], side=2.5) for kind in (ours, theirs))
+    assert vars(a) == vars(b)
+    assert a.fixed == 7
+    assert (repr(a) == repr(b)) == options.get("repr", True)  # otherwise both have an address
+    for change in ({}, {"names": []}, {"hidden": 4}, {"values": [1]}):
+        assert (a == replace(a, **change)) == (b == replace(b, **change))
+    assert [f.name for f in fields(ours)] == [f.name for f in fields(theirs)]
+    for wrong in ((), (1, 2, 3, 4, 5, 6)):
+        with pytest.raises(TypeError):
+            ours(*wrong)
+
+
+def test_values_stay() -> None:
+    point = Point(1)
+    with pytest.raises(FrozenInstanceError, match="cannot assign to field 'x'"):
+        point.x = 2  # type: ignore[misc]
+    with pytest.raises(FrozenInstanceError, match="cannot delete field 'x'"):
+        del point.x
+    box = make(dataclass)([1, 2])
+    assert (box.total, vars(box)["total"]) == (3, 3)
+
+
+def test_equality_and_hash_go_by_class_and_values() -> None:
+    assert Point(1, 2) == Point(1, 2) != Point(1, 3)
+    assert len({Point(1, 2), Point(1, 2), Point(2, 1)}) == 2
+    assert Point(1, 2) != Named(1, 2)
+    assert (Point(1) == "a point") is False
+    assert make(dataclass, eq=False)([1]) != make(dataclass, eq=False)([1])
+
+
+def test_methods_of_a_class_stay() -> None:
+    named = Named(1, name="corner")
+    assert (repr(named), hash(named), named.y) == ("corner", 5, 0)
+    assert repr(Point(1)) == "Point(x=1, y=0)"
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
+def test_copies_are_equal(copied: Callable[[Any], Any]) -> None:
+    assert copied(Named(1, 2, "corner")) == Named(1, 2, "corner")
+
+
+def test_other_classes_are_those_of_the_standard_library() -> None:
+    @dataclass
+    class Bare:
+        x: int
+
+    @dataclass(eq=False)
+    class Compared:
+        x: int
+
+    bare = Bare(1)
+    bare.x = 2
+    assert bare == Bare(2)
+    assert Compared(1) != Compared(1)
