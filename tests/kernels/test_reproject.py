@@ -7,7 +7,7 @@ import pytest
 
 from gsmerge.geometry import motion_matrices, project_points
 from gsmerge.kernels.elementary import exp
-from gsmerge.kernels.reproject import follow_pixels, linearise, nearest_centres, pixel_errors
+from gsmerge.kernels.reproject import follow_pixels, linearise, nearest_centres, pixel_errors, see_points
 
 K = np.array([[300.0, 0, 150], [0, 310, 110], [0, 0, 1]])
 STEP = 1e-6
@@ -50,6 +50,26 @@ def places_of(points: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.nda
         places, depths = project_points(points.astype(np.float64)[None], poses, np.tile(K, (len(poses), 1, 1)))
         x, y = np.moveaxis(places, -1, 0)
         return places, (depths > 0) & (x >= 0) & (x < 300) & (y >= 0) & (y < 220)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_are_seen_by_the_formula_bit_for_bit(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, poses, Ks = rng.normal(0, 3, (400, 3)), make_poses(7, rng), np.tile(K, (7, 1, 1))
+    points[:3] = np.nan, np.inf, 1e300
+    depths, near, behind = rng.uniform(0, 9, (7, 5, 9)), 0.5, 1.1
+    depths[::2, 1] = np.inf
+    inside, seen = see_points(points, poses, Ks, depths, 300, 220, near, behind)
+    with np.errstate(all="ignore"):
+        places, z = project_points(points[None], poses, Ks)
+        x, y = np.moveaxis(places, -1, 0)
+        expected = (z > near) & (x > 0) & (x < 300) & (y > 0) & (y < 220)
+    cells = np.where(expected[..., None], places * [9 / 300, 5 / 220], 0).astype(int)
+    grid = depths[np.arange(7)[:, None], cells[..., 1], cells[..., 0]]
+    assert np.array_equal(inside, expected)
+    assert np.array_equal(seen, expected & (z <= behind * grid))
+    assert 0.1 < seen.sum() / inside.sum() < 0.9
+    assert 0.02 < inside.mean() < 0.5
 
 
 @pytest.mark.parametrize("seed", range(3))
