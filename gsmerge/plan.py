@@ -25,7 +25,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.runtime.record import note
 from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.compact import OURS, CompactOptions
-from gsmerge.settings.fit import STEPS, USUAL_SHARE, FitOptions
+from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, STEPS, USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
     AUTO_SHARE,
     SHARE,
@@ -298,7 +298,8 @@ def choose_for_scene(
     if scene.num_views == 0 and options.fit.fit_steps is None and options.effort != "best":
         work = PER_STEP + (limits.count or limits.default) // PER_DRAWN
         steps = min(steps, max(SHORT_STEPS, scene.num_gaussians // work))
-    fit = replace(fit, fit_steps=steps, share=share)
+    grow_steps = max(GROW_STEPS, GROW_ROUNDS * scene.num_views)
+    fit = replace(fit, fit_steps=steps, share=share, grow_steps=grow_steps)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)
     pairs = _can_merge_pairs(scene, options, networks)

@@ -15,6 +15,7 @@ import numpy as np
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_centres, project
 from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.reproject import see_points
 from gsmerge.runtime.memory import free_pages
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene
@@ -90,7 +91,7 @@ def measure_covisibility(scene: Scene) -> Covisibility:
         counts = np.zeros(len(scene))
         for rows in split_points(points, POINTS_TOGETHER):
             candidates = frustums.reached_by(points[rows])
-            counts[candidates] += see(points[rows], cameras[candidates], depths[candidates])[0].sum(1)
+            counts[candidates] += see(points[rows], cameras[candidates], depths[candidates])[1].sum(1)
         return counts / max(1, len(points))
 
     shares = np.stack(parallel_map(measure_shares, samples))
@@ -140,17 +141,12 @@ def split_points(points: np.ndarray, max_size: int) -> Iterator[np.ndarray]:
 
 
 def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two masks ``[c,n]`` of points ``[n,3]``: seen by each camera, and inside the frustum of each camera.
+    """Return two masks ``[c,n]`` of points ``[n,3]``: inside the frustum of each camera, and seen by each camera.
 
     Points behind the surfaces of the coarse depth maps ``depths [c,h,w]`` are not seen.
     """
-    pixels, z = project(points, cameras)
-    inside = (z > 0) & (pixels > 0).all(-1) & (pixels < (cameras.width, cameras.height)).all(-1)
-    height, width = depths.shape[1:]
-    scale = np.array([width / cameras.width, height / cameras.height])
-    cells = np.where(inside[..., None], pixels * scale, 0).astype(np.int64)
-    nearest = depths[np.arange(len(depths))[:, None], cells[..., 1], cells[..., 0]]
-    return inside & (z <= (1 + SAME_DEPTH) * nearest), inside
+    viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
+    return see_points(points, viewmats, Ks, depths, cameras.width, cameras.height, 0.0, 1 + SAME_DEPTH)
 
 
 def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.ndarray:
@@ -266,7 +262,7 @@ def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence
                 candidates = frustums.reached_by(remaining, hidden=condition == "inside")
             squares = np.square(remaining - centres[candidates][:, None]).sum(-1)
             if condition != "any":
-                seen, inside = see(remaining, cameras[candidates], depths[candidates])
+                inside, seen = see(remaining, cameras[candidates], depths[candidates])
                 squares[~(seen if condition == "seen" else inside)] = np.inf
             is_owned = np.isfinite(squares).any(0)
             if is_owned.any():

@@ -11,7 +11,8 @@ from gsmerge.alignment.registration.join import concat_scenes
 from gsmerge.compaction.block_start import BlockStart
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
-from gsmerge.raster import contributions, make_splats, tile_view
+from gsmerge.raster import make_splats, tile_view
+from gsmerge.raster.composite import list_contributions
 from gsmerge.raster.photos import Photos, blank_photos
 from gsmerge.raster.tiled_view import Splats
 from gsmerge.runtime.memory import free_pages, make_array
@@ -72,13 +73,13 @@ def find_seams(
     """Return a mask ``[n]`` of Gaussians at seams and, for each block, its own views that show many of them."""
     total, foreign, splats = np.zeros(len(joined)), np.zeros(len(joined)), make_splats(joined)
     views: list[list[int]] = [[] for _ in starts]
-    for number, _, weights in _view_weights(splats, starts):
-        total += weights
-        foreign += np.where(owners == number, 0, weights)
+    for number, _, ids, weights in _view_weights(splats, starts):
+        total[ids] += weights
+        foreign[ids] += np.where(owners[ids] == number, 0, weights)
     at_seam = foreign > FOREIGN * total
     # measured a second time, because the weights of all views would not fit into memory
-    for number, view, weights in _view_weights(splats, starts):
-        seam_weight, view_weight = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam], weights))
+    for number, view, ids, weights in _view_weights(splats, starts):
+        seam_weight, view_weight = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam[ids]], weights))
         if view in starts[number].prepared.reference.fit_views and seam_weight > SEAM_SHARE * view_weight:
             views[number].append(view)
     return at_seam, views
@@ -100,8 +101,8 @@ def join_views(scene_views: Sequence[tuple[PicturedScene, list[int]]]) -> Pictur
     return PicturedScene.with_pictures(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
 
 
-def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Yield block, view, and the blending weights ``[n]`` of all Gaussians in it, for each block's own views.
+def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
+    """Yield block, view, and the rows and blending weights ``[m]`` of its Gaussians, for each block's own views.
 
     Views are numbered within the prepared scene of their block.
     """
@@ -110,8 +111,9 @@ def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tupl
         views = sorted({repeated[i] for i, view in enumerate(start.block.views) if view in own_views})
         photos = blank_photos(start.prepared.scene.cameras[views], 2)
 
-        def weights_of(view: int, photos: Photos = photos) -> np.ndarray:
-            return contributions(tile_view(splats, **photos.camera(view)))[0]
+        def weights_of(view: int, photos: Photos = photos) -> tuple[np.ndarray, np.ndarray]:
+            tiled = tile_view(splats, **photos.camera(view))
+            return tiled.ids, list_contributions(tiled)[0]
 
-        for view, weights in zip(views, in_turn(weights_of, range(len(photos))), strict=True):
-            yield number, view, weights
+        for view, (ids, weights) in zip(views, in_turn(weights_of, range(len(photos))), strict=True):
+            yield number, view, ids, weights

@@ -14,18 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import (
-    camera_depths,
-    median,
-    motion_matrices,
-    motion_vectors,
-    move_views,
-    project,
-    without_common_motion,
-)
+from gsmerge.geometry import camera_depths, median, motion_matrices, motion_vectors, move_views, without_common_motion
 from gsmerge.kernels.compare_views import COLUMNS, compare_views
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur
+from gsmerge.kernels.reproject import see_points
 from gsmerge.raster.photos import NEAR_PLANE, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene
@@ -112,14 +105,13 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
     """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours of the largest overlap."""
     cameras, fronts = scene.cameras, scene.get_pixels().fronts.reshape(len(scene), -1)
     step = max(1, scene.pixels_per_view // OVERLAP_PIXELS)
-    pairs, candidates = set(), set(views)
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
+    pairs, candidates, anywhere = set(), set(views), np.full((len(scene), 1, 1), np.inf)
     for view in views:
         rows = fronts[view, ::step]
-        points = scene.gaussians.means[rows[rows >= 0]]
-        pixels, z = project(points, cameras)
-        x, y = pixels[..., 0], pixels[..., 1]
-        inside = (z > NEAR_PLANE) & (x > 0) & (y > 0) & (x < cameras.width) & (y < cameras.height)
-        seen_shares = inside.mean(1) if len(points) else np.zeros(len(z))
+        points = scene.gaussians.means[rows[rows >= 0]].astype(np.float64)
+        inside, _ = see_points(points, viewmats, Ks, anywhere, cameras.width, cameras.height, NEAR_PLANE, 1.0)
+        seen_shares = inside.mean(1) if len(points) else np.zeros(len(inside))
         cosines = matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3])  # of the viewing directions
         overlap = seen_shares * cosines.clip(0)
         ranked = [int(i) for i in np.argsort(-overlap, kind="stable") if i != view and i in candidates]

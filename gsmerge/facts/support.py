@@ -13,7 +13,8 @@ import numpy as np
 
 from gsmerge.frame import scene_frame
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
-from gsmerge.raster import contributions, make_splats, tile_view
+from gsmerge.raster import make_splats, tile_view
+from gsmerge.raster.composite import list_contributions
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
@@ -34,12 +35,13 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     splats = make_splats(gaussians)
     pictures = blank_photos(cameras, max(LEVEL, max(cameras.width, cameras.height) / SIDE))
 
-    def is_shown(view: int) -> np.ndarray:
-        return contributions(tile_view(splats, **pictures.camera(view)))[1] >= LEAST
+    def list_shown(view: int) -> np.ndarray:
+        tiled = tile_view(splats, **pictures.camera(view))
+        return tiled.ids[list_contributions(tiled)[1] >= LEAST]
 
     counts = np.zeros(len(gaussians), np.int32)
-    for shown in in_turn(is_shown, range(len(pictures))):
-        counts += shown
+    for shown in in_turn(list_shown, range(len(pictures))):
+        counts[shown] += 1
     return counts
 
 

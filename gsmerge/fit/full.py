@@ -121,7 +121,7 @@ def renew_state(fit: FullFit) -> None:
     if not options.grows or not fit.reaches(GROWTH, *CLEARS, *CUTS):
         return
     if fit.reaches(GROWTH):
-        fit.state = grow_to(fit.state, fit.half, job.count)
+        fit.state = grow_to(fit.state, fit.half, job.count, most_growth=job.most_growth)
     if fit.reaches(*CLEARS) and job.fixed is None and options.min_contribution > 0:
         fit.state = grow_to(fit.state, fit.half, job.count, FAINT) if options.fills else drop_faint(fit.state, FAINT)
     if fit.reaches(*CUTS) and job.edges is not None:
@@ -167,7 +167,7 @@ def end_fit(fit: FullFit, start: Gaussians) -> FitResult:
         return start, FitReport("none", False, fit.step, fit.before, after, why, origins=rows)
     state = fit.state
     if options.grows and fit.last < GROWTH:  # a time budget may end before the growth
-        state = grow_to(state, fit.half, fit.run.job.count)
+        state = grow_to(state, fit.half, fit.run.job.count, most_growth=fit.run.job.most_growth)
     why = TIME_SPENT if options.time_budget is not None else "all steps done"
     fitted, viewmats = gaussians_of(fit.tail.of(state.x), state.splats.shN), fit.optimiser.viewmats
     return fitted, FitReport("full", True, fit.step, fit.before, after, why, viewmats, origins=state.origins)

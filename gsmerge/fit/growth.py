@@ -20,6 +20,10 @@ FAINT = 0.02  # opacity of Gaussians that late in a run will fade away; without 
 # Optical depth of a half, as a share of the parent's depth. Halves are narrower than the parent, so two halves of 0.7
 # cover as much as the parent; a little more closes gaps
 DEPTH = 0.8
+# Most Gaussians after a growth, relative to those before it. Where many views show the same surfaces, most Gaussians of
+# the start are hidden, and the usual share of all pixels is far more than the surfaces can use: further halves are
+# smaller than the details of the photos, and most of them fade. With up to a dozen views growth is about twofold
+MOST_GROWTH = 8
 
 
 def drop_faint(state: FitState, least: float) -> FitState:
@@ -28,13 +32,16 @@ def drop_faint(state: FitState, least: float) -> FitState:
     return state[opacities >= min(least, float(lower_median(opacities)))] if len(opacities) else state
 
 
-def grow_to(state: FitState, half: Photos, count: int, least: float = FADED) -> FitState:
+def grow_to(
+    state: FitState, half: Photos, count: int, least: float = FADED, most_growth: int | None = None
+) -> FitState:
     """Drop Gaussians with an opacity below ``least``, then split others until there are ``count``.
 
-    There are fewer if no visible Gaussian is left to split. The errors of the half-size photos ``half`` decide which
-    Gaussians are split.
+    There are fewer if no visible Gaussian is left to split, and at most ``most_growth`` times as many as remained
+    (None: any number). The errors of the half-size photos ``half`` decide which Gaussians are split.
     """
     state = drop_faint(state, least)
+    count = count if most_growth is None else min(count, most_growth * len(state.x))
     if len(state.x) >= count:
         return state
     masses, before = error_masses(state, half), 0

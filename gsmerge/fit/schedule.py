@@ -61,6 +61,7 @@ class FitJob:
     photos: tuple[Photos, ...]  # At full size, at half size, and larger ones if the fit uses them
     options: FitOptions
     count: int = 0  # Gaussians to grow to, where the run is long enough
+    most_growth: int | None = None  # Most Gaussians after the growth, relative to those before it; None: any number
     seed: int = 0
     progress: Progress | None = None  # Called after each step
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay unchanged; None: none

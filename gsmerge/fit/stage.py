@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.fit.edges import find_edges
 from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.full import fit_full
-from gsmerge.fit.growth import grow_to
+from gsmerge.fit.growth import MOST_GROWTH, grow_to
 from gsmerge.fit.outside import place_outside_views, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
@@ -49,7 +49,9 @@ def fit_scene(
         choose(start_count=len(decoded.gaussians))
         if decoded.exact and not options.grows:  # then no Gaussian is dropped either
             options = replace(options, min_contribution=0.0)
-        job = FitJob(photos, options, decoded.count, seed, report_steps, decoded.fixed, num_scored)
+        is_met = decoded.exact or options.fills  # then the count is met, whatever it gains
+        growth = None if is_met else MOST_GROWTH
+        job = FitJob(photos, options, decoded.count, growth, seed, report_steps, decoded.fixed, num_scored)
         outside = place_outside_views(scene, decoded.gaussians, job.scored_photos(1), options)
         edges = None if options.beyond else find_edges(scene.cameras, decoded.count)
         job = replace(job, outside=outside, edges=edges, region=scene.region)
@@ -91,7 +93,7 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
     if not options.scored:
         return start, replace(report, origins=rows)
     if options.grows:  # the stages before left room for a growth that did not happen
-        state = grow_to(start_state(start), job.photos[1], job.count)
+        state = grow_to(start_state(start), job.photos[1], job.count, most_growth=job.most_growth)
         fitted, report = _fit_colors(gaussians_of(state.x, state.splats.shN), job)
         if report.accepted:
             fitted, report = _better_of(scored, start, fitted, report, ALWAYS)

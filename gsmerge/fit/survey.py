@@ -12,8 +12,8 @@ from gsmerge.fit.photo_sizes import holdout_psnr
 from gsmerge.fit.schedule import FitRun
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import project
-from gsmerge.raster import contributions, make_splats, tile_view
-from gsmerge.raster.composite import survey
+from gsmerge.raster import make_splats, tile_view
+from gsmerge.raster.composite import list_contributions, survey
 from gsmerge.raster.photos import NEAR_PLANE, Photos, photo_errors, render_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
@@ -106,12 +106,12 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
         tiled = tile_view(splats, **photos.camera(view))
-        return tiled.ids, contributions(tiled)[1]
+        return tiled.ids, list_contributions(tiled)[1]
 
     peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
     for ids, peaks in in_turn(one_view, range(len(photos))):
         inside[ids] = True
-        np.maximum(peak, peaks, out=peak)
+        peak[ids] = np.maximum(peak[ids], peaks)
     return peak, inside
 
 

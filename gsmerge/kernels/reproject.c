@@ -78,6 +78,29 @@ API void add_photo_errors(const double *points, const float *colors, const doubl
   }
 }
 
+// For each of v cameras, mark which of n points are inside its picture, farther than `near`, and which of these are seen:
+// at most `behind` times as far as the depth of their cell in a grid of lines and columns over the picture.
+API void see_points(const double *points, const double *viewmats, const double *Ks, const double *depths, double width,
+                    double height, double near, double behind, uint8_t *inside, uint8_t *seen, int64_t n, int64_t v,
+                    int64_t lines, int64_t columns) {
+  double across = (double)columns / width, down = (double)lines / height;
+  for (int64_t view = 0; view < v; view++) {
+    const double *viewmat = viewmats + 16 * view, *K = Ks + 9 * view, *grid = depths + view * lines * columns;
+    for (int64_t i = 0; i < n; i++) {
+      double camera[3], image[3];
+      for (int c = 0; c < 3; c++) camera[c] = row_times(viewmat + 4 * c, points + 3 * i) + viewmat[4 * c + 3];
+      for (int c = 0; c < 3; c++) image[c] = row_times(K + 3 * c, camera);
+      double x = image[0] / image[2], y = image[1] / image[2];
+      bool is_inside = camera[2] > near && x > 0.0 && x < width && y > 0.0 && y < height;
+      inside[view * n + i] = is_inside;
+      seen[view * n + i] = 0;
+      if (!is_inside) continue;
+      int64_t line = mini((int64_t)(y * down), lines - 1), column = mini((int64_t)(x * across), columns - 1);
+      seen[view * n + i] = camera[2] <= behind * grid[line * columns + column];
+    }
+  }
+}
+
 API void nearest_centres(const float *points, const double *viewmats, const double *Ks, int64_t *ids,
                          double *squares, int32_t *seen, int64_t width, int64_t height, int64_t n, int64_t v) {
   for (int64_t i = 0; i < n; i++) {

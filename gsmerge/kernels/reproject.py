@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from gsmerge.kernels.signature import COUNT, STATUS, f4, f8, i4, i8, native, u1
+import numpy as np
+
+from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8, native, u1
 
 
 @native(
@@ -38,6 +40,25 @@ def add_photo_errors(points, colors, viewmat, K, photo, depths, mask, behind, mo
         depths: Drawn depths of the camera, 0 where nothing is drawn.
         mask: 1 where the photo counts; None: everywhere.
     """
+
+
+_see_points = declare(
+    "see_points", points=f8("n", 3), viewmats=f8("v", 4, 4), Ks=f8("v", 3, 3),
+    depths=f8("v", "lines", "columns"), width=f8(), height=f8(), near=f8(), behind=f8(),
+    inside=u1("v", "n", out=True), seen=u1("v", "n", out=True),
+)  # fmt: skip
+
+
+def see_points(points, viewmats, Ks, depths, width, height, near, behind):
+    """Return two masks ``[v,n]`` of points ``[n,3]``: inside the picture of each camera, and seen by each camera.
+
+    Points inside lie farther than ``near``. Points are seen if they lie at most ``behind`` times as far as the depth of
+    their cell, in a grid ``depths [v,lines,columns]`` over the picture.
+    """
+    inside, seen = np.empty((2, len(viewmats), len(points)), bool)
+    masks = inside.view(np.uint8), seen.view(np.uint8)
+    _see_points(points, viewmats, Ks, depths, float(width), float(height), near, behind, *masks)
+    return inside, seen
 
 
 @native(

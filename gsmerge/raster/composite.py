@@ -116,11 +116,16 @@ def survey(tiled: TiledView, colors: Array | None = None) -> tuple[Array, Array,
 
 def contributions(tiled: TiledView) -> tuple[Array, Array]:
     """Return the sum (pixels) and the maximum ``[n]`` float32 of each Gaussian's blending weights; 0 if unseen."""
+    mass, peak = np.zeros((2, len(tiled.splats)), np.float32)
+    mass[tiled.ids], peak[tiled.ids] = list_contributions(tiled)
+    return mass, peak
+
+
+def list_contributions(tiled: TiledView) -> Array:
+    """Return :func:`contributions` for the listed Gaussians alone, ``[2,m]``: the sums, and the maxima."""
     totals = np.zeros((len(tiled.ids), 2), np.float32)
     kernels.contributions(*tiled.lists, tiled.height, tiled.width, totals)
-    mass, peak = np.zeros((2, len(tiled.splats)), np.float32)
-    mass[tiled.ids], peak[tiled.ids] = totals.T
-    return mass, peak
+    return totals.T
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ LONG_STEPS = 600  # runs of at least so many steps gain from a little dropout
 USUAL_SHARE = 0.044  # Gaussians per pixel; photos with a quarter of the pixels suffice for this number
 TOO_FEW_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all their Gaussians
+GROW_ROUNDS = 2  # so do runs that draw each photo less often, which then do not draw every photo before they grow
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,8 @@ class FitOptions(Settings):
         internal=True)  # fmt: skip
     share: float | None = setting(None, "Number of Gaussians in the result per pixel; the plan sets it.",
         "By default 0.044.", internal=True)  # fmt: skip
+    grow_steps: int = setting(GROW_STEPS, "Fewest steps of a run that grows; the plan sets it by the number of photos.",
+        internal=True)  # fmt: skip
     tuning: Tuning = setting(Tuning(), "Constants.", internal=True)
 
     @property
@@ -130,4 +133,4 @@ class FitOptions(Settings):
     @property
     def grows(self) -> bool:
         """Whether the fit starts with fewer Gaussians than requested and adds the rest during its steps."""
-        return self.fit == "full" and self.steps >= GROW_STEPS
+        return self.fit == "full" and self.steps >= self.grow_steps

@@ -15,6 +15,7 @@ from gsmerge.kernels.reproject import (
     mark_pixels,
     nearest_centres,
     pixel_errors,
+    see_points,
 )
 
 K = np.array([[300.0, 0, 150], [0, 310, 110], [0, 0, 1]])
@@ -98,6 +99,26 @@ def test_photo_errors_are_those_of_the_points_that_the_photo_shows(masked: bool)
     assert np.array_equal(sums, expected[0])
     assert np.array_equal(counts, expected[1])
     assert 20 < shown.sum() < 2000
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_are_seen_by_the_formula_bit_for_bit(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, poses, Ks = rng.normal(0, 3, (400, 3)), make_poses(7, rng), np.tile(K, (7, 1, 1))
+    points[:3] = np.nan, np.inf, 1e300
+    depths, near, behind = rng.uniform(0, 9, (7, 5, 9)), 0.5, 1.1
+    depths[::2, 1] = np.inf
+    inside, seen = see_points(points, poses, Ks, depths, 300, 220, near, behind)
+    with np.errstate(all="ignore"):
+        places, z = project_points(points[None], poses, Ks)
+        x, y = np.moveaxis(places, -1, 0)
+        expected = (z > near) & (x > 0) & (x < 300) & (y > 0) & (y < 220)
+    cells = np.where(expected[..., None], places * [9 / 300, 5 / 220], 0).astype(int)
+    grid = depths[np.arange(7)[:, None], cells[..., 1], cells[..., 0]]
+    assert np.array_equal(inside, expected)
+    assert np.array_equal(seen, expected & (z <= behind * grid))
+    assert 0.1 < seen.sum() / inside.sum() < 0.9
+    assert 0.02 < inside.mean() < 0.5
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -38,6 +38,7 @@ from gsmerge.plan import (
 )
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORT_NAMES as NAMES
+from gsmerge.settings.fit import GROW_STEPS
 
 
 @pytest.fixture(scope="module")
@@ -322,6 +323,17 @@ def test_the_estimate_is_what_the_run_does(
         assert (plan.fit.fit, plan.fit.steps, plan.fit.share) == (choices.fit.fit, choices.fit.steps, choices.fit.share)
         assert run["k"] == plan.decode.k
         assert (plan.checkpoint is None) == (run["checkpoint"] == "none")
+
+
+@pytest.mark.parametrize(
+    ("effort", "num_views", "grows"),
+    [("draft", 12, False), ("draft", 512, False), ("fast", 512, False), ("default", 12, True), ("default", 512, True)],
+)
+def test_runs_grow_if_they_see_each_photo_twice(effort: str, num_views: int, grows: bool) -> None:
+    size = SceneSize(38_400 * num_views, num_views, 240, 160, True, rendered=False)
+    fit = choose_for_scene(size, options_of(effort=effort)).fit
+    assert fit.grows == grows
+    assert num_views == 12 or fit.steps >= GROW_STEPS
 
 
 @pytest.mark.parametrize("budget", ["40%", "5MB", "quest3"])

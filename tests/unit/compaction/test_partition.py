@@ -111,10 +111,10 @@ def test_hidden_points_are_not_seen() -> None:
     centre = scene.cameras.centres[0]
     behind = centre + 1.5 * (on_surface - centre)
     first = scene.cameras[[0]]
-    seen, inside = see(on_surface, first, covisibility.depths[:1])
+    inside, seen = see(on_surface, first, covisibility.depths[:1])
     assert seen.mean() > 0.95
     assert inside.all()
-    seen, inside = see(behind, first, covisibility.depths[:1])
+    inside, seen = see(behind, first, covisibility.depths[:1])
     assert seen.mean() < 0.1
     assert inside.all()
 
@@ -145,7 +145,7 @@ def test_cameras_that_are_left_out_see_nothing(seed: int) -> None:
     cameras, depths = Cameras(viewmats, Ks, 44, 30), rng.uniform(0.5, 6, (30, 5, 7))
     depths[::4, 1, 1] = np.inf  # open sky
     points = rng.normal(0, 4, (3000, 3)) * rng.choice([0.2, 1, 4], (3000, 1))
-    seen, inside = see(points, cameras, depths)
+    inside, seen = see(points, cameras, depths)
     frustums = make_frustums(cameras, depths)
     for rows in split_points(points, 16):
         assert set(np.flatnonzero(seen[:, rows].any(1))) <= set(frustums.reached_by(points[rows]))

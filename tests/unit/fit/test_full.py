@@ -188,6 +188,15 @@ def test_count_asked_for_is_met(truth: Gaussians, photos: Pair, every: int, extr
     assert len(result) == len(start) + extra
 
 
+def test_a_run_grows_to_a_multiple_of_what_is_left_at_most(truth: Gaussians, photos: Pair) -> None:
+    """Where many views show the same surfaces, few of the Gaussians at the start are visible."""
+    start = scenes.spoil(truth)[::8]
+    run = scenes.run_for(photos, replace(LONG, fills=False), count=8 * len(start), most_growth=3)
+    result, report = fit_full(start, run)
+    assert report.accepted
+    assert len(result) == 3 * len(start)
+
+
 def test_a_fit_is_judged_before_it_grows(truth: Gaussians, photos: Pair) -> None:
     """Halves that were never fitted show less than their parents, and would have the fit refused."""
     start = truth[::8]
