@@ -366,7 +366,7 @@ def goal_table(machine: Machine, records: list[dict[str, Any]]) -> str:
 
 def trees_table(machine: Machine, records: list[dict[str, Any]]) -> str:
     """Seconds of each kernel in all steps of a command, by tree, and their share of the algorithm's limit."""
-    rows = []
+    rows, names = [], ("before", "now")
     for scene in dict.fromkeys(record["scene"] for record in records):
         some = [record for record in records if record["scene"] == scene]
         totals = [kernel_seconds(machine, record, needed=False) for record in some]
@@ -375,11 +375,13 @@ def trees_table(machine: Machine, records: list[dict[str, Any]]) -> str:
             rows.append((f"{scene}, {kernel}", *cells, f"{totals[-1][kernel][0] / totals[0][kernel][0]:.2f}"))
         ratio = some[-1]["seconds"] / some[0]["seconds"]
         rows.append((f"{scene}, command", *(f"{record['seconds']:.2f}" for record in some), f"{ratio:.2f}"))
-    return make_table(("seconds (share)", *(f"tree {i}" for i in range(len(totals))), "last/first"), rows)
+    return make_table(
+        ("seconds (share)", *(names if len(totals) == 2 else map(str, range(len(totals)))), "ratio"), rows
+    )
 
 
 def make_tables(machine: Machine, records: list[dict[str, Any]]) -> dict[str, str]:
-    """Return the tables of the last tree by name, and one that compares trees if there are several."""
+    """Return the tables of the last tree by name and target, and one that compares trees if there are several."""
     last = [record for record in records if record["tree"] == records[-1]["tree"]]
     tables = {
         "machine": machine_table(machine),
@@ -388,7 +390,8 @@ def make_tables(machine: Machine, records: list[dict[str, Any]]) -> dict[str, st
         "drawing": drawing_table(machine, last),
         "goal": goal_table(machine, last),
     }
-    return tables | ({"trees": trees_table(machine, records)} if len(last) < len(records) else {})
+    tables |= {"trees": trees_table(machine, records)} if len(last) < len(records) else {}
+    return {f"{name} {machine.target}": table for name, table in tables.items()}
 
 
 def write_page(path: Path, tables: dict[str, str]) -> None:
@@ -409,11 +412,11 @@ def find_scenes(text: str, cache: Path) -> list[Path]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scenes", nargs="?", default="fox,fern", help="train, eval, names, or a folder")
+    parser.add_argument("scenes", nargs="*", default=["fox,fern"], help="train, eval, names with commas, folders")
     parser.add_argument("--tree", type=Path, action="append", help="checkout with built kernels; may be repeated")
     parser.add_argument("--repeats", type=int, default=5, help="runs of each command")
     parser.add_argument("--json", action="store_true", help="print all numbers instead of tables")
-    parser.add_argument("--page", type=Path, help="page whose tables are replaced")
+    parser.add_argument("--page", type=Path, help="page whose tables of this target are replaced")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
@@ -425,7 +428,7 @@ def main() -> None:
             (Path(name) / str(i)).mkdir()
             counters.append(compile_counter(tree, target, Path(name) / str(i)))
         machine, records = measure_machine(counters[-1], target), []
-        for folder in find_scenes(args.scenes, args.cache):
+        for folder in (folder for text in args.scenes for folder in find_scenes(text, args.cache)):
             records += measure_scene(trees, folder, counters, args.repeats, Path(name))
     tables = make_tables(machine, records)
     if args.page:
