@@ -92,9 +92,9 @@ class Machine:
         return self.slots[1] / self.divisions[1]
 
     def bandwidth(self, num_bytes: float) -> float:
-        """Return the bandwidth, for one thread, of the nearest memory that holds so many bytes."""
-        name = next((name for name, size in SIZES.items() if num_bytes <= size), "memory")
-        return self.bandwidths[name][1]
+        """Return the bandwidth, for one thread, of memory that holds so many bytes; between streams on a power law."""
+        rates = [self.bandwidths[name][1] for name in SIZES]
+        return float(np.exp(np.interp(np.log(max(num_bytes, 1)), np.log(list(SIZES.values())), np.log(rates))))
 
     def limit(self, kernel: str, counts: dict[str, float], *, needed: bool) -> tuple[float, str]:
         """Return the least processor seconds of a kernel at the counts of a step, and what bounds it."""
