@@ -1,0 +1,116 @@
+/* Counts the pairs of a pixel and a Gaussian in tile lists, and measures what a processor can do at most.
+
+Compiled by limit.py for the target of the kernels and with the walk.h of the tree that is measured. Needed pairs are
+counted on their own. Visited pairs follow the kernels, so `visit` changes with them. */
+#include <math.h>
+#include "walk.h"
+
+// Numbers of a list of tiles; the fields of kernel_times.py.
+typedef struct {
+  int64_t pixels, listed, walked, shown, visited, needed, vectors, useful;
+} Counts;
+
+// Lanes of a row that blend.c and blend_backward.c work on for Gaussian j of a batch: the one place that knows.
+static int32_t lanes_of(const Batch *b, int64_t j, int32_t *x0) {
+  *x0 = b->x0[j] == WIDE ? 0 : b->x0[j];
+  return b->x0[j] == WIDE ? TILE : HALF;
+}
+
+// Add the pairs of Gaussian j of a batch that change the picture, and where they lie: one bit for each pixel of a row.
+static int64_t need(float *light, const Batch *b, int64_t j, int32_t bits[TILE]) {
+  int64_t count = 0;
+  for (int32_t y = 0; y < TILE; y++) {
+    float dy = (float)y - b->my[j], base = b->mx[j] + b->slope[j] * dy, top = b->lnop[j] - b->decay[j] * dy * dy;
+    bits[y] = 0;
+    for (int32_t x = 0; x < TILE; x++) {
+      float *t = light + y * TILE + x, d = b->rate[j] * ((float)x - base), p = top - d * d;
+      if (p < LN_CUT || *t <= 0.f) continue;
+      float left = *t * (1.f - minf(expf(p), MAX_ALPHA));
+      bool goes = left > MIN_TRANSMITTANCE;
+      *t = goes ? left : -*t;
+      count += goes;
+      bits[y] |= goes << x;
+    }
+  }
+  return count;
+}
+
+// Add the pairs of Gaussian j of a batch that the kernels work on, and the vectors of eight among them.
+static void visit(Counts *c, const Tile *t, const Batch *b, int64_t j, const int32_t bits[TILE]) {
+  int32_t x0, lanes = lanes_of(b, j, &x0), y0 = first_row(t, b, j), y1 = last_row(t, b, j);
+  c->shown += y0 <= y1;
+  for (int32_t y = y0; y <= y1; y++)
+    for (int32_t x = x0; x < x0 + lanes; x += HALF) {
+      c->visited += HALF;
+      c->vectors++;
+      c->useful += (bits[y] >> x & 0xff) != 0;
+    }
+}
+
+API int32_t count_pairs(const float *conics, const int32_t *flatten_ids, const int64_t *offsets, int64_t tile_width,
+                        int64_t first, int64_t last, int64_t h, int64_t w, int64_t m, int64_t n, int64_t ends,
+                        Counts *c) {
+  Lists lists = {conics, flatten_ids, offsets, tile_width, m, n, ends};
+  if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
+  float light[PLANE] __attribute__((aligned(64)));
+  Batch batch;
+  clear_batch(&batch);
+  for (int64_t tile = first; tile < last; tile++) {
+    Tile t = open_tile(light, 1, tile, tile_width, h, w);
+    int64_t start = offsets[tile], end = offsets[tile + 1];
+    c->pixels += t.num_x * t.num_y;
+    c->listed += end - start;
+    for (; start < end && t.y_low <= t.y_high; start += BATCH) {
+      int64_t stop = mini(end, start + BATCH);
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
+      c->walked += stop - start;
+      for (int64_t j = 0; j < stop - start; j++) {
+        int32_t bits[TILE];
+        c->needed += need(light, &batch, j, bits);
+        visit(c, &t, &batch, j, bits);
+      }
+      narrow_tile(&t, light);
+    }
+  }
+  return 0;
+}
+
+#ifdef __AVX512F__
+typedef v16f wide;
+#else
+typedef v8f wide;
+#endif
+enum { CHAINS = 12, WIDTH = sizeof(wide) / sizeof(float) };
+
+// Independent chains of multiply-adds, or of divisions, in registers of the target; returns the operations, one for each
+// lane.
+API int64_t add_products(int64_t rounds, float *out) {
+  wide x[CHAINS], a, b;
+  for (int i = 0; i < WIDTH; i++) a[i] = 0.999f + 1e-5f * out[i], b[i] = 1e-3f * out[i];
+  for (int k = 0; k < CHAINS; k++) x[k] = a + (float)k;
+  for (int64_t i = 0; i < rounds; i++)
+    for (int k = 0; k < CHAINS; k++) x[k] = x[k] * a + b;
+  for (int k = 1; k < CHAINS; k++) x[0] += x[k];
+  for (int i = 0; i < WIDTH; i++) out[i] = x[0][i];
+  return rounds * CHAINS * WIDTH;
+}
+
+API int64_t divide(int64_t rounds, float *out) {
+  wide x[CHAINS], a;
+  for (int i = 0; i < WIDTH; i++) a[i] = 1.5f + 1e-5f * out[i];
+  for (int k = 0; k < CHAINS; k++) x[k] = a + (float)k;
+  for (int64_t i = 0; i < rounds; i++)
+    for (int k = 0; k < CHAINS; k++) x[k] = a / x[k];
+  for (int k = 1; k < CHAINS; k++) x[0] += x[k];
+  for (int i = 0; i < WIDTH; i++) out[i] = x[0][i];
+  return rounds * CHAINS * WIDTH;
+}
+
+// Read one array and write another, so many times; returns the bytes read and written.
+API int64_t stream(const float *from, float *to, int64_t count, int64_t rounds) {
+  for (int64_t i = 0; i < rounds; i++) {
+    float add = (float)i;
+    for (int64_t j = 0; j < count; j += LANES) store(to + j, load(from + j) + add);
+  }
+  return 8 * count * rounds;
+}
