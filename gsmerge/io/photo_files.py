@@ -21,7 +21,6 @@ from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
 from gsmerge.io.first_bytes import refuse_picture
 from gsmerge.io.image_names import ImageSource, match_images
-from gsmerge.kernels.deflate import deflate_runs
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.runtime.memory import free_pages, make_array
@@ -37,11 +36,8 @@ _MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of a file: four floats per pixel,
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
 _HALF_OPAQUE = 127
 ASPECT_TOLERANCE = 0.04  # of width over height, since backbones round each side to a multiple of 14 separately
-_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
-_ZLIB = b"\x78\x01"  # header of a zlib stream that was compressed fast
-_PALETTE = 3  # colour type of a PNG with a palette
+PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of a scan; a progressive JPEG has any number of scans
-_EFFORT = 0  # of a WebP, of at most 6; an effort of 1 takes a quarter longer for 1 % fewer bytes, 2 twice as long
 _PIXELS_PER_STEP = 50_000  # of an empty scan, per step of a budget
 _MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
 _COPIES = 2, 3  # of all pixels in memory: with OpenCV, and at most with Pillow and the conversion of its image
@@ -50,7 +46,7 @@ _COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 
 _EMBEDDED_BYTES = 9  # additional bytes of a pixel while embedded photos are decoded
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # first bytes; the last two are those of BigTIFF
 # First bytes of a file -> Pillow's plugin; without a plugin for its first format, Pillow imports those of all formats
-_PLUGINS = {_PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp", **dict.fromkeys(_TIFF, "Tiff")}
+_PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp", **dict.fromkeys(_TIFF, "Tiff")}
 _TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8, 0])  # of a number by type of tag
 _TILE_TAGS = (322, 323)  # width and length of a tile, pixels
 _BITS_TAG, _SAMPLES_TAG = 258, 277
@@ -313,7 +309,7 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             data = np.fromfile(path, np.uint8)
-            pixels = _png_pixels(data) if data[: len(_PNG)].tobytes() == _PNG else data  # without texts of many MB
+            pixels = _png_pixels(data) if data[: len(PNG)].tobytes() == PNG else data  # without texts of many MB
             if pixels is None:
                 raise ValueError("damaged chunks")
             with _open_image(io.BytesIO(pixels.data), ("PNG", *_FORMATS)) as image:
@@ -376,7 +372,7 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
     start, pixel_bytes = file.read(24), 0.0
     file.seek(0)
     try:
-        if start[:8] == _PNG:  # Pillow refuses a PNG for damage outside its pixels as well
+        if start[:8] == PNG:  # Pillow refuses a PNG for damage outside its pixels as well
             width, height = struct.unpack(">II", start[16:24])
         else:
             if start[:4] in _TIFF:
@@ -478,7 +474,7 @@ def _decode(path: Path, data: np.ndarray, size: Size, divisor: int = 1) -> np.nd
     """Decode ``[h,w,3]`` uint8 sRGB, with each side divided by ``divisor``; the orientation tag is ignored."""
     width, height = (-(-side // divisor) for side in size)
     flags = _REDUCTIONS[divisor] | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = _png_pixels(data) if data[: len(_PNG)].tobytes() == _PNG else data
+    pixels = _png_pixels(data) if data[: len(PNG)].tobytes() == PNG else data
     try:
         image = cv2.imdecode(pixels, flags) if pixels is not None and len(pixels) else None
     except cv2.error:
@@ -496,12 +492,12 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
     The decoder would print messages about damaged colour profiles and texts.
     """
-    view, start, pixels = np.ascontiguousarray(data).data, len(_PNG), bytearray(_PNG)
+    view, start, pixels = np.ascontiguousarray(data).data, len(PNG), bytearray(PNG)
     while start + 12 <= len(view):
         length, kind = struct.unpack_from(">I4s", view, start)
         end = start + 12 + length
         if kind == b"IEND":
-            pixels += _PNG_END
+            pixels += PNG_END
             return np.frombuffer(pixels, np.uint8)
         if end > len(view) or (kind[:1].isupper() and kind not in _PNG_CHUNKS):
             return None
@@ -511,39 +507,6 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
             pixels += view[start:end]
         start = end
     return None
-
-
-def encode_picture(picture: np.ndarray, quality: int) -> bytes:
-    """Encode a picture ``[h,w,3]`` uint8 sRGB as a WebP with a ``quality`` up to 100."""
-    from PIL import WebPImagePlugin  # noqa: F401 - without it, Pillow imports the plugins of all formats
-
-    content = io.BytesIO()
-    Image.fromarray(picture).save(content, "WEBP", quality=quality, method=_EFFORT)
-    return content.getvalue()
-
-
-def encode_indexed(indices: np.ndarray, colors: np.ndarray) -> bytes:
-    """Encode ``indices [h,w]`` uint8 into ``colors [n,3 or 4]`` uint8 sRGB as a PNG; index 0 is transparent.
-
-    With up to 16 colours, two pixels share a byte.
-    """
-    (height, width), bits = indices.shape, 4 if len(colors) <= 16 else 8  # bits of an index
-    opacities = colors[:, 3].copy() if colors.shape[1] > 3 else np.full(len(colors), 255, np.uint8)
-    opacities[0] = 0
-    if bits == 4:
-        indices = np.pad(indices, ((0, 0), (0, width % 2)))
-        indices = indices[:, ::2] << 4 | indices[:, 1::2]
-    rows = np.pad(indices, ((0, 0), (1, 0)))  # each row begins with the number of its filter, 0 for none
-    content = rows.tobytes()
-    packed = _ZLIB + deflate_runs(content) + struct.pack(">I", zlib.adler32(content))
-    png = _PNG
-    for kind, data in (
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, bits, _PALETTE, 0, 0, 0)),
-        (b"PLTE", colors[:, :3].tobytes()), (b"tRNS", opacities.tobytes()),
-        (b"IDAT", packed),
-    ):  # fmt: skip
-        png += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    return png + _PNG_END
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from gsmerge.facts.views import even_views
 from gsmerge.frame import Frame, scene_frame
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import middle_depth
-from gsmerge.io.photo_files import encode_indexed, encode_picture, photo_array
+from gsmerge.io.encode_pictures import encode_indexed, encode_picture
+from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.error_maps import ErrorReference, draw_errors, expected_errors, make_reference
 from gsmerge.measure.evaluate import (

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.facts.support import TINTS, count_views
 from gsmerge.frozen import dataclass
-from gsmerge.io.photo_files import encode_indexed
+from gsmerge.io.encode_pictures import encode_indexed
 from gsmerge.raster import Splats, TiledView, tile_view
 from gsmerge.raster.composite import blend
 from gsmerge.raster.photos import NEAR_PLANE

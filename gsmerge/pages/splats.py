@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from functools import reduce
 from math import prod
 from typing import Any
@@ -64,7 +65,7 @@ def pack_splats(
     head |= {"steps": steps, "levels": levels, "sizes": [size for size, _ in packed]}
     line = json.dumps(head).encode() + b"\n"
     content = line + b"".join(planes for _, planes in packed)
-    return spz.gzip_runs(content), degree  # longer matches are rare in differences
+    return spz.gzip_bytes(content, 1, zlib.Z_RLE), degree  # longer matches are rare in differences
 
 
 def _num_harmonics(degree: int) -> int:
@@ -99,7 +100,7 @@ def drawn_rows(gaussians: Gaussians) -> np.ndarray:
 
 def pack_support(support: np.ndarray) -> bytes:
     """Pack the number of views that show each Gaussian, ``[n]`` uint8, as a gzip stream of one byte per Gaussian."""
-    return spz.gzip_bytes(support.tobytes())
+    return spz.gzip_bytes(support.tobytes(), 9, zlib.Z_DEFAULT_STRATEGY)
 
 
 def _pixel_positions(rows: np.ndarray, means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:

@@ -429,15 +429,14 @@ def _combine(
     pinholes = at_own_size(pinholes, photo_size(pictures))
     notes += [camera_file.focal] if camera_file.focal else []
     without_bars, bar_notes = cut_bars(pictures, camera_file)
-    had_bars = without_bars is not pictures
     limited, size_notes = limit_photo_size(without_bars, len(ply.gaussians), hints.max_side, unaligned=order == "none")
     depths = cache(partial(read_depths, Path(camera_file.path)))
-    frames = partial(read_dataparser, files.ply, files.cameras)
     if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians
         problem = "expected one Gaussian per pixel, found the Gaussians of a state"
         cameras = to_cameras(pinholes, photo_size(limited))
         result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
     else:
+        frames = partial(read_dataparser, files.ply, files.cameras)
         result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, depths=depths, frames=frames)
     notes += [*bar_notes, *size_notes, *result.notes]
     if result.pixel_ids is None:
@@ -445,7 +444,7 @@ def _combine(
         cameras, images, size_notes = limit_view_size(result.cameras, result.images, hints.max_side)
         result = replace(result, cameras=cameras, images=images)
         notes += size_notes
-    size = photo_size(limited)
+    size, had_bars = photo_size(limited), without_bars is not pictures
     unused = [f"--{name}" for name in ("masks", "protect") if getattr(files, name) is not None]
     if unused and (had_bars or not size):
         reason = "the photos have bars, which are cut off" if size else "there are no photos"

@@ -30,7 +30,6 @@ from gsmerge.frozen import dataclass
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
-from gsmerge.kernels.deflate import deflate_runs
 from gsmerge.types import SH_C0, Gaussians, StrPath
 
 VERSION, MAX_DEGREE = 3, 3  # of written files; Spark 2.2 does not read version 4
@@ -354,14 +353,8 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     return gzip_bytes(b"".join([header, *(part.tobytes() for part in parts)]))
 
 
-def gzip_bytes(data: bytes) -> bytes:
-    """Compress well to a gzip stream with equal bytes at any time, on every system and in every version of Python."""
-    packer = zlib.compressobj(9, wbits=31)  # without a time
+def gzip_bytes(data: bytes, level: int = 9, strategy: int = zlib.Z_DEFAULT_STRATEGY) -> bytes:
+    """Compress to a gzip stream with equal bytes at any time, on every system and in every version of Python."""
+    packer = zlib.compressobj(level, wbits=31, strategy=strategy)  # without a time
     packed = packer.compress(data) + packer.flush()
     return packed[:SYSTEM] + UNIX + packed[SYSTEM + 1 :]
-
-
-def gzip_runs(data: bytes) -> bytes:
-    """Compress fast to a gzip stream of literals and runs, see :mod:`gsmerge.kernels.deflate`."""
-    head = GZIP_MAGIC + b"\x08" + bytes(SYSTEM - 3) + UNIX  # compressed by deflate; without a time
-    return head + deflate_runs(data) + struct.pack("<II", zlib.crc32(data), len(data) & 0xFFFFFFFF)
