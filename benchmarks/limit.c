@@ -38,7 +38,10 @@ static int64_t need(float *light, const Batch *b, int64_t j, int32_t bits[TILE])
 // Add the pairs of Gaussian j of a batch that the kernels work on, and the vectors of eight among them.
 static void visit(Counts *c, const Tile *t, const Batch *b, int64_t j, const int32_t bits[TILE]) {
   int32_t x0, lanes = lanes_of(b, j, &x0), y0 = first_row(t, b, j), y1 = last_row(t, b, j);
+  int32_t extra = PARTS == 1 && y0 <= y1 && lanes == HALF && (y1 - y0) % 2 == 0;  // rows of eight come in pairs
   c->shown += y0 <= y1;
+  c->visited += HALF * extra;
+  c->vectors += extra;
   for (int32_t y = y0; y <= y1; y++)
     for (int32_t x = x0; x < x0 + lanes; x += HALF) {
       c->visited += HALF;
