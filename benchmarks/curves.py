@@ -40,7 +40,6 @@ POINTS: dict[str, tuple[str, ...]] = {
     "160 steps": ("--set", "fit_steps=160"),
     "240 steps": ("--set", "fit_steps=240"),
     DEFAULT: (),
-    "best, 600 steps": ("--effort", "best", "--set", "fit_steps=600"),
     "best": ("--effort", "best"),
 }
 QUALITIES = {"psnr": "PSNR, dB", "lpips": "LPIPS, less is better"}
