@@ -4,6 +4,9 @@ Compiled by limit.py for the target of the kernels and with the walk.h of the tr
 counted on their own. Visited pairs follow the kernels, so `visit` changes with them. */
 #include <math.h>
 #include "walk.h"
+#ifndef PARTS  // older checkouts walk eight pixels at a time on all processors
+#define PARTS 2
+#endif
 
 // Numbers of a list of tiles; the fields of kernel_times.py.
 typedef struct {
