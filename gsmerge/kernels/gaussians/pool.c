@@ -2,7 +2,7 @@
 #include "exp_log.h"
 #include "select.h"
 
-enum { FEW = 64, SWEEPS = 8 };  // most members whose median is found by counting; most Jacobi sweeps
+enum { FEW = 64, SWEEPS = 8, AHEAD = 32 };  // most members whose median is found by counting; most Jacobi sweeps
 static const double MAX_OPACITY = 0.995;  // optical depth is -ln(1 - opacity): 1 would be infinite
 static const double CAP = 3.0;  // members are shrunk to this many times the group's median extent
 static const double FLOOR = 0.1;  // smallest standard deviation of a group, in pixel footprints
@@ -128,6 +128,19 @@ static void pool_group(const members *m, const int32_t *ids, int64_t n, const do
   out[9] = total, out[10] = mass * VOLUME, out[11] = extinction, out[12] = footprint;
 }
 
+// Begin to load the members of the next group, which are the next to come from memory.
+static inline void prefetch_members(const members *m, const int32_t *ids, int64_t n) {
+  for (int64_t j = 0; j < n; j++) {
+    int64_t i = ids[j];
+    __builtin_prefetch(m->means + 3 * i);
+    __builtin_prefetch(m->quats + 4 * i);
+    __builtin_prefetch(m->scales + 3 * i);
+    __builtin_prefetch(m->sh0 + 3 * i);
+    __builtin_prefetch(m->opacities + i);
+    __builtin_prefetch(m->footprints + i);
+  }
+}
+
 API int32_t pool_groups(const int64_t *restrict starts, const int32_t *restrict ids,
                         const float *restrict means, const float *restrict quats,
                         const float *restrict scales, const float *restrict opacities,
@@ -146,6 +159,7 @@ API int32_t pool_groups(const int64_t *restrict starts, const int32_t *restrict 
     if (count == 0) continue;
     for (int64_t j = 0; j < count; j++)
       if (own[j] < 0 || own[j] >= n) return OUTSIDE;
+    prefetch_members(&all, own + count, mini(AHEAD, m - starts[g + 1]));
     if (own_covariance) cap_members(&all, own, count, caps, order);
     pool_group(&all, own, count, caps, own_covariance, out_geometry + 13 * g,
                out_sh + 3 * bases * g);
