@@ -121,8 +121,8 @@ def _camera_quats(scene: Scene, world_rotation: np.ndarray | None) -> np.ndarray
 
 def _cosines(quats: np.ndarray, thinnest: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Compute the cosines ``[n]``, 0 to 1, between the thinnest axes of Gaussians with ``quats [n,4]`` and normals."""
-    axes = np.take_along_axis(quat_to_rotmat(quats), thinnest[:, None, None], 2)[:, :, 0]
-    return np.abs((axes * normals).sum(1))
+    x, y, z = (quat_to_rotmat(quats)[np.arange(len(quats)), :, thinnest] * normals).T
+    return np.abs(x + y + z)
 
 
 def _is_root(

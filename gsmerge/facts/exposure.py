@@ -174,7 +174,7 @@ def _pixels_of(scene: Scene) -> _Pixels:
     valid = fronts >= 0
     if scene.masks is not None:
         valid = valid & scene.masks.reshape(shape)
-    return _Pixels(scene.cameras, scene.gaussians.means[fronts], valid)
+    return _Pixels(scene.cameras, scene.gaussians.means.take(fronts, axis=0), valid)
 
 
 def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
@@ -189,8 +189,9 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
         rows = sample[pixels.valid[view, sample]]
         for other in (views[column] for column in partners[row]):
             found, other_rows = pixels.look_up(view, rows, other)
-            here, there = photos[view, rows[found]], photos[other, other_rows]
-            clear = ((here > LOW) & (here < HIGH) & (there > LOW) & (there < HIGH)).all(1)
+            here, there = photos[view].take(rows[found], axis=0), photos[other].take(other_rows, axis=0)
+            red, green, blue = ((here > LOW) & (here < HIGH) & (there > LOW) & (there < HIGH)).T
+            clear = red & green & blue
             if clear.sum() >= MIN_PAIRS:
                 ratios = log(there[clear].astype(np.float64) / here[clear])
                 pairs.append(_Pair(view, other, medians(ratios), ratios[:MIN_PAIRS].copy(), len(ratios)))

@@ -143,7 +143,7 @@ def row_pictures(scene: Scene) -> np.ndarray:
 
     def draw(view: int) -> None:
         fronts, picture = pixels.fronts[view], pictures[view]
-        np.clip(sh0_to_rgb(sh0[fronts]), 0, 1, out=picture)
+        np.clip(sh0_to_rgb(sh0.take(fronts, axis=0)), 0, 1, out=picture)
         if (fronts < 0).any():
             picture[fronts < 0] = 0
 

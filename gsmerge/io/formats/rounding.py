@@ -26,9 +26,11 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
         return []
     format_, columns = output_format(path, levels=True, cameras=True), gaussians.numpy()
     rows = _sample_rows(columns.means)
-    means, sizes = columns.means[rows].astype(np.float64), np.sort(columns.scales[rows], axis=1)[:, 1]
+    means, (x, y, z) = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0).T
+    sizes = np.maximum(np.minimum(x, y), np.minimum(np.maximum(x, y), z))  # the second largest
     with np.errstate(over="ignore"):
-        moves = np.abs(format_.round_means(means) - means).max(axis=1)
+        x, y, z = np.abs(format_.round_means(means) - means).T
+    moves = np.maximum(np.maximum(x, y), z)
     mean_square = float(np.square(np.minimum(moves / np.maximum(sizes, 1e-30), 1)).mean())
     if mean_square <= SHOWN:
         return []

@@ -2,7 +2,9 @@
 #include "exp_log.h"
 #include "select.h"
 
-enum { FEW = 64, SWEEPS = 8 };  // most members whose median is found by counting; most Jacobi sweeps
+// Most members whose median is found by counting; most Jacobi sweeps; members whose moments are computed together, and
+// that are loaded ahead
+enum { FEW = 64, SWEEPS = 8, LINE = 32, AHEAD = 32 };
 static const double MAX_OPACITY = 0.995;  // optical depth is -ln(1 - opacity): 1 would be infinite
 static const double CAP = 3.0;  // members are shrunk to this many times the group's median extent
 static const double FLOOR = 0.1;  // smallest standard deviation of a group, in pixel footprints
@@ -63,21 +65,31 @@ static void cap_members(const members *m, const int32_t *ids, int64_t n, double 
   for (int64_t j = 0; j < n; j++) caps[j] = caps[j] > limit ? limit / caps[j] : 1.0;
 }
 
-// Adds w R diag(s)^2 R^T to a covariance xx xy xz yy yz zz, with the rotation R of a quaternion
-// wxyz of any length; the zero quaternion means no rotation.
-static inline void add_covariance(const float *quat, const double *s, double weight, double *c) {
-  double w = quat[0], x = quat[1], y = quat[2], z = quat[3];
-  double n = w * w + x * x + y * y + z * z, f = n > 0.0 ? 2.0 / n : 0.0;
-  double xx = f * x * x, xy = f * x * y, xz = f * x * z;
-  double yy = f * y * y, yz = f * y * z, zz = f * z * z;
-  double wx = f * w * x, wy = f * w * y, wz = f * w * z;
-  double r[3][3] = {{1.0 - yy - zz, xy - wz, xz + wy},
-                    {xy + wz, 1.0 - xx - zz, yz - wx},
-                    {xz - wy, yz + wx, 1.0 - xx - yy}};
-  double v[3] = {weight * s[0] * s[0], weight * s[1] * s[1], weight * s[2] * s[2]};
-  for (int i = 0, k = 0; i < 3; i++)
-    for (int j = i; j < 3; j++, k++)
-      c[k] += v[0] * r[i][0] * r[j][0] + v[1] * r[i][1] * r[j][1] + v[2] * r[i][2] * r[j][2];
+// What up to LINE members add to the moments of their group. Each member is a lane, so that the compiler vectorises.
+typedef struct {
+  double weights[LINE], opacities[LINE], scales[3][LINE], offsets[3][LINE];  // offsets are from the group's mean
+  double covars[6][LINE], logs[LINE], areas[LINE];  // covars are the members' own, times their weights
+  float quats[4][LINE];
+} lanes;
+
+// Covariances w R diag(s)^2 R^T as xx xy xz yy yz zz, with the rotation R of a quaternion wxyz of any length; the zero
+// quaternion means no rotation.
+static inline void add_covariances(lanes *l, int64_t n) {
+  for (int64_t j = 0; j < n; j++) {
+    double w = l->quats[0][j], x = l->quats[1][j], y = l->quats[2][j], z = l->quats[3][j];
+    double norm = w * w + x * x + y * y + z * z, f = norm > 0.0 ? 2.0 / norm : 0.0;
+    double xx = f * x * x, xy = f * x * y, xz = f * x * z;
+    double yy = f * y * y, yz = f * y * z, zz = f * z * z;
+    double wx = f * w * x, wy = f * w * y, wz = f * w * z;
+    double r[3][3] = {{1.0 - yy - zz, xy - wz, xz + wy},
+                      {xy + wz, 1.0 - xx - zz, yz - wx},
+                      {xz - wy, yz + wx, 1.0 - xx - yy}};
+    double v[3], weight = l->weights[j];
+    for (int k = 0; k < 3; k++) v[k] = weight * l->scales[k][j] * l->scales[k][j];
+    for (int p = 0, k = 0; p < 3; p++)
+      for (int q = p; q < 3; q++, k++)
+        l->covars[k][j] = v[0] * r[p][0] * r[q][0] + v[1] * r[p][1] * r[q][1] + v[2] * r[p][2] * r[q][2];
+  }
 }
 
 // Weighted sums over a group: of weights, means and footprints.
@@ -93,10 +105,35 @@ static inline void sum_means(const members *m, const int32_t *ids, int64_t n, bo
   }
 }
 
-// Moments of one group; see pool.py. A fully transparent group gets equal weights, so that it has a
-// mean.
-static void pool_group(const members *m, const int32_t *ids, int64_t n, const double *caps,
-                       bool own, double *out, float *out_sh) {
+// Fill the lanes of n members of a group; a weight is an opacity times `norm`, or `norm` alone if `uniform`.
+static inline void fill_lanes(const members *m, const int32_t *ids, int64_t n, const double *caps, const double *mean,
+                              double norm, bool uniform, lanes *l) {
+  for (int64_t j = 0; j < n; j++) {
+    int64_t i = ids[j];
+    l->opacities[j] = mind(m->opacities[i], MAX_OPACITY);
+    for (int k = 0; k < 3; k++) {
+      l->offsets[k][j] = m->means[3 * i + k] - mean[k];
+      l->scales[k][j] = m->scales[3 * i + k];
+    }
+    for (int k = 0; k < 4 && caps; k++) l->quats[k][j] = m->quats[4 * i + k];
+  }
+  for (int64_t j = 0; j < n; j++) {
+    l->weights[j] = uniform ? norm : l->opacities[j] * norm;
+    for (int k = 0; k < 3 && caps; k++) l->scales[k][j] *= caps[j];
+  }
+  for (int64_t j = 0; j < n; j++) {
+    double x = l->scales[0][j], y = l->scales[1][j], z = l->scales[2][j];
+    l->logs[j] = log8(1.0 - l->opacities[j]);
+    l->areas[j] = maxd(maxd(x * y, x * z), y * z);
+  }
+  if (caps) add_covariances(l, n);
+}
+
+// Moments of one group; see pool.py. A fully transparent group gets equal weights, so that it has a mean. Without caps,
+// the members' own covariances do not count.
+static void pool_group(const members *m, const int32_t *ids, int64_t n, const double *caps, double *out,
+                       float *out_sh) {
+  lanes l;
   double sums[5], mean[3], c[6] = {0}, mass = 0.0, extinction = 0.0;
   sum_means(m, ids, n, false, sums);
   double total = sums[0];
@@ -104,28 +141,41 @@ static void pool_group(const members *m, const int32_t *ids, int64_t n, const do
   if (uniform) sum_means(m, ids, n, true, sums);
   double norm = 1.0 / sums[0], footprint = sums[4] * norm;
   for (int k = 0; k < 3; k++) mean[k] = sums[1 + k] * norm;
-  for (int64_t j = 0; j < n; j++) {
-    int64_t i = ids[j];
-    double a = mind(m->opacities[i], MAX_OPACITY), w = uniform ? norm : a * norm;
-    double d[3], s[3];
-    for (int k = 0; k < 3; k++) {
-      d[k] = m->means[3 * i + k] - mean[k];
-      s[k] = own ? caps[j] * m->scales[3 * i + k] : m->scales[3 * i + k];
+  for (int64_t first = 0; first < n; first += LINE) {
+    int64_t size = mini(LINE, n - first);
+    fill_lanes(m, ids + first, size, caps ? caps + first : caps, mean, norm, uniform, &l);
+    for (int64_t j = 0; j < size; j++) {
+      for (int p = 0, k = 0; p < 3; p++)
+        for (int q = p; q < 3; q++, k++) c[k] += l.weights[j] * l.offsets[p][j] * l.offsets[q][j];
+      for (int k = 0; k < 6 && caps; k++) c[k] += l.covars[k][j];
+      mass += l.opacities[j] * l.scales[0][j] * l.scales[1][j] * l.scales[2][j];
+      extinction -= l.logs[j] * l.areas[j];
     }
-    for (int p = 0, k = 0; p < 3; p++)
-      for (int q = p; q < 3; q++, k++) c[k] += w * d[p] * d[q];
-    if (own) add_covariance(m->quats + 4 * i, s, w, c);
-    mass += a * s[0] * s[1] * s[2];
-    extinction -= log8(1.0 - a) * maxd(maxd(s[0] * s[1], s[0] * s[2]), s[1] * s[2]);
-    float share = (float)w;
-    for (int k = 0; k < 3; k++) out_sh[k] += share * m->sh0[3 * i + k];
-    const float *rest = m->shN + 3 * m->rest * i;
-    for (int64_t k = 0; k < 3 * m->rest; k++) out_sh[3 + k] += share * rest[k];
+    for (int64_t j = 0; j < size; j++) {
+      int64_t i = ids[first + j];
+      float share = (float)l.weights[j];
+      for (int k = 0; k < 3; k++) out_sh[k] += share * m->sh0[3 * i + k];
+      const float *rest = m->shN + 3 * m->rest * i;
+      for (int64_t k = 0; k < 3 * m->rest; k++) out_sh[3 + k] += share * rest[k];
+    }
   }
   double floor = FLOOR * footprint * (FLOOR * footprint);
   for (int k = 0; k < 3; k++) out[k] = mean[k];
   for (int k = 0; k < 6; k++) out[3 + k] = k == 0 || k == 3 || k == 5 ? c[k] + floor : c[k];
   out[9] = total, out[10] = mass * VOLUME, out[11] = extinction, out[12] = footprint;
+}
+
+// Begin to load the members of the next group, which are the next to come from memory.
+static inline void prefetch_members(const members *m, const int32_t *ids, int64_t n) {
+  for (int64_t j = 0; j < n; j++) {
+    int64_t i = ids[j];
+    __builtin_prefetch(m->means + 3 * i);
+    __builtin_prefetch(m->quats + 4 * i);
+    __builtin_prefetch(m->scales + 3 * i);
+    __builtin_prefetch(m->sh0 + 3 * i);
+    __builtin_prefetch(m->opacities + i);
+    __builtin_prefetch(m->footprints + i);
+  }
 }
 
 API int32_t pool_groups(const int64_t *restrict starts, const int32_t *restrict ids,
@@ -146,9 +196,9 @@ API int32_t pool_groups(const int64_t *restrict starts, const int32_t *restrict 
     if (count == 0) continue;
     for (int64_t j = 0; j < count; j++)
       if (own[j] < 0 || own[j] >= n) return OUTSIDE;
+    prefetch_members(&all, own + count, mini(AHEAD, m - starts[g + 1]));
     if (own_covariance) cap_members(&all, own, count, caps, order);
-    pool_group(&all, own, count, caps, own_covariance, out_geometry + 13 * g,
-               out_sh + 3 * bases * g);
+    pool_group(&all, own, count, own_covariance ? caps : 0, out_geometry + 13 * g, out_sh + 3 * bases * g);
   }
   return 0;
 }
