@@ -10,7 +10,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.settings.setting import Settings, setting
 
 Fit = Literal["full", "none"]
-STEPS = 368  # of the full fit
+STEPS = 320  # of the full fit
 LONG_STEPS = 600  # runs of at least so many steps gain from a little dropout
 USUAL_SHARE = 0.044  # Gaussians per pixel; photos with a quarter of the pixels suffice for this number
 TOO_FEW_STEPS = 20  # shorter runs have no time for full-size photos
@@ -82,7 +82,7 @@ class FitOptions(Settings):
     fit: Fit = setting("full", "full: fit the Gaussians to the photos, which takes most of a run's time; none: skip "
         "it.")  # fmt: skip
     fit_steps: int | None = setting(None, "Number of steps of the full fit; each step draws one view.",
-        "By default 368, scaled by `effort` and by the numbers of views and Gaussians.", least=1)  # fmt: skip
+        "By default 320, scaled by `effort` and by the numbers of views and Gaussians.", least=1)  # fmt: skip
     time_budget: float | None = setting(None, "Seconds after which the full fit stops.",
         "With a limit the result is no longer the same on every machine. By default there is no limit.", above=0,
         unit="seconds", in_trial=None)  # fmt: skip
