@@ -115,12 +115,13 @@ def score_fit(fit: FullFit) -> None:
 def renew_state(fit: FullFit) -> None:
     """Grow the state, drop its faint Gaussians, or cut it at the edges of the views, if one of these is due.
 
-    The rows and axes of the state change their meaning, so the mean of the last steps begins anew.
+    The rows and axes of the state change their meaning, so the mean of the last steps begins anew. Beside fixed
+    Gaussians no row is dropped or added: who fixes some puts the others back by their rows.
     """
     job, options = fit.run.job, fit.run.job.options
     if not options.grows or not fit.reaches(GROWTH, *CLEARS, *CUTS):
         return
-    if fit.reaches(GROWTH):
+    if fit.reaches(GROWTH) and job.fixed is None:
         fit.state = grow_to(fit.state, fit.half, job.count, most_growth=job.most_growth)
     if fit.reaches(*CLEARS) and job.fixed is None and options.min_contribution > 0:
         fit.state = grow_to(fit.state, fit.half, job.count, FAINT) if options.fills else drop_faint(fit.state, FAINT)
@@ -166,7 +167,7 @@ def end_fit(fit: FullFit, start: Gaussians) -> FitResult:
         rows = np.arange(len(start))
         return start, FitReport("none", False, fit.step, fit.before, after, why, origins=rows)
     state = fit.state
-    if options.grows and fit.last < GROWTH:  # a time budget may end before the growth
+    if options.grows and fit.run.job.fixed is None and fit.last < GROWTH:  # a time budget may end before the growth
         state = grow_to(state, fit.half, fit.run.job.count, most_growth=fit.run.job.most_growth)
     why = TIME_SPENT if options.time_budget is not None else "all steps done"
     fitted, viewmats = gaussians_of(fit.tail.of(state.x), state.splats.shN), fit.optimiser.viewmats

@@ -23,7 +23,8 @@ from gsmerge.frame import canonicalise
 from gsmerge.plan import choose_for_scene
 from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES
-from gsmerge.types import Cameras, PicturedScene, Scene
+from gsmerge.settings.fit import GROW_STEPS
+from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 SETTINGS: dict[str, Any] = {"checkpoint": "none", "superpixels": "10%", "fit_steps": 10, "threads": 1}
 
@@ -170,21 +171,36 @@ def test_unaligned_scenes_have_no_blocks(scene: Scene) -> None:
         compact(unaligned, blocks=2)
 
 
-def test_what_is_fixed_stays(scene: Scene) -> None:
-    """To the bit, beside Gaussians that a fit moves."""
+def fit_every_second(scene: Scene, steps: int, faint: int) -> tuple[Gaussians, Gaussians, np.ndarray]:
+    """Gaussians before and after a fit that fixes every second, and which; the first others are ``faint`` at first."""
     canonical, _ = canonicalise(scene)
     start = compact(scene, fit="none", **{**SETTINGS, "superpixels": "5%"}).gaussians
-    fixed = np.arange(len(start)) % 2 == 0
-    settings = FitOptions(fit_steps=20, scored=False, min_contribution=0.0)
+    fixed, opacities = np.arange(len(start)) % 2 == 0, start.opacities.copy()
+    opacities[1 : 2 * faint : 2] = 0.001
+    settings = FitOptions(fit_steps=steps, scored=False, min_contribution=0.0)
     photos = fit_photos(PicturedScene.with_pictures(canonical, scene.images, None), settings)
-    frame_start = replace(start, means=start.means.astype(np.float32))
-    fitted, report = fit(frame_start, FitJob(photos, settings, len(start), fixed=fixed))
+    start = replace(start, means=start.means.astype(np.float32), opacities=opacities)
+    fitted, report = fit(start, FitJob(photos, settings, len(start), fixed=fixed))
     assert report is not None
     assert report.accepted
+    assert settings.grows == (steps >= GROW_STEPS)
+    return start, fitted, fixed
+
+
+def test_what_is_fixed_stays(scene: Scene) -> None:
+    """To the bit, beside Gaussians that a fit moves."""
+    frame_start, fitted, fixed = fit_every_second(scene, 20, 0)
     for name in ("means", "sh0"):
-        moved = (getattr(fitted, name) != getattr(frame_start, name)).reshape(len(start), -1).any(1)
+        moved = (getattr(fitted, name) != getattr(frame_start, name)).reshape(len(fixed), -1).any(1)
         assert moved[~fixed].any()
     assert np.abs(fitted.means - frame_start.means)[fixed].max() == 0
+
+
+def test_rows_stay_beside_what_is_fixed(scene: Scene) -> None:
+    """Also in runs that would drop faint Gaussians and split others; the mean of the last steps is rounded."""
+    start, fitted, fixed = fit_every_second(scene, GROW_STEPS, 10)
+    assert len(fitted) == len(start)
+    assert np.abs(fitted.means - start.means)[fixed].max() < 1e-5
 
 
 def test_views_of_blocks_are_joined(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
