@@ -24,6 +24,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 from page_tables import make_table
 from quality import score
 from shared_scenes import export, read_held_out, scene_folders
@@ -42,6 +43,7 @@ POINTS: dict[str, tuple[str, ...]] = {
     DEFAULT: (),
     "best": ("--effort", "best"),
 }
+SECONDS = 1, 2, 5, 10, 20  # ticks
 QUALITIES = {"psnr": "PSNR, dB", "lpips": "LPIPS, less is better"}
 
 
@@ -130,6 +132,8 @@ def draw_chart(records: list[dict[str, Any]], versions: list[str], path: Path) -
                 places = means(records, version, "seconds"), means(records, version, key)
                 axes.plot(*places, color=color, marker="o", markersize=3.5, label=version)
             axes.set(xscale="log", xlabel="processor seconds", ylabel=label)
+            axes.xaxis.set_ticks(SECONDS, [str(tick) for tick in SECONDS])
+            axes.xaxis.set_minor_locator(NullLocator())
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center")
         figure.savefig(path, dpi=150, metadata={"Software": None})
 
