@@ -20,9 +20,11 @@ FAINT = 0.02  # opacity of Gaussians that late in a run will fade away; without 
 # Optical depth of a half, as a share of the parent's depth. Halves are narrower than the parent, so two halves of 0.7
 # cover as much as the parent; a little more closes gaps
 DEPTH = 0.8
-# Most Gaussians after a growth, relative to those before it. Where many views show the same surfaces, most Gaussians of
-# the start are hidden, and the usual share of all pixels is far more than the surfaces can use: further halves are
-# smaller than the details of the photos, and most of them fade. With up to a dozen views growth is about twofold
+# Most Gaussians after a growth, as a multiple of those that are left when it begins. Where many views show the same
+# surfaces, most Gaussians of the start are hidden, and the usual share of all pixels is far more than the surfaces can
+# use: further halves are smaller than the details of the photos, and most of them fade. Real scenes of 60 and 84 views
+# gain .1 to .2 dB over growth to the share, in .7 to .8 of the time; a fourfold growth costs a made room .06 dB. With
+# up to a dozen views growth is about twofold
 MOST_GROWTH = 8
 
 

@@ -15,7 +15,9 @@ LONG_STEPS = 600  # runs of at least so many steps gain from a little dropout
 USUAL_SHARE = 0.044  # Gaussians per pixel; photos with a quarter of the pixels suffice for this number
 TOO_FEW_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all their Gaussians
-GROW_ROUNDS = 2  # so do runs that draw each photo less often, which then do not draw every photo before they grow
+# Steps for each photo, as a step draws one. Runs with fewer do not draw every photo before they grow, and do better
+# without: of 100 real views 20.9 dB for 20.7, in .6 of the time
+GROW_ROUNDS = 2
 
 
 @dataclass(frozen=True)
