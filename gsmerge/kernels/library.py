@@ -8,7 +8,7 @@ import struct
 from functools import lru_cache
 from pathlib import Path
 
-from gsmerge.errors import UsageError
+from gsmerge.errors import UsageError, is_out_of_memory
 from gsmerge.kernels.build import FOLDER, Target, find_platform, hash_sources
 
 ELF_HEADER = 64  # bytes
@@ -51,6 +51,8 @@ def _open(target: Target) -> ctypes.CDLL:
         library = ctypes.CDLL(str(path))
         sources_hash = ctypes.c_char_p.in_dll(library, "sources_hash").value or b""
     except (OSError, ValueError) as error:  # ValueError if it is not a library of this package
+        if is_out_of_memory(error):
+            raise MemoryError from error
         if path.exists():
             raise UsageError(f"{path}: the native library cannot be loaded ({error}); {REMEDY}") from None
         raise UsageError(f"{path}: the native library is missing; {_find_shadow() or REMEDY}") from None

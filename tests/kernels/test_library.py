@@ -108,6 +108,15 @@ def test_a_damaged_library_names_the_command_that_builds_it(monkeypatch: pytest.
         load_library()
 
 
+def test_memory_that_does_not_suffice_for_the_library_is_called_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(path: str) -> None:
+        raise OSError(f"{path}: failed to map segment from shared object")
+
+    monkeypatch.setattr(module.ctypes, "CDLL", load)
+    with pytest.raises(MemoryError):
+        load_library()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="ELF files")
 @pytest.mark.parametrize("share", [0.001, 0.5, 0.999])
 def test_a_library_that_is_cut_off_is_not_loaded(share: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
