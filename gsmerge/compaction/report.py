@@ -285,14 +285,16 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
         return []
     head = f"{'Gaussians':>12}  {'PSNR':>5}  {'SSIM':>5}"
     asked = count + document["choices"].get("pruned", 0)
-    result = f"{count:,}" if asked == count else f"{count:,} of {asked:,}"
+    result = f"{asked:,}" if asked == count else f"{asked:,}, of which {count:,} are seen"
     nearest = min(points, key=lambda p: abs(math.log(p["count"] / max(asked, 1))))
     rows = [
         f"{p['count']:>12,}  {p['psnr']:5.2f}  {p['ssim']:5.3f}"
-        + (f"  <- the result has {result}" if p is nearest else "")
+        + (f"  <- nearest to the result: {result}" if p is nearest else "")
         for p in points
     ]
-    return ["quality of short fits, on photos or patches that they left out:", head, *rows]
+    num_photos = document["choices"].get("curve_left_out")
+    scored_on = f"the {num_photos} photos" if num_photos else "patches of the photos"
+    return [f"short fits of half the size compare counts, on {scored_on} that they left out:", head, *rows]
 
 
 def summary_line(document: Mapping[str, Any]) -> str:

@@ -251,7 +251,8 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
         why = f"there are fewer than {LEAST_VIEWS} photos, or no other view sees what they show"
         if not prepared.scene.has_own_pixels:
             why = "views have no Gaussians of their own, which could be left out with the photos"
-        note(f"quality: measured on photos that the fit has seen, because {why}; new views look worse")
+        seen = "photos that the fit has seen" if has_target else "patches of photos that the fits have not seen"
+        note(f"quality: measured on {seen}, because {why}; new views look worse")
     return None
 
 
@@ -289,7 +290,7 @@ def choose_count(
         if forecast is not None:
             forecast.expect_curve(counts, steps, limits.default)
         points = measure_curve(prepared, plan, build, steps, counts, left_out)
-    choose(curve=[asdict(point) for point in points])
+    choose(curve=[asdict(point) for point in points], curve_left_out=0 if left_out is None else len(left_out.photos))
     return curve_knee(points) if drop is None else count_within(points, drop)
 
 

@@ -238,7 +238,7 @@ def evaluate(
         splits = _splits(scene, reference, inputs, targets, renderer)
         scored = {INPUT: inputs, **outputs} if options.own else outputs
         has_fog = options.fog and bool(outputs)
-        fog = measure_fog(inputs, outputs, scene.cameras, renderer.near, progress) if has_fog else {}
+        fog = measure_fog(scene.gaussians.numpy(), outputs, scene.cameras, renderer.near, progress) if has_fog else {}
         num_pictures, numbers = len(scored) * sum(len(split.views) for split in splits.values()), count(1)
 
         def report_image(name: str, kind: str, view: int, image: np.ndarray) -> None:

@@ -105,6 +105,11 @@ def test_summary_line_without_photos(files: tuple[Path, Path]) -> None:
 
 def test_the_curve_marks_the_result(files: tuple[Path, Path]) -> None:
     points = [{"count": count, "psnr": 20.0, "ssim": 0.5} for count in (10, 30, 90)]
-    *_, few, nearest, many = report.curve_lines(make_document(files, choices={"curve": points}))
-    assert nearest.endswith("the result has 25")
+    heading, _, few, nearest, many = report.curve_lines(make_document(files, choices={"curve": points}))
+    assert "patches of the photos that they left out" in heading
+    assert nearest.endswith("nearest to the result: 25")
     assert "result" not in few + many
+    pruned = make_document(files, choices={"curve": points, "curve_left_out": 2, "pruned": 4})
+    heading, _, few, nearest, many = report.curve_lines(pruned)
+    assert "the 2 photos that they left out" in heading
+    assert nearest.endswith("nearest to the result: 29, of which 25 are seen")

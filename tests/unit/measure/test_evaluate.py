@@ -377,6 +377,15 @@ def test_fog_and_holes_are_of_each_result(scene: Scene, half: Gaussians, actual:
     assert evaluate(scene, {"half": half}, None, replace(PLAIN, fog=False)).results[1].fog == {}
 
 
+def test_rows_that_were_put_back_are_no_fog(scene: Scene) -> None:
+    """As for the fit: where an exporter dropped pixels, a result that shows their surfaces is right."""
+    filled = scene.gaussians.means[:, 0] > 0
+    unfilled = evaluate(scene, {"all": scene.gaussians}, None, PLAIN)
+    actual = evaluate(replace(scene, filled=filled), {"all": scene.gaussians}, None, PLAIN)
+    assert actual.results[0].num_gaussians < unfilled.results[0].num_gaussians
+    assert actual.results[1].fog == unfilled.results[1].fog
+
+
 def test_documents_have_fog_and_holes(actual: Evaluation) -> None:
     document = json.loads(to_json(evaluation_document(actual, {})))
     given, result = document["results"]
