@@ -74,6 +74,8 @@ def compact_in_blocks(
     """
     device, scene = scene.gaussians.device, scene.numpy()
     count, limit = len(blocks), choices.limits.count
+    if scene.images is not None:
+        note(f"compacted in {count} blocks of views: photos keep their exposures, and new views are not estimated")
     with stage("partition"):
         factors = count_factors(blocks, covisibility).tolist()
         frame, options = scene_frame(scene), with_choices(options, choices)

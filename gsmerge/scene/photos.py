@@ -293,8 +293,8 @@ def read_photos(
     return ScenePhotos(decode_views(paths, turns, size), paths, turns, tuple(notes))
 
 
-def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, str] | None:
-    """Leave out the views whose photos do not have the aspect ratio of most photos.
+def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:
+    """Leave out photos that do not have the aspect ratio of most photos, and their views if the cameras have neither.
 
     Returns the cameras and the photos of all other views, and a note on the views that are left out. None if that is
     not possible, because there are no photos, all have one aspect ratio, or a single view would remain.
@@ -302,23 +302,31 @@ def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[Camer
     paths = [None if photo is None else proposal.pool[photo] for photo in proposal.named]
     if not any(paths):
         return None
-    stored_sizes = zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)
-    sizes = [size if path is None else image_size(path) for path, size in zip(paths, stored_sizes, strict=True)]
+    camera_sizes = list(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True))
+    sizes = [size if path is None else image_size(path) for path, size in zip(paths, camera_sizes, strict=True)]
     photo_sizes = Counter(size for size, path in zip(sizes, paths, strict=True) if path is not None)
     (width, height), _ = photo_sizes.most_common(1)[0]
     # a size of 1 pixel means that the size is unknown
     has_shape = [min(size) <= 1 or same_shape(size, (width, height)) for size in sizes]
-    used = [view for view, fits in enumerate(has_shape) if fits]
-    unused = [view for view, fits in enumerate(has_shape) if not fits]
-    if not unused or len(used) == 1:
+    camera_fits = [min(size) > 1 and same_shape(size, (width, height)) for size in camera_sizes]
+    used = [view for view in range(len(sizes)) if has_shape[view] or camera_fits[view]]
+    unused = [view for view in range(len(sizes)) if view not in used]
+    if all(has_shape) or len(used) == 1:
         return None
-    names = list_some([f"{camera_file.names[view]} ({sizes[view][0]} x {sizes[view][1]})" for view in unused])
     shape = f"the aspect ratio of {width} x {height}"
+    names = list_some([f"{camera_file.names[view]} ({sizes[view][0]} x {sizes[view][1]})" for view in unused])
     note = f"{len(unused)} of {len(sizes)} views are left out, since they do not have {shape}: {names}"
-    unused_paths = {paths[view] for view in unused}
-    pool = tuple(path for path in proposal.pool if path not in unused_paths)
-    fewer = replace(proposal, pool=pool, named=(), faults=tuple(proposal.faults[view] for view in used))
-    return select_views(camera_file, used), _drop_unreadable(fewer, [paths[view] for view in used]), note
+    other_paths = {path for path, fits in zip(paths, has_shape, strict=True) if not fits}
+    faults = [
+        proposal.faults[view]
+        if has_shape[view]
+        else f"{camera_file.names[view]}: {sizes[view][0]} x {sizes[view][1]}, not {shape}"
+        for view in used
+    ]
+    pool = tuple(path for path in proposal.pool if path not in other_paths)
+    fewer = replace(proposal, pool=pool, named=(), faults=tuple(faults))
+    named = [paths[view] if has_shape[view] else None for view in used]
+    return select_views(camera_file, used), _drop_unreadable(fewer, named), [note] if unused else []
 
 
 def _turned_size(path: Path, turn: int) -> Size:

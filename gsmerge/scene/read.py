@@ -371,15 +371,15 @@ def _prefer_resized(
 def _assign_of_one_shape(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
 ) -> Loaded:
-    """Combine as :func:`_assign`; if that fails, leave out views whose photos differ in shape from most photos."""
+    """Combine as :func:`_assign`; if that fails, leave out the photos or views whose shape is not that of most photos."""
     try:
         return _assign(ply, files, camera_file, proposal, hints)
     except SceneError:
         fewer = select_one_shape(camera_file, proposal)
         if fewer is None:
             raise
-    cameras, photos, note = fewer
-    return _assign(ply, files, cameras, photos, hints).with_left_out([note])
+    cameras, photos, left_out = fewer
+    return _assign(ply, files, cameras, photos, hints).with_left_out(left_out)
 
 
 def _assign(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
+from messages import names, refuses
 from sweeps import sweep
 
 from gsmerge import CompactOptions, compact
@@ -109,6 +109,7 @@ def test_without_a_fit(scene: Scene, checkpoint: str) -> None:
     whole, result = (compact(scene, blocks=blocks, **settings) for blocks in ("none", 2))
     scenes.assert_invariants(result.gaussians, scene)
     assert scenes.psnr_of(result.gaussians, scene) > scenes.psnr_of(whole.gaussians, scene) - 1
+    assert any(names(note, "2 blocks of views", "exposures", "not estimated") for note in result.report.notes)
     assert len(np.unique(result.gaussians.means, axis=0)) == len(result.gaussians)
 
 

@@ -185,6 +185,18 @@ def test_one_photo_of_another_shape(folder: Path, truth: np.ndarray, sizes: str)
     assert not any("without a camera" in note for note in loaded.notes)
 
 
+def test_a_photo_of_another_shape_than_its_camera(folder: Path, truth: np.ndarray) -> None:
+    """Only the photo is left out: the view keeps its camera, and all rows their pixels."""
+    path = photos_in(folder)[1]
+    Image.fromarray((read(path) * 255).astype(np.uint8)).resize((100, 100)).save(path)
+    loaded = load_scene(folder)
+    assert absent(loaded) == [1]
+    assert loaded.scene.has_own_pixels
+    assert [right for view, right in enumerate(right_ones(loaded, truth)) if view != 1] == [True] * 3
+    assert loaded.left_out is not None
+    assert names(loaded.left_out, "photos of 1 of 4 views", path.name, "100 x 100", "192 x 144")
+
+
 def test_photos_that_no_camera_names_beside_rows_of_nothing(folder: Path) -> None:
     """Are refused with the reason why the cameras are."""
     name_frames(folder, lambda view, name: f"elsewhere/{view}.png")
