@@ -371,7 +371,7 @@ def _prefer_resized(
 def _assign_of_one_shape(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
 ) -> Loaded:
-    """Combine as :func:`_assign`; if that fails, leave out the photos or views whose shape is not that of most photos."""
+    """Combine as :func:`_assign`; if that fails, leave out photos or views whose shape is not that of most photos."""
     try:
         return _assign(ply, files, camera_file, proposal, hints)
     except SceneError:
