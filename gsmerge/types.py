@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import field, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -183,7 +183,7 @@ class Cameras:
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class LargePhotos:
     """Photos larger than the scene's views, read one at a time; they have the poses of the scene's cameras."""
 
@@ -191,7 +191,8 @@ class LargePhotos:
     width: int
     height: int
     ids: tuple[int, ...]  # Number of each view's photo, for `read`
-    read: Callable[[int], np.ndarray]  # Number -> [height,width,3] uint8 sRGB; several threads may call it
+    # Number -> [height,width,3] uint8 sRGB; several threads may call it. Each reading of a scene has another function
+    read: Callable[[int], np.ndarray] = field(compare=False)
 
     def __getitem__(self, views: Sequence[int]) -> LargePhotos:
         """Return the photos of some views."""
@@ -234,7 +235,7 @@ PROTECTED = np.float32(4)  # importance of a pixel that is white in a picture of
 PER_PIXEL = ("images", "masks", "importance")  # arrays of a scene with a value for each pixel of its views
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Pixels:
     """The pixel that each Gaussian belongs to, and the Gaussian that each pixel shows.
 
@@ -292,7 +293,7 @@ class Pixels:
         return rows, Pixels(np.concatenate(homes), np.array(fronts, np.int32).reshape(shape), own=self.own)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Region:
     """A box, which may be rotated, or a sphere; both are convex, so the mean of points inside is inside."""
 

@@ -128,7 +128,7 @@ def list_contributions(tiled: TiledView) -> Array:
     return totals.T
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Rendering:
     """Rendered images of c views.
 

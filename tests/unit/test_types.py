@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 from dataclasses import fields, replace
 from typing import Any
 
@@ -162,6 +163,13 @@ def test_wrong_cameras_are_refused(change: dict, named: tuple[object, ...]) -> N
 def scene() -> Scene:
     images, valid = np.zeros((2, 3, 4, 3), np.float32), np.ones((2, 3, 4), bool)
     return Scene(gaussians(24), cameras(), images, Pixels.of_grid(valid), ("a", "b"))
+
+
+def test_equal_scenes_are_equal(torch: Any) -> None:
+    for one in (scene(), scene().pixels, make_scene(gaussians(2).to("cpu"), cameras())):
+        assert copy.deepcopy(one) == one
+    assert scene() in [replace(scene(), images=None), scene()]
+    assert replace(scene(), names=("a", "c")) != scene() != replace(scene(), gaussians=gaussians(24, start=1))
 
 
 def test_pixels_of_a_grid_with_gaps() -> None:
