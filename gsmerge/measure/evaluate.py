@@ -27,6 +27,7 @@ from gsmerge.raster.photos import COVERED, NEAR_PLANE, WHOLE
 from gsmerge.report import html_table
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
+from gsmerge.scene.input import check_scene
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, own_gaussians
 
@@ -205,6 +206,7 @@ def evaluate(
         on_image: Called with (result, split, number of the view in the split, render ``[h,w,3]`` in [0, 1]).
 
     Raises:
+        SceneError: If the scene has values of another convention, such as log scales.
         UsageError: If the scene has no views, or if a result has the name "input".
         GsmergeError: If ``options`` ask for LPIPS and its weights are not installed. Without ``options`` LPIPS is then
             left out, with a note.
@@ -223,6 +225,7 @@ def evaluate(
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
+    check_scene(scene)
     original = scene if scene.images is None else replace(scene, images=as_pictures(scene.images))
     scene, mended = scored_pictures(original)
     inputs = scene.file_gaussians

@@ -23,7 +23,7 @@ from gsmerge.pages.page import headline, view_page
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.scene.files import find_scene_files, scene_title
-from gsmerge.scene.read import as_scene
+from gsmerge.scene.input import as_scene
 from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
 
 MAX_SOLID = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
