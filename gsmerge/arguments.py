@@ -62,9 +62,10 @@ def check_arguments(function: Function) -> Function:
     return cast("Function", call)
 
 
-def check_fields(value: object) -> None:
+def check_fields(value: Any) -> None:
     """Raise TypeError, with one line, if a field of a dataclass has an undeclared type; see :func:`check_arguments`."""
-    for name, annotation in _known_fields(type(value)):
+    kind: Any = type(value)
+    for name, annotation in _known_fields(kind):
         _check(name, annotation, getattr(value, name))
 
 
