@@ -96,8 +96,13 @@ def _refuse_to_delete(self: Any, name: str) -> NoReturn:
 
 @recursive_repr()
 def _describe(self: Any) -> str:
-    shown = ", ".join(f"{field.name}={getattr(self, field.name)!r}" for field in fields(self) if field.repr)
+    shown = ", ".join(f"{field.name}={_shorten(getattr(self, field.name))}" for field in fields(self) if field.repr)
     return f"{type(self).__qualname__}({shown})"
+
+
+def _shorten(value: Any) -> str:
+    """Describe a value; of an array or tensor only the shape."""
+    return f"{type(value).__name__}{list(value.shape)}" if getattr(value, "ndim", 0) else repr(value)
 
 
 def _compare_by(names: list[str]) -> tuple[Callable[[Any, Any], bool], Callable[[Any], int]]:

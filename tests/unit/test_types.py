@@ -289,6 +289,10 @@ def test_a_scene_may_have_no_cameras() -> None:
     assert replace(scene(), names=None).names == make_scene(gaussians(2), cameras()).names
 
 
+def test_arrays_are_described_by_their_shape() -> None:
+    assert repr(scene().pixels) == "Pixels(homes=ndarray[24], fronts=ndarray[2, 3, 4], own=True)"
+
+
 def test_groups_count_all_views() -> None:
     assert len(Groups(np.zeros((2, 3, 4), np.int32), (3, 4))) == 7
     with refuses(ValueError, "labels", [2, 3, 4]):
