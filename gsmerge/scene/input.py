@@ -54,14 +54,14 @@ def check_values(columns: Mapping[str, Array]) -> None:
     Rows with NaN or infinities do not count.
     """
     scales, opacities, quats = (as_array(columns[name]) for name in ("scales", "opacities", "quats"))
-    squares = np.einsum("nj,nj->n", quats, quats)
-    ranges = (scales, 0, np.inf), (opacities, 0, 1), (squares, (1 - _NOT_UNIT) ** 2, (1 + _NOT_UNIT) ** 2)
+    lengths = np.linalg.norm(quats, axis=1)
+    ranges = (scales, 0, np.inf), (opacities, 0, 1), (lengths, 1 - _NOT_UNIT, 1 + _NOT_UNIT)
     if len(scales) == 0 or all(_lie_within(*values) for values in ranges):
         return
     finite = np.isfinite(scales).all(1) & np.isfinite(opacities) & np.isfinite(quats).all(1)
     if not finite.any():
         return
-    scales, opacities, quats = scales[finite], opacities[finite], quats[finite]
+    scales, opacities, lengths = scales[finite], opacities[finite], lengths[finite]
     negative = float((scales < 0).any(1).mean())
     if negative > 0:
         problem = f"expected standard deviations of at least 0, found negative ones in {100 * negative:.3g} % of rows"
@@ -70,7 +70,6 @@ def check_values(columns: Mapping[str, Array]) -> None:
     if low < -TOLERANCE or high > 1 + TOLERANCE:
         problem = f"expected opacities in [0, 1], found {low:.3g} to {high:.3g}"
         raise SceneError("opacities", problem, "they look like logits: pass torch.sigmoid(opacities)")
-    lengths = np.linalg.norm(quats, axis=1)
     share = float((np.abs(lengths - 1) > _NOT_UNIT).mean())
     if share > _FEW:
         sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
