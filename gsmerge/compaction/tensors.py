@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from gsmerge.settings.keywords import CompactKeywords
 
 ORDERS = ("view-major", "none")
+_NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may exceed it
 _EXACT = 1e-5  # the same difference from which on quaternions are normalised
 _MAX_COLOR = 2.0  # largest colour; harmonics may take colours a little beyond 1
 # Offset (pixels) up to which Gaussians lie at the corners of their pixels, if Ks take the corners for the centres
@@ -211,6 +212,7 @@ def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, l
         valid &= np.isfinite(column.reshape(n, -1)).all(1)
     num_bad = clear_invalid("means", out | {"valid": valid})
     check_values(out)
+    _check_lengths(out["quats"][valid])
     np.clip(out["opacities"], 0, 1, out=out["opacities"])
     off = np.flatnonzero(np.abs(np.linalg.norm(out["quats"], axis=1) - 1) > _EXACT)
     out["quats"][off] = normalize(out["quats"][off])
@@ -245,6 +247,16 @@ def _read_harmonics(shN: Array | None, n: int) -> np.ndarray:
         problem = f"expected shape [n, k-1, 3] with 3, 8, 15 or 24 coefficients, found {list(shape)}"
         raise SceneError("shN", problem, "pass shN.transpose(-1, -2): each coefficient's colours last" * swapped)
     return _rows("shN", shN, shape[-2], 3)
+
+
+def _check_lengths(quats: np.ndarray) -> None:
+    """Raise SceneError for quaternions of other lengths than 1; a scene may have them, as no stage uses lengths."""
+    lengths = np.linalg.norm(quats, axis=1)
+    share = float((np.abs(lengths - 1) > _NOT_UNIT).mean())
+    if share > _FEW:
+        sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
+        remedy = "pass torch.nn.functional.normalize(quats, dim=-1)"
+        raise SceneError("quats", f"expected unit quaternions wxyz, found {sizes}", remedy)
 
 
 def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:

@@ -15,7 +15,6 @@ from gsmerge.scene.read import load_scene
 from gsmerge.types import Scene, StrPath
 
 TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by so much
-_NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may exceed it
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
@@ -49,19 +48,14 @@ def check_numbers(name: str, values: Any) -> None:
 
 
 def check_values(columns: Mapping[str, Array]) -> None:
-    """Raise SceneError for log scales, logits, and quaternions that do not have length 1.
-
-    Rows with NaN or infinities do not count.
-    """
-    scales, opacities, quats = (as_array(columns[name]) for name in ("scales", "opacities", "quats"))
-    lengths = np.linalg.norm(quats, axis=1)
-    ranges = (scales, 0, np.inf), (opacities, 0, 1), (lengths, 1 - _NOT_UNIT, 1 + _NOT_UNIT)
-    if len(scales) == 0 or all(_lie_within(*values) for values in ranges):
+    """Raise SceneError for log scales and logits; rows with NaN or infinities do not count."""
+    scales, opacities = as_array(columns["scales"]), as_array(columns["opacities"])
+    if len(scales) == 0 or (_lie_within(scales, 0, np.inf) and _lie_within(opacities, 0, 1)):
         return
-    finite = np.isfinite(scales).all(1) & np.isfinite(opacities) & np.isfinite(quats).all(1)
+    finite = np.isfinite(scales).all(1) & np.isfinite(opacities)
     if not finite.any():
         return
-    scales, opacities, lengths = scales[finite], opacities[finite], lengths[finite]
+    scales, opacities = scales[finite], opacities[finite]
     negative = float((scales < 0).any(1).mean())
     if negative > 0:
         problem = f"expected standard deviations of at least 0, found negative ones in {100 * negative:.3g} % of rows"
@@ -70,11 +64,6 @@ def check_values(columns: Mapping[str, Array]) -> None:
     if low < -TOLERANCE or high > 1 + TOLERANCE:
         problem = f"expected opacities in [0, 1], found {low:.3g} to {high:.3g}"
         raise SceneError("opacities", problem, "they look like logits: pass torch.sigmoid(opacities)")
-    share = float((np.abs(lengths - 1) > _NOT_UNIT).mean())
-    if share > _FEW:
-        sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
-        remedy = "pass torch.nn.functional.normalize(quats, dim=-1)"
-        raise SceneError("quats", f"expected unit quaternions wxyz, found {sizes}", remedy)
 
 
 def _lie_within(values: np.ndarray, low: float, high: float) -> bool:

@@ -150,7 +150,7 @@ def test_a_wrong_convention_is_named(scene: Scene, name: str, change: Change, fo
 
 
 SAME_RULES: list[tuple[str, Change]] = [
-    ("scales", elementary.log), ("opacities", lambda o: 8 * o), ("quats", lambda q: 3 * q),
+    ("scales", elementary.log), ("opacities", lambda o: 8 * o),
     ("means", lambda m: m.astype(complex)), ("means", lambda m: m.astype(object)), ("sh0", lambda c: c.astype(str)),
     ("viewmats", lambda m: m * np.nan), ("viewmats", lambda m: m.transpose(0, 2, 1)), ("Ks", lambda K: -K),
     ("images", lambda i: i.astype(complex)),
@@ -174,8 +174,8 @@ def test_scenes_in_memory_have_the_rules_of_tensors(scene: Scene, name: str, cha
 
 
 def test_rows_that_are_not_finite_are_no_other_convention(scene: Scene) -> None:
-    columns = {name: np.array(getattr(scene.gaussians, name)) for name in ("scales", "opacities", "quats")}
-    columns["scales"][3], columns["opacities"][4:6], columns["quats"][7] = -np.inf, (np.inf, np.nan), np.nan
+    columns = {name: np.array(getattr(scene.gaussians, name)) for name in ("scales", "opacities")}
+    columns["scales"][3], columns["opacities"][4:6] = -np.inf, (np.inf, np.nan)
     check_scene(replace(scene, gaussians=replace(scene.gaussians, **columns)))
     check_scene(replace(scene, gaussians=scene.gaussians[:0], pixels=None))
 
