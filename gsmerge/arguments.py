@@ -1,4 +1,7 @@
-"""Check the arguments of public functions by their annotations; a wrong type raises TypeError with one clear line."""
+"""Check the arguments of public functions, and the fields of public classes, by their annotations.
+
+A wrong type raises TypeError with one clear line.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,8 @@ import inspect
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import wraps
+from dataclasses import fields
+from functools import cache, wraps
 from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -18,9 +22,15 @@ KINDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "int": ("a whole number", lambda value: hasattr(value, "__index__") and not isinstance(value, bool)),
     "Progress": ("a function", callable),
     "OnImage": ("a function", callable),
+    "np.ndarray": ("an array", lambda value: hasattr(value, "ndim")),
+    "tuple[str, ...]": (
+        "a tuple of texts",
+        lambda value: isinstance(value, tuple | list) and all(isinstance(one, str) for one in value),
+    ),
     "HasGaussians": ("a result", lambda value: hasattr(value, "gaussians")),
 }
 CLASSES = {
+    "Pixels": "Pixels", "LargePhotos": "LargePhotos", "Region": "a Region",
     "Scene": "a Scene", "Gaussians": "Gaussians", "Cameras": "Cameras", "Views": "Views", "CameraFile": "a CameraFile",
     "CompactOptions": "CompactOptions", "EvaluateOptions": "EvaluateOptions",
 }  # fmt: skip
@@ -52,6 +62,19 @@ def check_arguments(function: Function) -> Function:
     return cast("Function", call)
 
 
+def check_fields(value: Any) -> None:
+    """Raise TypeError, with one line, if a field of a dataclass has an undeclared type; see :func:`check_arguments`."""
+    kind: Any = type(value)
+    for name, annotation in _known_fields(kind):
+        _check(name, annotation, getattr(value, name))
+
+
+@cache
+def _known_fields(kind: type) -> Sequence[tuple[str, str]]:
+    """Return names and annotations of the fields of a dataclass that are checked."""
+    return [(field.name, field.type) for field in fields(kind) if isinstance(field.type, str) and _is_known(field.type)]
+
+
 def _check(name: str, annotation: str, value: Any) -> None:
     """Raise TypeError, with the expected types, if a value has none of the types of an annotation."""
     if not _fits(annotation, value):
@@ -71,11 +94,13 @@ def _remedy(annotation: str, value: Any) -> str:
     return "pass its .gaussians" if "Gaussians" in annotation and hasattr(value, "gaussians") else ""
 
 
-def _parts(annotation: str) -> list[str]:
+@cache
+def _parts(annotation: str) -> Sequence[str]:
     """Split an annotation at each | outside brackets."""
     return [part.strip() for part in re.split(r"\|(?![^\[]*\])", annotation)]
 
 
+@cache
 def _split(part: str) -> tuple[str, str]:
     """Split a part of an annotation into its container, "" without one, and the annotation of the elements."""
     match = re.fullmatch(r"(Mapping\[str, |Sequence\[)(.*)\]", part)

@@ -16,13 +16,30 @@ if TYPE_CHECKING:
 Array = NDArray[Any]  # or a torch tensor if a docstring allows one; type checkers do not see that
 
 
-def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> None:
-    """Raise ValueError unless an array has a shape; an axis given by a name may have any length."""
+def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> int:
+    """Return the length of an array; TypeError unless it is an array or tensor, ValueError unless it has a shape.
+
+    An axis given by a name may have any length.
+    """
+    if not hasattr(array, "ndim"):
+        raise TypeError(f"{name}: expected an array or a tensor, got {type(array).__name__}")
     fits = array.ndim == len(shape) and all(
         isinstance(expected, str) or expected == length for expected, length in zip(shape, array.shape, strict=True)
     )
     if not fits:
-        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
+        raise ValueError(f"{name}: expected shape [{', '.join(map(str, shape))}], got {list(array.shape)}")
+    return array.shape[0]
+
+
+def as_index(rows: str, index: Any) -> Any:
+    """Return an index that selects ``rows``: a slice, a mask or integers, a tuple as a list; TypeError for another."""
+    if isinstance(index, slice | list | range) or getattr(index, "ndim", 0) == 1:
+        return index
+    if isinstance(index, tuple):
+        return list(index)
+    is_number = isinstance(index, int | np.integer)
+    actual, remedy = (index, f"; write {rows}[[{index}]] for one") if is_number else (type(index).__name__, "")
+    raise TypeError(f"{rows}: expected a slice, a mask or indices, got {actual}{remedy}")
 
 
 def as_array(values: Array) -> np.ndarray:

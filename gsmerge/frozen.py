@@ -96,8 +96,13 @@ def _refuse_to_delete(self: Any, name: str) -> NoReturn:
 
 @recursive_repr()
 def _describe(self: Any) -> str:
-    shown = ", ".join(f"{field.name}={getattr(self, field.name)!r}" for field in fields(self) if field.repr)
+    shown = ", ".join(f"{field.name}={_shorten(getattr(self, field.name))}" for field in fields(self) if field.repr)
     return f"{type(self).__qualname__}({shown})"
+
+
+def _shorten(value: Any) -> str:
+    """Describe a value; of an array or tensor only the shape."""
+    return f"{type(value).__name__}{list(value.shape)}" if getattr(value, "ndim", 0) else repr(value)
 
 
 def _compare_by(names: list[str]) -> tuple[Callable[[Any, Any], bool], Callable[[Any], int]]:
@@ -105,9 +110,28 @@ def _compare_by(names: list[str]) -> tuple[Callable[[Any, Any], bool], Callable[
     read = attrgetter(*names) if names else lambda _: ()
 
     def is_equal(self: Any, other: Any) -> bool:
-        return read(self) == read(other) if other.__class__ is self.__class__ else NotImplemented
+        return _is_equal(read(self), read(other)) if other.__class__ is self.__class__ else NotImplemented
 
     def make_hash(self: Any) -> int:
         return hash(read(self))
 
     return is_equal, make_hash
+
+
+def _is_equal(one: Any, other: Any) -> bool:
+    """Compare two values, also inside tuples, lists and dictionaries; NaN equals NaN.
+
+    Arrays and tensors are equal if their shapes and numbers are; the types of the numbers may differ. A tensor equals
+    tensors of its device only.
+    """
+    if one is other:
+        return True
+    if getattr(one, "ndim", 0) or getattr(other, "ndim", 0):
+        homes = [(getattr(each, "shape", None), getattr(each, "device", None)) for each in (one, other)]
+        return homes[0] == homes[1] and bool(((one == other) | ((one != one) & (other != other))).all())
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_is_equal(value, other[key]) for key, value in one.items())
+    for kind in (tuple, list):
+        if isinstance(one, kind) and isinstance(other, kind):
+            return len(one) == len(other) and all(map(_is_equal, one, other))
+    return bool(one == other or (one != one and other != other))

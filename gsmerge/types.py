@@ -12,14 +12,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import field, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
-from gsmerge.arrays import Array, as_array, as_pictures, as_tensor, check_shape, concat_rows
+from gsmerge.arguments import check_fields
+from gsmerge.arrays import Array, as_array, as_index, as_pictures, as_tensor, check_shape, concat_rows
 from gsmerge.frozen import dataclass
 
 if TYPE_CHECKING:
@@ -60,8 +61,7 @@ class Gaussians:
     shN: Array
 
     def __post_init__(self) -> None:
-        n = self.means.shape[0]
-        check_shape("means", self.means, (n, 3))
+        n = check_shape("means", self.means, ("n", 3))
         check_shape("quats", self.quats, (n, 4))
         check_shape("scales", self.scales, (n, 3))
         check_shape("opacities", self.opacities, (n,))
@@ -79,6 +79,7 @@ class Gaussians:
 
     def __getitem__(self, index: Any) -> Gaussians:
         """Return the rows that ``index`` (slice, mask or integer array) selects."""
+        index = as_index("gaussians", index)
         columns = [getattr(self, f.name) for f in fields(self)]
         if isinstance(index, np.ndarray) and index.dtype.kind == "i" and self.device is None:
             return Gaussians(*(column.take(index, axis=0) for column in columns))  # a quarter of the time of [index]
@@ -149,8 +150,8 @@ class Cameras:
     height: int
 
     def __post_init__(self) -> None:
-        c = self.viewmats.shape[0]
-        check_shape("viewmats", self.viewmats, (c, 4, 4))
+        check_fields(self)
+        c = check_shape("viewmats", self.viewmats, ("c", 4, 4))
         check_shape("Ks", self.Ks, (c, 3, 3))
         if self.width < 1 or self.height < 1:
             raise ValueError(f"expected a positive image size, got {self.width} x {self.height}")
@@ -163,6 +164,7 @@ class Cameras:
 
     def __getitem__(self, index: Any) -> Cameras:
         """Return the cameras that ``index`` (slice, mask or integer array) selects."""
+        index = as_index("cameras", index)
         return replace(self, viewmats=self.viewmats[index], Ks=self.Ks[index])
 
     def to(self, device: torch.device | str) -> Cameras:
@@ -183,7 +185,7 @@ class Cameras:
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class LargePhotos:
     """Photos larger than the scene's views, read one at a time; they have the poses of the scene's cameras."""
 
@@ -191,7 +193,8 @@ class LargePhotos:
     width: int
     height: int
     ids: tuple[int, ...]  # Number of each view's photo, for `read`
-    read: Callable[[int], np.ndarray]  # Number -> [height,width,3] uint8 sRGB; several threads may call it
+    # Number -> [height,width,3] uint8 sRGB; several threads may call it. Each reading of a scene has another function
+    read: Callable[[int], np.ndarray] = field(compare=False)
 
     def __getitem__(self, views: Sequence[int]) -> LargePhotos:
         """Return the photos of some views."""
@@ -217,6 +220,11 @@ class Views:
     images: Array
     names: tuple[str, ...]
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+        check_shape("images", self.images, (len(self), self.cameras.height, self.cameras.width, 3))
+        _check_count("view names", self.names, len(self))
+
     def __len__(self) -> int:
         """Return v."""
         return len(self.cameras)
@@ -224,9 +232,9 @@ class Views:
     def __repr__(self) -> str:
         return f"Views({len(self)} of {self.cameras.width} x {self.cameras.height}, images)"
 
-    def __getitem__(self, ids: Sequence[int]) -> Views:
-        """Select views by their ids."""
-        ids = list(ids)
+    def __getitem__(self, index: Any) -> Views:
+        """Return the views that ``index`` (slice, mask or integer array) selects."""
+        ids = np.arange(len(self))[as_index("views", index)].tolist()
         return Views(self.cameras[ids], self.images[ids], tuple(self.names[i] for i in ids))
 
 
@@ -234,7 +242,7 @@ PROTECTED = np.float32(4)  # importance of a pixel that is white in a picture of
 PER_PIXEL = ("images", "masks", "importance")  # arrays of a scene with a value for each pixel of its views
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Pixels:
     """The pixel that each Gaussian belongs to, and the Gaussian that each pixel shows.
 
@@ -292,7 +300,7 @@ class Pixels:
         return rows, Pixels(np.concatenate(homes), np.array(fronts, np.int32).reshape(shape), own=self.own)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Region:
     """A box, which may be rotated, or a sphere; both are convex, so the mean of points inside is inside."""
 
@@ -301,6 +309,17 @@ class Region:
     axes: np.ndarray  # [3,3] rotation into the directions of the sides
     is_sphere: bool
     rounding: float = 0.0  # Rounding of stored positions; clamped positions stay inside the border by this distance
+
+
+def _number_views(count: int) -> tuple[str, ...]:
+    """Name views by their numbers."""
+    return tuple(f"view {view}" for view in range(count))
+
+
+def _check_count(what: str, values: Sequence[Any], count: int) -> None:
+    """Raise ValueError unless there are ``count`` values."""
+    if len(values) != count:
+        raise ValueError(f"expected {count} {what}, got {len(values)}")
 
 
 @dataclass(frozen=True)
@@ -312,10 +331,10 @@ class Scene:
 
     Args:
         gaussians: n Gaussians, in the frame of the cameras.
-        cameras: The v views; no cameras if none are known.
+        cameras: The v views; None, or no cameras, if none are known.
         images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None. A run also accepts uint8, and no other type.
         pixels: The pixel of each Gaussian, and the Gaussian in front of each pixel; None: not known yet.
-        names: The views' names, which are the image file names if these are known.
+        names: The views' names, which are the image file names if these are known; None: numbers.
         large_photos: The photos with more pixels than the views, or None.
         masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. It is False everywhere in a view without a
             photo.
@@ -344,6 +363,11 @@ class Scene:
     region: Region | None = None
 
     def __post_init__(self) -> None:
+        if self.cameras is None:
+            object.__setattr__(self, "cameras", NO_CAMERAS)
+        if self.names is None:
+            object.__setattr__(self, "names", _number_views(len(self.cameras)))
+        check_fields(self)
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
         if self.pixels is not None:
             check_shape("homes", self.pixels.homes, (len(self.gaussians),))
@@ -351,9 +375,8 @@ class Scene:
         for name in PER_PIXEL:
             if getattr(self, name) is not None:
                 check_shape(name, getattr(self, name), (v, h, w, 3) if name == "images" else (v, h, w))
-        for what, values in (("view names", self.names), ("large photos", getattr(self.large_photos, "ids", None))):
-            if values is not None and len(values) != v:
-                raise ValueError(f"expected {v} {what}, got {len(values)}")
+        _check_count("view names", self.names, v)
+        _check_count("large photos", self.names if self.large_photos is None else self.large_photos.ids, v)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -434,7 +457,7 @@ class Scene:
 
 def make_scene(gaussians: Gaussians, cameras: Cameras) -> Scene:
     """Make a scene of Gaussians and cameras alone, whose views have numbers for names."""
-    return Scene(gaussians, cameras, None, None, tuple(f"view {view}" for view in range(len(cameras))))
+    return Scene(gaussians, cameras, None, None, _number_views(len(cameras)))
 
 
 def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:
@@ -526,7 +549,7 @@ class FeatureGaussians:
     latents: Array  # [g,d] latents of the networks (paper section 4.2), a tensor in training; d = 0 without networks
 
     def __post_init__(self) -> None:
-        g = self.means.shape[0]
+        g = len(self)
         for name in ("weights", "masses", "extinctions", "gains", "footprints", "views"):
             check_shape(name, getattr(self, name), (g,))
         check_shape("covars", self.covars, (g, 3, 3))

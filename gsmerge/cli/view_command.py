@@ -35,7 +35,7 @@ def view(args: opt.Args) -> None:
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D and scores in one file."""
     from gsmerge.pages.data import collect
     from gsmerge.pages.page import headline, speed, speed_words, view_page
-    from gsmerge.pages.view import file_gains
+    from gsmerge.pages.view import check_page_name, file_gains
     from gsmerge.report import document_head
 
     args.after = args.after or []
@@ -46,8 +46,7 @@ def view(args: opt.Args) -> None:
     output = args.output or default
     check_outputs((output,), (*input_files(files), *after, args.targets), overwrite=True)
     check_replaced((output,))
-    if output.suffix.lower() not in (".html", ".htm"):
-        raise UsageError(f"{output}: expected a name ending in .html")
+    check_page_name(output)
     with stage_progress(quiet=args.silent) as progress:
         progress("read", 0, 0)
         pair = read_before_after(args, files)

@@ -46,7 +46,7 @@ from gsmerge.runtime.record import (
     record_run,
 )
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.read import as_scene
+from gsmerge.scene.input import as_scene
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians, Scene, StrPath
@@ -79,7 +79,7 @@ def compact(
         **settings: Single settings by name that override ``options``: ``compact(scene, k=2, superpixels="1%")``.
 
     Raises:
-        SceneError: If a path cannot be read.
+        SceneError: If a path cannot be read, or a scene has values of another convention, such as log scales.
         ValueError: If a setting is unknown or out of range.
 
     Doubts about the result are warnings of the class :class:`gsmerge.DoubtWarning`. Notes go to the logger ``gsmerge``.

@@ -32,12 +32,12 @@ from gsmerge.io.cameras.camera_file import (
     W2C_OPENCV,
     W2C_OPENGL,
     Convention,
-    check_camera,
     check_size,
 )
 from gsmerge.io.formats.read import clear_invalid, clear_rows, find_empty
 from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
+from gsmerge.scene.input import TOLERANCE, check_cameras, check_numbers, check_values
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
 from gsmerge.words import count_words
 
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from gsmerge.settings.keywords import CompactKeywords
 
 ORDERS = ("view-major", "none")
-_TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by so much
 _NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may exceed it
 _EXACT = 1e-5  # the same difference from which on quaternions are normalised
 _MAX_COLOR = 2.0  # largest colour; harmonics may take colours a little beyond 1
@@ -182,10 +181,8 @@ def _to_numpy(name: str, values: Any) -> np.ndarray:
     """Return an array or tensor as a NumPy array; raise SceneError if it holds no numbers."""
     if hasattr(values, "detach") and "float" in str(values.dtype):  # NumPy knows no bfloat16
         values = values.detach().double() if str(values.dtype) == "torch.float64" else values.detach().float()
-    array = as_array(values)
-    if array.dtype.kind not in "fiub":
-        raise SceneError(name, f"expected an array or tensor of numbers, found {type(values).__name__}")
-    return array
+    check_numbers(name, values)
+    return as_array(values)
 
 
 def _rows(name: str, values: Any, *tail: int) -> np.ndarray:
@@ -214,7 +211,8 @@ def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, l
     for column in out.values():
         valid &= np.isfinite(column.reshape(n, -1)).all(1)
     num_bad = clear_invalid("means", out | {"valid": valid})
-    _check_values(out, valid)
+    check_values(out)
+    _check_lengths(out["quats"][valid])
     np.clip(out["opacities"], 0, 1, out=out["opacities"])
     off = np.flatnonzero(np.abs(np.linalg.norm(out["quats"], axis=1) - 1) > _EXACT)
     out["quats"][off] = normalize(out["quats"][off])
@@ -251,18 +249,9 @@ def _read_harmonics(shN: Array | None, n: int) -> np.ndarray:
     return _rows("shN", shN, shape[-2], 3)
 
 
-def _check_values(out: dict[str, np.ndarray], valid: np.ndarray) -> None:
-    """Raise SceneError for log scales, logits, and quaternions that do not have length 1."""
-    scales, opacities = out["scales"][valid], out["opacities"][valid]
-    negative = float((scales < 0).any(1).mean())
-    if negative > 0:
-        problem = f"expected standard deviations of at least 0, found negative ones in {100 * negative:.3g} % of rows"
-        raise SceneError("scales", problem, "they look like log scales: pass scales.exp()")
-    low, high = float(opacities.min()), float(opacities.max())
-    if low < -_TOLERANCE or high > 1 + _TOLERANCE:
-        problem = f"expected opacities in [0, 1], found {low:.3g} to {high:.3g}"
-        raise SceneError("opacities", problem, "they look like logits: pass torch.sigmoid(opacities)")
-    lengths = np.linalg.norm(out["quats"][valid], axis=1)
+def _check_lengths(quats: np.ndarray) -> None:
+    """Raise SceneError for quaternions of other lengths than 1; a scene may have them, as no stage uses lengths."""
+    lengths = np.linalg.norm(quats, axis=1)
     share = float((np.abs(lengths - 1) > _NOT_UNIT).mean())
     if share > _FEW:
         sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
@@ -295,15 +284,11 @@ def _read_views(
     intrinsics = _matrices("Ks", Ks, ((3, 3),), views)
     poses = np.tile(np.eye(4), (views, 1, 1))
     poses[:, : matrices.shape[1]] = matrices
-    for view, (pose, K) in enumerate(zip(poses, intrinsics, strict=True)):
-        if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-3:
-            problem = f"view {view}: expected 0 0 0 1 as the last row, found another"
-            raise SceneError("viewmats", problem, "if they are transposed, pass viewmats.transpose(-1, -2)")
+    check_cameras(poses, intrinsics)
+    for view, K in enumerate(intrinsics):
         if max(K[0, 0], K[1, 1]) < MAX_NORMALISED_FOCAL <= min(width, height):
             problem = f"view {view}: expected intrinsics in pixels, found a focal length of {K[0, 0]:.3g}"
             raise SceneError("Ks", problem, "they look divided by the image's size: multiply the rows by W, H and 1")
-        check_camera("viewmats", str(view), pose, np.eye(3))
-        check_camera("Ks", str(view), np.eye(4), K)
         check_size("Ks", str(view), K, (width, height))
     cameras = Cameras(poses, intrinsics, width, height)
     if photos is None:
@@ -313,7 +298,7 @@ def _read_views(
         raise _image_error(photos, str(list(expected)))
     if not np.isfinite(photos).all():
         raise SceneError("images", "expected finite numbers, found NaN or inf")
-    _expect_unit_range("images", photos, _TOLERANCE)
+    _expect_unit_range("images", photos, TOLERANCE)
     return cameras, to_float32(photos.reshape(expected)).clip(0, 1)
 
 

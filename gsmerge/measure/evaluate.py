@@ -27,6 +27,7 @@ from gsmerge.raster.photos import COVERED, NEAR_PLANE, WHOLE
 from gsmerge.report import html_table
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
+from gsmerge.scene.input import check_scene
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, own_gaussians
 
@@ -35,6 +36,7 @@ MENDED = (
     " that cover them; compact mends this, but the scores here use the photos as they are"
 )
 MIN_SEEN_SHARE = 0.1  # if input views have seen less of the held-out pixels, the frames of coordinates may differ
+SPLITS = ("context", "target")  # input views, and held-out views
 INPUT = "input"  # name of the scene itself among the results
 
 OnImage = Callable[[str, str, int, np.ndarray], None]  # result, split, number of the view, image
@@ -82,12 +84,20 @@ class ResultScores:
     scores: tuple[ViewScore, ...]  # one for each view
     fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty for the input, or if not measured
 
+    def __repr__(self) -> str:
+        return f"ResultScores({self.name!r}, {self.num_gaussians:,} Gaussians, {len(self.scores)} views)"
+
     def mean(self, split: str, *, zoom: float | None = None) -> Pair:
         """Average the scores of a split's views, at the size of the photos or at another ``zoom``.
 
-        Returns the mean scores over all pixels, and over the pixels that the input views have seen.
+        Returns the mean scores over all pixels, and over the pixels that the input views have seen. ValueError for
+        another split than "context" and "target", or for a zoom that was not measured.
         """
-        views = [score for score in self.scores if score.split == split]
+        views = self._select_views(split)
+        zooms = {size for score in views for size in score.zooms}
+        if zoom is not None and views and zoom not in zooms:
+            measured = [f"{size:g}" for size in sorted(zooms)]
+            raise ValueError(f"zoom: expected {', '.join([*measured, 'None'])}, got {zoom!r}")
         pairs = [(score.full, score.masked) for score in views]
         if zoom is not None:
             pairs = [score.zooms[zoom] for score in views if zoom in score.zooms]
@@ -95,9 +105,15 @@ class ResultScores:
 
     def mean_covered(self, split: str) -> tuple[float | None, Quality]:
         """Average, over a split's views, the share of pixels that the input covers, and the scores over them."""
-        views = [score for score in self.scores if score.split == split]
+        views = self._select_views(split)
         shares = [score.covered_share for score in views if score.covered_share is not None]
         return float(np.mean(shares)) if shares else None, _mean([score.covered for score in views])
+
+    def _select_views(self, split: str) -> list[ViewScore]:
+        """Return the scores of a split's views; ValueError for an unknown split."""
+        if split not in SPLITS:
+            raise ValueError(f"split: expected {' or '.join(SPLITS)}, got {split!r}")
+        return [score for score in self.scores if score.split == split]
 
 
 @dataclass(frozen=True)
@@ -128,7 +144,7 @@ class Evaluation:
     pictures: np.ndarray | None = None
 
     def __repr__(self) -> str:
-        scores = ", ".join(f"{row[0]} {row[2]} dB" for row in self._rows()[1:])
+        scores = ", ".join(f"{row[0]} {row[2]} dB" if len(row) > 2 else row[0] for row in self._rows()[1:])
         return f"Evaluation({scores}; against {self.reference})"
 
     def _repr_html_(self) -> str:
@@ -205,6 +221,7 @@ def evaluate(
         on_image: Called with (result, split, number of the view in the split, render ``[h,w,3]`` in [0, 1]).
 
     Raises:
+        SceneError: If the scene has values of another convention, such as log scales.
         UsageError: If the scene has no views, or if a result has the name "input".
         GsmergeError: If ``options`` ask for LPIPS and its weights are not installed. Without ``options`` LPIPS is then
             left out, with a note.
@@ -223,6 +240,7 @@ def evaluate(
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
+    check_scene(scene)
     original = scene if scene.images is None else replace(scene, images=as_pictures(scene.images))
     scene, mended = scored_pictures(original)
     inputs = scene.file_gaussians

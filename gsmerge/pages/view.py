@@ -12,6 +12,7 @@ from tempfile import mkdtemp
 from typing import Any
 
 from gsmerge.arguments import check_arguments
+from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.frozen import dataclass
 from gsmerge.io.atomic import atomic_output
@@ -23,7 +24,7 @@ from gsmerge.pages.page import headline, view_page
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.scene.files import find_scene_files, scene_title
-from gsmerge.scene.read import as_scene
+from gsmerge.scene.input import as_scene
 from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
 
 MAX_SOLID = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
@@ -44,8 +45,10 @@ class Page:
         style = f"width: 100%; height: {HEIGHT}px; border: 0"
         return f'<iframe srcdoc="{html.escape(self.text)}" style="{style}" allowfullscreen></iframe>'
 
+    @check_arguments
     def save(self, path: StrPath, *, overwrite: bool = False) -> Path:
-        """Write the page as an ``.html`` file that opens anywhere; return its path."""
+        """Write the page as an ``.html`` file that opens anywhere; return its path. UsageError for another ending."""
+        check_page_name(Path(path))
         with atomic_output(path, overwrite=overwrite) as temporary:
             temporary.write_bytes(self.text.encode())
         return Path(path)
@@ -53,6 +56,12 @@ class Page:
     def open(self) -> None:
         """Open the page in the browser, from a temporary file."""
         webbrowser.open(self.save(Path(mkdtemp(prefix="gsmerge-")) / "view.html").as_uri())
+
+
+def check_page_name(path: Path) -> None:
+    """Raise UsageError unless the name of a page ends in .html."""
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"{path}: expected a name ending in .html")
 
 
 @check_arguments

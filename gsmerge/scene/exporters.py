@@ -33,7 +33,7 @@ def make_hints(values: dict[str, Any]) -> ReadHints:
     if unknown:
         known = sorted({*names, *SCENE_ARGUMENTS})
         suggestion = suggest_name(unknown[0], known)
-        raise ValueError(f"expected {join_words(map(repr, known))}, got {unknown[0]!r}{suggestion}")
+        raise ValueError(f"unknown argument {unknown[0]!r}{suggestion or f'; expected {join_words(known)}'}")
     return ReadHints(**values)
 
 

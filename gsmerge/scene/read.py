@@ -34,7 +34,6 @@ from gsmerge.io.formats.arrays import FLAT_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
-from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import (
     AUTO,
@@ -193,16 +192,6 @@ def read_scene(
     )
     if load.left_out is not None:
         warnings.warn(load.left_out, stacklevel=2)
-    return load.scene
-
-
-def as_scene(scene: Scene | StrPath) -> Scene:
-    """Return a scene unchanged, or read it from a path; notes describe unusual content of the file."""
-    if isinstance(scene, Scene):
-        return scene
-    load = load_scene(scene)
-    for text in load.notes:
-        note(text)
     return load.scene
 
 

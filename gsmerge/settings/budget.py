@@ -50,6 +50,8 @@ class BudgetOptions(Settings):
         in_batches=False)  # fmt: skip
 
     def __post_init__(self) -> None:
+        if self.quality is not None:
+            parse_quality(self.quality)
         super().__post_init__()
         word = str(self.budget).strip().lower()
         if word in (AUTO, *DEVICES):
@@ -58,8 +60,6 @@ class BudgetOptions(Settings):
             parse_bytes(str(self.budget))
         elif self.budget is not None:
             parse_budget(self.budget, sys.maxsize)
-        if self.quality is not None:
-            parse_quality(self.quality)
 
     @property
     def search_names(self) -> list[str]:

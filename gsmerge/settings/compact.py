@@ -155,8 +155,10 @@ class CompactOptions(Settings):
 
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
         """Change settings by flat name (``k=2``), after those of a recipe; raise ValueError for unknown names."""
+        if not isinstance(settings, Mapping):
+            raise TypeError(f"settings: expected a dictionary of values by name, got {type(settings).__name__}")
         all_settings = flat_settings(CompactOptions)
-        unknown = sorted(settings.keys() - all_settings.keys())
+        unknown = sorted(settings.keys() - all_settings.keys(), key=str)
         if unknown:
             hint = suggest_name(unknown[0], all_settings)
             if unknown[0] in SCENE_ARGUMENTS:

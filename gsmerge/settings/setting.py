@@ -128,8 +128,12 @@ class Setting:
     def expected(self, value: Any, *, null: bool = False) -> str:
         """Describe the expected values for an error message about ``value``."""
         values = self.values(null=null)
-        needs_whole = isinstance(value, float) and int in self.kinds and float not in self.kinds
-        return f"{KIND_NAMES[int]}, {values}" if needs_whole and not values.startswith(KIND_NAMES[int]) else values
+        numbers = [kind for kind in (float, int) if kind in self.kinds]
+        is_whole = isinstance(value, float) and numbers == [int]
+        is_other = not isinstance(value, Real | NoneType) and not self.words
+        if not numbers or not (is_whole or is_other) or values.startswith(KIND_NAMES[numbers[0]]):
+            return values
+        return f"{KIND_NAMES[numbers[0]]}, {values}"
 
     def _describe_range(self, kind: type) -> str:
         low = None if self.least is None else _number(self.least)
@@ -148,6 +152,9 @@ class Setting:
         if value is self.default:
             return
         if self.is_list:
+            if not isinstance(value, list | tuple):
+                remedy = f"; write ({value!r},)" if self._fits(value) and self._in_range(value) else ""
+                raise ValueError(f"{self.name}: expected a list of {self.expected(value)}, got {value!r}{remedy}")
             if self.filled and not value:
                 raise ValueError(f"{self.name}: expected at least one value, got none")
             for element in value:
@@ -186,7 +193,13 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, declared in settings_of(type(self)).items():
-            declared.check(getattr(self, name))
+            value = getattr(self, name)
+            if declared.is_group and not isinstance(value, declared.kind):
+                actual = repr(value) if isinstance(value, str | Real) else type(value).__name__
+                single = f"{type(self).__name__}().with_settings({{...}}) takes single settings by name"
+                remedy = f"; {single}" if hasattr(self, "with_settings") else ""
+                raise ValueError(f"{name}: expected {declared.kind.__name__}, got {actual}{remedy}")
+            declared.check(value)
 
 
 _declared: dict[type, dict[str, Setting]] = {}  # by class; resolving the types of its fields takes time

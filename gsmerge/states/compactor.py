@@ -12,7 +12,7 @@ from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import UsageError
 from gsmerge.io.formats.table import STATE_ENDING
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.read import as_scene
+from gsmerge.scene.input import as_scene
 from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.extend import BatchReport, extend

@@ -53,7 +53,8 @@ def _check_removable(state: State, number: int) -> Scene:
     """Return the scene of a state; UsageError if the batch with this number, from 1, cannot be removed from it."""
     batches, scene = state.about["batches"], state.scene
     if not 1 <= number <= len(batches):
-        raise UsageError(f"remove {number}: expected a batch from 1 to {len(batches)}; gsmerge inspect lists them")
+        lists = "gsmerge inspect or Compactor.batches lists them"
+        raise UsageError(f"remove {number}: expected a batch from 1 to {len(batches)}; {lists}")
     if scene is None:
         raise UsageError(f"remove {number}: expected a state of results, found merged Feature Gaussians; {RESTART}")
     if len(batches) == 1:

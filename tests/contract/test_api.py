@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,11 @@ def test_public_names_are_documented(name: str) -> None:
     first = value.__doc__.splitlines()[0]
     assert first.endswith(".")
     assert not first.startswith(f"{name}(")  # what dataclasses make up when there is no docstring
+
+
+@pytest.mark.parametrize("name", [name for name in PUBLIC if is_dataclass(getattr(gsmerge, name))])
+def test_public_values_are_equal_by_value(name: str) -> None:
+    assert getattr(gsmerge, name).__eq__ is not object.__eq__
 
 
 @pytest.mark.parametrize("name", [name for name in PUBLIC if name[0].islower()])

@@ -24,9 +24,11 @@ from gsmerge.cli.app import app
 from gsmerge.compaction.report import report_document
 from gsmerge.errors import SceneError
 from gsmerge.io.formats.table import FORMATS
+from gsmerge.pages.view import Page
 from gsmerge.settings.compact import method_names
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.setting import flat_settings
+from gsmerge.types import Pixels
 
 ROOT = Path(__file__).parents[2]
 TOP: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
@@ -230,6 +232,27 @@ def test_python_uses_public_names(page: str) -> None:
             assert all(hasattr(import_module(module), name.strip()) for name in names.split(","))
         for name in re.findall(r"\bgsmerge\.(\w+)", block):
             assert hasattr(gsmerge, name) or name in ("io", "measure"), name
+
+
+# What variables of these names are in pages
+VARIABLES: dict[str, type] = {
+    "scene": gsmerge.Scene, "gaussians": gsmerge.Gaussians, "cameras": gsmerge.Cameras, "pixels": Pixels,
+    "result": gsmerge.CompactResult, "small": gsmerge.CompactResult, "report": gsmerge.CompactReport,
+    "compactor": gsmerge.Compactor, "rendering": gsmerge.Rendering, "evaluation": gsmerge.Evaluation, "page": Page,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("page", [page for page in WRITTEN if "\nimport gsmerge\n" in read(page)])
+def test_attributes_in_python_exist(page: str) -> None:
+    """In blocks, with their comments, and in the text of the guide to Python."""
+    blocks = re.findall(r"```python\n(.*?)```", read(page), re.DOTALL)
+    parts = [block for block in blocks if "import gsmerge" in block]
+    parts += re.findall(r"`([^`]+)`", read(page)) if page == "docs/guide/python.md" else []
+    for part in parts:
+        code = re.sub(r'"[^"]*"|from [\w.]+', "", part)
+        for variable, name in re.findall(rf"\b({'|'.join(VARIABLES)})\.(\w+)", code):
+            kind = VARIABLES[variable]
+            assert name in {*dir(kind), *getattr(kind, "__dataclass_fields__", ())}, f"{variable}.{name}"
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -11,6 +11,7 @@ from dataclasses import FrozenInstanceError, field, fields, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import pytest
 
 from gsmerge.frozen import dataclass
@@ -114,3 +115,23 @@ def test_other_classes_are_those_of_the_standard_library() -> None:
     bare.x = 2
     assert bare == Bare(2)
     assert Compared(1) != Compared(1)
+
+
+def test_arrays_are_equal_by_shape_and_numbers() -> None:
+    """Also inside tuples and dictionaries; the type of the numbers does not count, and NaN equals NaN."""
+    values = np.array([1.0, np.nan])
+    for one in (values, (1, values), [values], {"a": (values,)}, values[:0], np.float32("nan"), np.array(["a"])):
+        assert Point(copy.deepcopy(one)) == Point(one)  # type: ignore[arg-type]
+        assert Point(one) != Point(1)  # type: ignore[arg-type]
+    assert Point(values.astype(np.float32)) == Point(values)  # type: ignore[arg-type]
+    assert Point(np.arange(2)) in [Point(np.zeros(2)), Point(np.array([0.0, 1.0]))]  # type: ignore[arg-type]
+    for other in (values[:1], values[None], values + 1, [1.0, np.nan], (values, values), {"b": values}, None, "1"):
+        assert Point(other) != Point(values)  # type: ignore[arg-type]
+        assert Point({"a": other}) != Point({"a": values})  # type: ignore[arg-type]
+
+
+def test_tensors_are_equal_on_one_device(torch: Any) -> None:
+    tensor = torch.tensor([1.0, torch.nan], requires_grad=True)
+    assert Point(copy.deepcopy(tensor)) == Point(tensor)
+    for other in (tensor + 1, tensor[:1], tensor.detach().numpy(), tensor.to("meta")):
+        assert Point(other) != Point(tensor)

@@ -89,6 +89,8 @@ def test_a_result_shows_its_scene_beside_it(
     assert path.read_text(encoding="utf-8") == page.text
     with pytest.raises(gsmerge.SceneError, match="exists already"):
         page.save(path)
+    with pytest.raises(ValueError, match=r"page.txt: expected a name ending in .html"):
+        page.save(tmp_path / "page.txt")
 
 
 @pytest.mark.slow

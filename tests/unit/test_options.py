@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable
+from dataclasses import asdict, fields, is_dataclass, replace
 
 import pytest
 from messages import refuses
@@ -69,3 +70,28 @@ def test_values_out_of_range_are_refused_before_any_work(setting: dict) -> None:
     (name,) = setting
     with pytest.raises(ValueError, match=name):
         CompactOptions().with_settings(setting)
+
+
+WHOLE = asdict(CompactOptions())
+
+
+@pytest.mark.parametrize(("call", "place", "values"), [
+    (lambda: CompactOptions(budget="4%"), "budget", ["BudgetOptions", "'4%'", "CompactOptions().with_settings"]),
+    (lambda: CompactOptions("4%"), "prepare", ["PrepareOptions", "CompactOptions().with_settings"]),
+    (lambda: replace(CompactOptions(), fit=None), "fit", ["FitOptions", "CompactOptions().with_settings"]),
+    (lambda: CompactOptions(**WHOLE), "prepare", ["dict", "CompactOptions().with_settings"]),
+    (lambda: CompactOptions().with_settings({"quality": 30}), "quality", ['"-0.2dB"', '"30dB"']),
+])  # fmt: skip
+def test_values_that_are_no_settings_of_a_stage_are_named(
+    call: Callable[[], CompactOptions], place: str, values: list[object]
+) -> None:
+    with refuses(ValueError, place, *values):
+        call()
+
+
+def test_settings_are_a_dictionary() -> None:
+    assert CompactOptions().with_settings(CompactOptions().to_dict()) == CompactOptions()
+    with refuses(TypeError, "settings", "str"):
+        CompactOptions().with_settings("4%")  # type: ignore[arg-type]
+    with refuses(ValueError, "", "3", "k", "quality"):
+        CompactOptions().with_settings({3: 4, "a": 5})  # type: ignore[dict-item]

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -8,7 +10,7 @@ import pytest
 from messages import refuses
 
 from gsmerge.arrays import as_array, as_tensor, distinct, like
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, Pixels, Scene, make_scene
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, Pixels, Scene, Views, make_scene
 
 
 def gaussians(n: int, coefficients: int = 0, start: int = 0) -> Gaussians:
@@ -149,7 +151,7 @@ def test_cameras_of_tensors(torch: Any) -> None:
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"viewmats": np.stack([np.eye(3)] * 2)}, ("viewmats", [2, 4, 4], [2, 3, 3])),
+        ({"viewmats": np.stack([np.eye(3)] * 2)}, ("viewmats", "[c, 4, 4]", [2, 3, 3])),
         ({"Ks": np.eye(3)[None]}, ("Ks", [2, 3, 3], [1, 3, 3])),
         ({"width": 0}, ("", "0 x 3")), ({"height": -1}, ("", "4 x -1")),
     ],
@@ -162,6 +164,13 @@ def test_wrong_cameras_are_refused(change: dict, named: tuple[object, ...]) -> N
 def scene() -> Scene:
     images, valid = np.zeros((2, 3, 4, 3), np.float32), np.ones((2, 3, 4), bool)
     return Scene(gaussians(24), cameras(), images, Pixels.of_grid(valid), ("a", "b"))
+
+
+def test_equal_scenes_are_equal(torch: Any) -> None:
+    for one in (scene(), scene().pixels, make_scene(gaussians(2).to("cpu"), cameras())):
+        assert copy.deepcopy(one) == one
+    assert scene() in [replace(scene(), images=None), scene()]
+    assert replace(scene(), names=("a", "c")) != scene() != replace(scene(), gaussians=gaussians(24, start=1))
 
 
 def test_pixels_of_a_grid_with_gaps() -> None:
@@ -227,6 +236,61 @@ def test_scenes_of_tensors_become_such_of_arrays(torch: Any) -> None:
 def test_wrong_scenes_are_refused(change: dict, named: tuple[object, ...]) -> None:
     with refuses(ValueError, *named):
         replace(scene(), **change)
+
+
+OTHER_TYPES: list[tuple[Callable[[], Any], str, list[object]]] = [
+    (lambda: replace(gaussians(1), means=[[0, 0, 0]]), "means", ["list"]),
+    (lambda: replace(gaussians(1), quats="quats"), "quats", ["str"]),
+    (lambda: replace(gaussians(1), shN=None), "shN", ["NoneType"]),
+    (lambda: replace(cameras(), viewmats=None), "viewmats", ["NoneType"]),
+    (lambda: replace(cameras(), width="4"), "width", ["str"]),
+    (lambda: replace(cameras(), height=3.0), "height", ["float"]),
+    (lambda: replace(scene(), images="x"), "images", ["str"]),
+    (lambda: replace(scene(), pixels=np.zeros(3)), "pixels", ["ndarray"]),
+    (lambda: replace(scene(), names="ab"), "names", ["str"]),
+    (lambda: replace(scene(), gaussians=cameras()), "gaussians", ["Cameras"]),
+    (lambda: Views(cameras(), None, ("a", "b")), "images", ["NoneType"]),
+    (lambda: gaussians(3)[2], "gaussians", ["gaussians[[2]]"]),
+    (lambda: gaussians(3)[None], "gaussians", ["NoneType"]),
+    (lambda: list(cameras()), "cameras", ["cameras[[0]]"]),
+    (lambda: cameras()[np.int64(1)], "cameras", ["cameras[[1]]"]),
+    (lambda: views()[-1], "views", ["views[[-1]]"]),
+]
+
+
+@pytest.mark.parametrize(("call", "place", "values"), OTHER_TYPES)
+def test_other_types_are_refused(call: Callable[[], Any], place: str, values: list[object]) -> None:
+    with refuses(TypeError, place, *values):
+        call()
+
+
+def views() -> Views:
+    return Views(cameras(), np.zeros((2, 3, 4, 3)), ("a", "b"))
+
+
+@pytest.mark.parametrize("index", [slice(1, 2), [1], (1,), np.array([1]), np.array([False, True]), range(1, 2)])
+def test_an_index_selects_rows(index: Any) -> None:
+    assert views()[index] == Views(cameras(1), np.zeros((1, 3, 4, 3)), ("b",))
+    assert gaussians(2)[index] == gaussians(1, start=1)
+
+
+@pytest.mark.parametrize("change", [{"images": np.zeros((2, 4, 3, 3))}, {"names": ("a",)}], ids=str)
+def test_wrong_views_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        replace(views(), **change)
+
+
+def test_a_scene_may_have_no_cameras() -> None:
+    for bare in (
+        Scene(gaussians(2), None, None, None, ()),  # type: ignore[arg-type]
+        replace(scene(), cameras=None, images=None, pixels=None, names=None),
+    ):
+        assert (len(bare), len(bare.cameras), bare.names) == (0, 0, ())
+    assert replace(scene(), names=None).names == make_scene(gaussians(2), cameras()).names
+
+
+def test_arrays_are_described_by_their_shape() -> None:
+    assert repr(scene().pixels) == "Pixels(homes=ndarray[24], fronts=ndarray[2, 3, 4], own=True)"
 
 
 def test_groups_count_all_views() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ import pytest
 from messages import noted, refuses
 from scenes import FIELDS, arc, make_scene, move, room
 
-from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors
+from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate
 from gsmerge.geometry import multiply_quats, normalize, sh0_to_rgb
 from gsmerge.kernels import elementary
+from gsmerge.scene.input import check_scene
 
 FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none"}
 SHAPE = (3, 36, 48)
@@ -145,6 +147,37 @@ WRONG: list[tuple[str, Change, list[object]]] = [
 def test_a_wrong_convention_is_named(scene: Scene, name: str, change: Change, found: list[object]) -> None:
     with refuses(SceneError, name, *found):
         compact_tensors(**changed(scene, name, change), **FAST)
+
+
+SAME_RULES: list[tuple[str, Change]] = [
+    ("scales", elementary.log), ("opacities", lambda o: 8 * o),
+    ("means", lambda m: m.astype(complex)), ("means", lambda m: m.astype(object)), ("sh0", lambda c: c.astype(str)),
+    ("viewmats", lambda m: m * np.nan), ("viewmats", lambda m: m.transpose(0, 2, 1)), ("Ks", lambda K: -K),
+    ("images", lambda i: i.astype(complex)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "change"), SAME_RULES)
+def test_scenes_in_memory_have_the_rules_of_tensors(scene: Scene, name: str, change: Change) -> None:
+    """For compact and evaluate alike; single values that are not finite are set aside."""
+    given = changed(scene, name, change)
+    parts = {"gaussians": scene.gaussians, "cameras": scene.cameras}
+    owners = {owner: replace(part, **{name: given[name]}) for owner, part in parts.items() if hasattr(part, name)}
+    wrong = replace(scene, **owners or {name: given[name]})
+    calls = (lambda: compact_tensors(**given, **FAST), lambda: compact(wrong, **FAST), lambda: evaluate(wrong, {}))
+    messages = set()
+    for call in calls:
+        with refuses(SceneError, name) as refused:
+            call()
+        messages.add(str(refused.value))
+    assert len(messages) == 1
+
+
+def test_rows_that_are_not_finite_are_no_other_convention(scene: Scene) -> None:
+    columns = {name: np.array(getattr(scene.gaussians, name)) for name in ("scales", "opacities")}
+    columns["scales"][3], columns["opacities"][4:6] = -np.inf, (np.inf, np.nan)
+    check_scene(replace(scene, gaussians=replace(scene.gaussians, **columns)))
+    check_scene(replace(scene, gaussians=scene.gaussians[:0], pixels=None))
 
 
 def test_colors_of_bytes_and_channel_major_harmonics_are_named(scene: Scene) -> None:

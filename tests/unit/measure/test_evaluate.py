@@ -167,7 +167,7 @@ def test_threads_do_not_matter(threads: int, scene: Scene, half: Gaussians, actu
     assert [r.scores for r in again.results] == [r.scores for r in actual.results]
 
 
-def test_bad_arguments(scene: Scene, half: Gaussians) -> None:
+def test_bad_arguments(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     empty = Scene(half, scene.cameras[[]], None, None, ())
     refuse_all(ValueError, [
         (lambda: EvaluateOptions(lpips=("squeeze",)), "lpips", "'squeeze'"),
@@ -179,6 +179,10 @@ def test_bad_arguments(scene: Scene, half: Gaussians) -> None:
         (lambda: EvaluateOptions(photo_side=476.5), "photo_side", 476.5),  # type: ignore[arg-type]
         (lambda: evaluate(scene, {INPUT: half}, None, PLAIN), "results", "'input'"),
         (lambda: evaluate(empty, {}, None, PLAIN), "", "views", "none"),
+        (lambda: EvaluateOptions(lpips="vgg"), "lpips", "'vgg'", "('vgg',)"),  # type: ignore[arg-type]
+        (lambda: actual.results[1].mean("input"), "split", "context", "target", "'input'"),
+        (lambda: actual.results[1].mean_covered("x"), "split", "'x'"),
+        (lambda: actual.results[1].mean("target", zoom=3), "zoom", "None", 3),
     ])  # fmt: skip
 
 
@@ -462,3 +466,10 @@ def test_means_leave_out_what_was_not_measured(actual: Evaluation) -> None:
     scores = [s for s in actual.results[1].scores if s.split == "target"]
     assert full.psnr == pytest.approx(np.mean([s.full.psnr for s in scores]))
     assert masked.lpips_vgg is None
+
+
+def test_scores_are_described_in_one_line(scene: Scene, actual: Evaluation) -> None:
+    for value in (actual, *actual.results, evaluate(scene, {}, options=replace(PLAIN, own=False))):
+        assert len(repr(value)) < 120
+        assert "\n" not in repr(value)
+    assert "0 Gaussians" not in repr(actual.results[0])

@@ -237,8 +237,9 @@ def test_wrong_use(room: Scene) -> None:
         with pytest.raises(ValueError, match="at least one batch"):
             call()
     for number in (0, 1, 2):
-        with pytest.raises(ValueError, match=f"remove {number}: expected a batch"):
+        with pytest.raises(ValueError, match=f"remove {number}: expected a batch") as refused:
             compactor.remove(number)
+        assert ("Compactor.batches" in str(refused.value)) == (number != 1)
     with pytest.raises(ValueError, match="recipe"):
         compactor.decode(k=1)
     with pytest.raises(ValueError, match=r"\.gsm"):
