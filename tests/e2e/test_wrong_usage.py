@@ -55,6 +55,7 @@ USAGE = {
     "compact room --budget 0.02": "budget*'0.02'*\"2%\"",
     "compact room --ratio 0.1": "*--ratio*--budget*--k",
     "compact room out.ply": "out.ply*-o",
+    "room room": "room*twice*-o",
     "compress room": "*'compress'*'compact'",
     "batch room -o out --set fit=none --quality 30": "quality*'30'",
     "batch room -o out --name {{stem:>999999999}}.ply": "--name*{{stem}}*'{{stem:>999999999}}.ply'",
@@ -120,6 +121,7 @@ USAGE = {
     "lab train -o out": "*'--data'",
 }
 PLACES = {
+    "compact room alone.ply -o a.ply": "alone.ply*to join*no cameras*by itself",
     "compact room --set require_checkpoint=true --set checkpoint=gone": "gone*checkpoint",
     "batch gone -o out": "gone*no such",
     "batch room/transforms.json -o out": "transforms.json*list*JSON",
@@ -147,6 +149,7 @@ NEED_THE_SCENE = {  # to be known as wrong: refused by the plan, all others befo
     "compact room --budget 5B",
     "compact room --set method=blocks --hint order=none",
     "compact room --set require_checkpoint=true --set checkpoint=gone",
+    "compact room alone.ply -o a.ply",
 }
 
 
