@@ -18,6 +18,8 @@ from gsmerge.types import StrPath
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of unread formats
 FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content == FILM)
+# Ends of the videos that gsmerge writes, which tell them from films of a capture: a box or element that players skip
+CLIP_ENDS = {".mp4": b"\0\0\0\x0ffreegsmerge", ".webm": b"\xec\x87gsmerge"}
 _CUT = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
 _MAX_PARTS = 16  # parts at the end of a path that names are compared with: the file's name and folders above it
 _NAME_FOLDER = "name the folder of the photos with --images, or of held-out views with --target-images"
@@ -162,7 +164,16 @@ def _find_unread(files: Sequence[Path]) -> tuple[str, str] | None:
     if num_pictures := sum(counts[ending] for ending in OTHER_SUFFIXES):
         endings = " and ".join(sorted(ending for ending in counts if ending in OTHER_SUFFIXES))
         return f"{num_pictures} {endings}", "convert them to .jpg or .png, and keep their names"
-    return (FILM, _CUT) if any(counts[ending] for ending in FILMS) else None
+    return (FILM, _CUT) if any(file.suffix.lower() in FILMS and not is_clip(file) for file in files) else None
+
+
+def is_clip(film: Path) -> bool:
+    """Return whether gsmerge wrote a film, by the end of the file."""
+    end = CLIP_ENDS.get(film.suffix.lower(), b"")
+    with suppress(OSError), film.open("rb") as file:
+        file.seek(-len(end), os.SEEK_END)
+        return bool(end) and file.read() == end
+    return False
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

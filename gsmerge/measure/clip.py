@@ -19,6 +19,7 @@ from PIL import Image
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_output
+from gsmerge.io.image_names import CLIP_ENDS
 from gsmerge.kernels.elementary import sin
 from gsmerge.measure.preview import BLUE_FIRST, FACE, Picture, shorten_text
 from gsmerge.settings.pictures import GIF
@@ -196,6 +197,8 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
             with _silent_stderr():
                 writer.release()
         _check_frames(path, temporary, len(written))
+        with temporary.open("ab") as file:
+            file.write(CLIP_ENDS[path.suffix.lower()])
     return encoding
 
 

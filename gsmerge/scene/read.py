@@ -45,7 +45,7 @@ from gsmerge.scene.exporters import (
     find_exporter,
     make_hints,
 )
-from gsmerge.scene.files import IMAGE_PLACES, SceneFiles, find_scene_files
+from gsmerge.scene.files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
 from gsmerge.scene.masks import NO_MASKS, Masks, check_masks
 from gsmerge.scene.photos import (
     SEEN_PLACE,
@@ -342,7 +342,7 @@ def _align(
         inside = photos_inside(files, camera_file) if photos else ()
         load = _combine(ply, files, camera_file, ScenePhotos(inside), hints)
         lacks_photos = photos and "images" not in files.named and load.scene.images is None
-        is_result = RESULT_COMMENT in ply.info.comments  # films beside it are clips of it
+        is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside it are clips of it
         unread = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
         return replace(load, notes=(*load.notes, *unread))
     load = _assign_of_one_shape(ply, files, camera_file, proposal, hints)

@@ -15,6 +15,7 @@ from messages import refuses
 from PIL import Image
 
 from gsmerge.errors import SceneError
+from gsmerge.io.image_names import is_clip
 from gsmerge.measure import clip
 from gsmerge.measure.preview import Picture
 
@@ -113,6 +114,7 @@ def test_a_video_is_what_was_drawn(name: str, tmp_path: Path, capfd: pytest.Capt
         assert np.abs(drawn.astype(float) - picture).mean() < 12
     assert cv2.VideoCapture(str(tmp_path / name)).get(cv2.CAP_PROP_FPS) == 24
     assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert is_clip(tmp_path / name)
     assert capfd.readouterr() == ("", "")
 
 
