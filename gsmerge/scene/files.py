@@ -87,6 +87,7 @@ class SceneFiles:
     parts: tuple[Path, ...] = ()  # all files of a scene in several files, ``ply`` first; empty for a single file
     num_copies: int = 0  # number of other files in the folder with the same bytes
     named: frozenset[str] = frozenset()  # names of the fields that the caller gave, which are not searched
+    photo_option: str = "--images"  # names the folder of ``images``
     # Photos and cameras in the folder above or in its folders, if the scene has none, by option; never read
     above: tuple[tuple[str, Path], ...] = ()
 

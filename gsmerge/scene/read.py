@@ -374,12 +374,14 @@ def _assign_of_one_shape(
     """Combine as :func:`_assign`; if that fails, leave out views whose photos differ in shape from most photos."""
     try:
         return _assign(ply, files, camera_file, proposal, hints)
-    except SceneError:
-        fewer = select_one_shape(camera_file, proposal)
+    except SceneError as error:
+        fewer, cause = select_one_shape(camera_file, proposal), SceneError(error.path, error.problem, error.remedy)
         if fewer is None:
             raise
     cameras, photos, note = fewer
-    return _assign(ply, files, cameras, photos, hints).with_left_out([note])
+    with suppress(SceneError):
+        return _assign(ply, files, cameras, photos, hints).with_left_out([note])
+    raise cause
 
 
 def _assign(
@@ -407,10 +409,8 @@ def _assign(
     proposal = proposal.without_views(guessed)
     chosen = assign_to_views(base.scene, base.views.of_scene, proposal, read=is_read, guessed=guessed, fit=fit)
     if not any(chosen):
-        if cause is not None:
-            raise cause
-        if "images" in files.named:
-            raise SceneError(proposal.folder, *refuse_photos(proposal, camera_file))
+        if (refusal := refuse_photos(files, proposal, camera_file, cause)) is not None:
+            raise refusal
         bare = base if load is None else _combine(ply, files, camera_file, ScenePhotos(), hints)
         return bare.with_left_out([describe_unused(proposal, camera_file)])
     described, left_out = describe_assignment(proposal, chosen, camera_file)
