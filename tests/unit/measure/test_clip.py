@@ -226,3 +226,16 @@ def test_captions_stay_in_their_scene_s_part() -> None:
         assert (frame[: left.top] == 128).all()
     assert tall[480] == pytest.approx(tall[1920], abs=0.03)  # as large a part of a small frame
     assert tall[256] > tall[480]  # a line more, for there is less room
+
+
+@pytest.mark.parametrize(("width", "last"), [(640, 3), (256, 4), (150, 1)])
+def test_captions_have_whole_words(width: int, last: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three scenes side by side: numbers are never cut, and a name has its beginning and its end."""
+    drawn = list[str]()
+    monkeypatch.setattr(clip.cv2, "putText", lambda box, text, *_: drawn.append(text))
+    clip.make_captions([("fox_of_the_best.ply", "1,187,654 Gaussians", "80.4 MB")] * 3, width, 480)
+    name, *others = drawn[: len(drawn) // 3]
+    assert name.startswith("f")
+    assert name.endswith("y")
+    assert len(others) == last - 1
+    assert {word for text in others for word in text.split()} <= {"1,187,654", "Gaussians", "80.4", "MB"}
