@@ -11,6 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
+from threading import Thread
 
 import cv2
 import numpy as np
@@ -201,9 +202,14 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
                     if written:
                         written[-1].result()
                     written.append(encoder.submit(encode, frame))
-        finally:
-            with _silent_stderr():
-                writer.release()
+        except BaseException:
+            ending = Thread(target=writer.release, daemon=True)  # takes seconds, for a file that is removed
+            ending.start()
+            if os.name == "nt":  # where an open file cannot be removed
+                ending.join()
+            raise
+        with _silent_stderr():
+            writer.release()
         _check_frames(path, temporary, len(written))
         with temporary.open("ab") as file:
             file.write(CLIP_ENDS[path.suffix.lower()])

@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Event
 
 import cv2
 import numpy as np
@@ -226,6 +227,29 @@ def test_captions_stay_in_their_scene_s_part() -> None:
         assert (frame[: left.top] == 128).all()
     assert tall[480] == pytest.approx(tall[1920], abs=0.03)  # as large a part of a small frame
     assert tall[256] > tall[480]  # a line more, for there is less room
+
+
+@pytest.mark.skipif(os.name == "nt", reason="an open file cannot be removed there")
+def test_an_interruption_does_not_wait_for_the_encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which has frames to encode yet, for a file that is removed."""
+    may_end, waited = Event(), list[bool]()
+
+    class Writer:
+        def write(self, _: Picture) -> None:
+            pass
+
+        def release(self) -> None:
+            waited.append(may_end.wait(20))
+
+    def interrupted() -> Iterator[Picture]:
+        yield from frames(3)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(clip, "_open_writer", lambda *_: (Writer(), "VP9"))
+    with pytest.raises(KeyboardInterrupt):
+        clip.write_clip(tmp_path / "a.mp4", interrupted(), 24)
+    assert (waited, list(tmp_path.iterdir())) == ([], [])
+    may_end.set()
 
 
 @pytest.mark.parametrize(("width", "last"), [(640, 3), (256, 4), (150, 1)])
