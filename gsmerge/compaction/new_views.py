@@ -107,7 +107,8 @@ def explain_no_trial(prepared: Prepared, count: int = 0) -> str | None:
     if not can_leave_out(prepared):
         return f"fewer than {LEAST_VIEWS} views have photos"
     pixels = prepared.scene.pixels_per_view * len(prepared.scene)
-    return f"the result has more than {100 * MOST_SHARE:.0f} % of the Gaussians" if count > MOST_SHARE * pixels else None
+    share = f"{100 * MOST_SHARE:.0f} % of the Gaussians"
+    return f"the result has more than {share}" if count > MOST_SHARE * pixels else None
 
 
 def note_no_trial(reason: str | None) -> None:

@@ -137,7 +137,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def check_photo_folder(path: Path) -> None:
-    """Raise SceneError if a path is a file that holds no photos, or a folder without a photo in a format that is read."""
+    """Raise SceneError if a path is a file that holds no photos, or a folder without a photo of a known format."""
     ending = path.suffix.lower()
     if path.is_file() and ending not in HOLD_PHOTOS:
         found, remedy = (FILM, _CUT) if ending in FILMS else ("a file", "name the folder of the photos")

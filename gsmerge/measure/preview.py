@@ -70,7 +70,7 @@ def label(picture: Picture, text: str) -> Picture:
 def shorten_text(text: str, width: int, scale: float, thickness: int) -> str:
     """Shorten a text that OpenCV would draw wider than ``width`` pixels.
 
-    Its last parts, after commas with spaces, are left out. If its first part alone is too wide, dots replace the middle.
+    Its last parts, after commas with spaces, are left out. If the first part is too wide, dots replace its middle.
     """
 
     def fits(text: str) -> bool:

@@ -529,9 +529,7 @@ def refuse_photos(
     is_of_cameras = cause is not None and cause.path == camera_file.path and "cameras" not in files.named
     if "images" not in files.named or not (cause is None or is_of_cameras):
         return cause
-    return SceneError(
-        proposal.folder, _describe_mismatch(proposal, camera_file), "name their folder with --images"
-    )
+    return SceneError(proposal.folder, _describe_mismatch(proposal, camera_file), "name their folder with --images")
 
 
 def _describe_mismatch(proposal: Proposal, camera_file: CameraFile) -> str:

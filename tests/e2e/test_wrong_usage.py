@@ -130,7 +130,7 @@ PLACES = {
     "inspect other/0.png": "other/0.png*picture*model",
     "compact room --images occupied": "occupied*none*--images",
     "compact room --images other -o a.ply": "other*5 views*48 x 32*none*--images",
-    "evaluate room alone.ply --lpips none --targets occupied/absolute.json": "absolute.json*photos*room/targets*--target-images",
+    "evaluate room --lpips none --targets occupied/absolute.json": "absolute.json*photos*targets*--target-images",
     "compact room --set require_checkpoint=true --set checkpoint=gone": "gone*checkpoint",
     "batch gone -o out": "gone*no such",
     "batch room/transforms.json -o out": "transforms.json*list*JSON",

@@ -74,7 +74,9 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
         scene_size = scene.cameras.width, scene.cameras.height
         sh_degree = scene.gaussians.sh_degree
         if not scene.has_own_pixels:
-            found = count_words(len(scene), "camera", "and Gaussians that are no pixels") if len(scene) else "no cameras"
+            found = "no cameras"
+            if len(scene):
+                found = count_words(len(scene), "camera", "and Gaussians that are no pixels")
             problem = f"expected cameras and one Gaussian for each of their pixels, as scenes to join, found {found}"
             raise SceneError(path, problem, "compact it by itself")
         if scene_size != size:
