@@ -127,7 +127,7 @@ PLACES = {
     "compact room alone.ply -o a.ply": "alone.ply*to join*no cameras*by itself",
     "compact room --images room/transforms.json": "room/transforms.json*folder of photos*file",
     "compact room/transforms.json": "room/transforms.json*cameras*--cameras",
-    "inspect other/0.png": "other/0.png*picture*model",
+    "inspect other/view_000.png": "other/view_000.png*picture*model",
     "compact room --images occupied": "occupied*none*--images",
     "compact room --images other -o a.ply": "other*5 views*48 x 32*none*--images",
     "evaluate room --lpips none --targets occupied/absolute.json": "absolute.json*photos*targets*--target-images",
@@ -171,7 +171,7 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     write_without_grid(small_scene / "scene.ply", folder / "alone.ply")
     (folder / "other").mkdir()
     for name in "012":
-        Image.new("RGB", (20, 30)).save(folder / f"other/{name}.png")
+        Image.new("RGB", (20, 30)).save(folder / f"other/view_00{name}.png")
     targets = json.loads((folder / "room/targets/transforms.json").read_text())
     for frame in targets["frames"]:
         frame["file_path"] = str(folder / "room/targets" / frame["file_path"])
