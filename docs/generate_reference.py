@@ -27,8 +27,8 @@ KINDS = {int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH"}
 COMMANDS_HEAD = """# Commands
 
 `gsmerge COMMAND --help` prints the same; what is in brackets is the default. `gsmerge SCENE` takes the options of
-`compact`, and opens the page of `view`. Where a command has no `--threads` or `--seed`, `GSMERGE_THREADS` and
-`GSMERGE_SEED` of the environment are read. [Exit codes](exit-codes.md)."""
+`compact`, and opens the page of `view`. If no `--threads` or `--seed` is given, `GSMERGE_THREADS` and
+`GSMERGE_SEED` of the environment are read, the seed by commands that choose at random. [Exit codes](exit-codes.md)."""
 SETTINGS_HEAD = """# Settings
 
 `compact`, `batch`, `extend` and `lab stress` take them as `--set NAME=VALUE`, such as `--set poses=fixed`; in Python

@@ -107,7 +107,7 @@ def refuse_without_torch() -> Iterator[None]:
         raise
 
 
-OUT_OF_MEMORY = "out of memory; use fewer --threads or --jobs, or a smaller scene"
+OUT_OF_MEMORY = "out of memory; use a smaller scene, or fewer threads or jobs"  # not all commands have these as options
 _MEMORY_ERRORS = ("failed to map segment", "annot allocate memory", "can't allocate memory", "can't start new thread",
               "Insufficient memory")  # the last one comes from OpenCV  # fmt: skip
 

@@ -200,8 +200,8 @@ def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | N
     fit = _fit_renders(prepared, options, fit) if pairs else fit
     if keeps and has_few_rows(size):
         few = f"the scene has only {size.num_gaussians:,} Gaussians, fewer than its photos need"
-        share = f"superpixels={segment.superpixels} is taken of the photos' pixels instead of the Gaussians"
-        note(f"{few}, so {share}; the result has at most half as many superpixels as Gaussians")
+        share = f"so superpixels={segment.superpixels} is a share of the photos' pixels, and at most half the Gaussians"
+        note(f"{few}, {share}; a result with more Gaussians may show the photos better: --budget NUMBER")
     budget = options.budget
     searches = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
     shares_tree = cuts_views(options, size) and not pairs and (searches or limits.count is not None)

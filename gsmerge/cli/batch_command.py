@@ -242,8 +242,9 @@ class Totals:
             (FAILED, self.failed),
         )
         for status, reasons in kinds:
-            lines += [f"{status}: {scene}: {reason}" for scene, reason in reasons[:MAX_LISTED]]
-            lines += [f"... and {len(reasons) - MAX_LISTED:,} more {status}"] if len(reasons) > MAX_LISTED else []
+            grouped = _list_reasons(reasons)
+            lines += [f"{status}: {line}" for line in grouped[:MAX_LISTED]]
+            lines += [f"... and {len(grouped) - MAX_LISTED:,} more {status}"] if len(grouped) > MAX_LISTED else []
         statuses = [status for status in (DONE, SKIPPED, FAILED) if self.counts[status] or status == DONE]
         counts = [f"{self.counts[status]:,} {status}" for status in statuses]
         num_left = self.total - self.counts.total()
@@ -254,6 +255,18 @@ class Totals:
         line += f"; {self.unmet:,} missed the target" if self.unmet else ""
         line += f"; {len(self.worse):,} worse than the input" if self.worse else ""
         return [*lines, line]
+
+
+def _list_reasons(reasons: Sequence[tuple[str, str]]) -> list[str]:
+    """Describe scenes with their reasons: each reason once, and the scene before it unless the reason begins so."""
+    scenes: dict[str, list[str]] = {}
+    for scene, reason in reasons:
+        scenes.setdefault(reason, []).append(scene)
+    lines = []
+    for reason, (first, *more) in scenes.items():
+        others = f" and {count_words(len(more), 'other')}" if more else ""
+        lines.append(reason if reason.startswith(first) else f"{first}{others}: {reason}")
+    return lines
 
 
 def _describe_lack(num_views: int) -> str:

@@ -68,6 +68,8 @@ def compact(args: opt.Args) -> None:
 def look(args: opt.Args) -> None:
     """Compact a scene, and open a page that compares it with the result: ``gsmerge SCENE``."""
     scene, features = args.scenes[0], _features_in(args.scenes)
+    if not features:
+        _check_scenes(args)  # before the output has a name, so that a remedy names -o
     default = default_output(scene if features else args.files(*args.scenes).base)
     writing: FileOptions = args.make(CompactOptions, FileOptions, Engine)[1]
     args.output = output_file(args.output or default, default.name, site=writing.site)
@@ -229,17 +231,22 @@ def _features_in(scenes: Sequence[Path]) -> Path | None:
 
 
 def _check_scenes(args: opt.Args) -> None:
-    """Raise an error for several scenes with one ``--cameras``, a missing scene, or a scene given twice."""
+    """Raise UsageError for several scenes with one ``--cameras``, a missing or a repeated scene, or a result."""
     if len(args.scenes) == 1:
         return
     if args.cameras not in (None, NONE):
         problem = "--cameras: expected one scene with it, got several"
         raise UsageError(f"{problem}; the cameras of several scenes are read from beside or inside them")
+    from gsmerge.io.formats.ply import header_content
+
+    remedy = "" if args.output else "; name the output with -o"
     for i, scene in enumerate(args.scenes):
         if not os.path.lexists(scene):
-            raise UsageError(f"{scene}: no such scene; name the output with -o")
+            raise UsageError(f"{scene}: no such scene{remedy}")
         if any(os.path.realpath(scene) == os.path.realpath(other) for other in args.scenes[:i]):
-            raise UsageError(f"{scene}: expected each scene once, got it twice; name the output with -o")
+            raise UsageError(f"{scene}: expected each scene once, got it twice{remedy}")
+        if scene.is_file() and header_content(scene) == "result":
+            raise UsageError(f"{scene}: expected scenes to join, found a result of gsmerge{remedy}")
 
 
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:

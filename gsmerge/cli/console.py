@@ -314,7 +314,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     if console is None:
 
         def print_run(name: str, status: str, done: int, failure: str, num_failed: int, _: float) -> None:
-            text = _run_text(name, status, failure, num_failed)
+            text = status if failure.startswith(name) else _run_text(name, status, failure, num_failed)
             say(f"{done}/{total} {text}{f': {failure}' if failure else ''}", quiet=quiet)
 
         yield print_run
@@ -342,7 +342,8 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
 
 def _run_text(name: str, status: str, failure: str, num_failed: int) -> str:
     """Describe the end of one run, with the number of failures so far."""
-    return f"{name} {status}{f', {num_failed} failed' if num_failed and not failure else ''}"
+    ending = {"skipped": "skipped, since it was done before"}.get(status, status)
+    return f"{name} {ending}{f', {num_failed} failed' if num_failed and not failure else ''}"
 
 
 def duration(seconds: float) -> str:

@@ -68,6 +68,9 @@ class _Words:
         names = {name for param in params for name in param.opts}
         for param in params:
             convert_plain_values(param)
+        first = words[0] if words and hasattr(self, "commands") else ""
+        if re.match("-[^-]{2}", first) and _owner({first[1:].partition("=")[0].replace("-", "_")}, self):
+            raise UsageError(f"{first}: expected two dashes, -{first}, after the name of a command or scene")
         for word in words[: words.index("--") if "--" in words else None]:
             if re.match("-[^-]", word) and f"-{word.partition('=')[0]}" in names:
                 raise UsageError(f"{word}: expected two dashes, -{word}")

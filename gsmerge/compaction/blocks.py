@@ -13,6 +13,7 @@ from gsmerge.compaction.block_report import BlockScores, join_reports
 from gsmerge.compaction.block_start import BlockStart, start_block
 from gsmerge.compaction.file_size import drop_to_bytes, measure_rest
 from gsmerge.compaction.forecast import AFTER, BEFORE, fit_cost
+from gsmerge.compaction.new_views import note_no_trial
 from gsmerge.compaction.partition import (
     Block,
     Covisibility,
@@ -76,6 +77,8 @@ def compact_in_blocks(
     count, limit = len(blocks), choices.limits.count
     if scene.images is not None:
         note(f"compacted in {count} blocks of views: photos keep their exposures, and new views are not estimated")
+    elif options.new_views:
+        note_no_trial("the scene is compacted in blocks")
     with stage("partition"):
         factors = count_factors(blocks, covisibility).tolist()
         frame, options = scene_frame(scene), with_choices(options, choices)

@@ -28,7 +28,7 @@ from gsmerge.io.formats.write import output_notes
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress, record_part
 from gsmerge.scene.exporters import AUTO, ReadHints
-from gsmerge.scene.files import SceneFiles, scene_title
+from gsmerge.scene.files import SceneFiles, result_cameras, scene_title
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
@@ -178,7 +178,8 @@ def check_cameras(scene: Scene, out: Path) -> None:
 def _compact_notes(loaded: Loaded) -> list[str]:
     """Return notes on columns that results lack, and on a scene that is a result already.
 
-    A result is recognised by the header of its file, or by its small number of Gaussians.
+    A result is recognised by the header of its file, or by its small number of Gaussians. Formats without such a header
+    are those of gsmerge if they have the cameras that it writes beside results.
     """
     scene, comments, notes = loaded.scene, loaded.info.comments, list[str]()
     named = " ".join(note for note in loaded.info.adapted if note.startswith(UNUSED))
@@ -186,7 +187,8 @@ def _compact_notes(loaded: Loaded) -> list[str]:
     if lost:
         notes.append(f"merged Gaussians do not have the columns {list_names(lost)}; gsmerge convert copies them")
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
-    few = is_from_gsmerge(comments) and scene.num_gaussians <= pixels / 2
+    is_own = is_from_gsmerge(comments) or result_cameras(loaded.files.ply) is not None
+    few = is_own and scene.num_gaussians <= pixels / 2
     if few or RESULT_COMMENT in comments:
         count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
         remedy = "start from the original for more detail"

@@ -18,9 +18,12 @@ from gsmerge.types import StrPath
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of unread formats
 FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content == FILM)
+# Ends of the videos that gsmerge writes, which tell them from films of a capture: a box or element that players skip
+CLIP_ENDS = {".mp4": b"\0\0\0\x0ffreegsmerge", ".webm": b"\xec\x87gsmerge"}
 _CUT = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
+HOLD_PHOTOS = (".npz", ".torch", ".gsm")  # endings of files that may have photos inside
 _MAX_PARTS = 16  # parts at the end of a path that names are compared with: the file's name and folders above it
-_NAME_FOLDER = "name the folder of the photos with --images, or of held-out views with --target-images"
+_NAME_FOLDER = "name the folder of the photos with {option}"
 _HIDDEN = ".@"  # first characters of hidden folders, such as .thumb and @eaDir
 ImageSource = StrPath | Sequence[StrPath]
 PixelCount = Callable[[Path], int]  # counts the pixels of an image file
@@ -134,14 +137,14 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def check_photo_folder(path: Path) -> None:
-    """Raise SceneError if a path is a film or a picture, or a folder without a photo in a format that is read."""
-    if path.suffix.lower() in FILMS and path.is_file():
-        raise SceneError(path, "expected a folder of photos, found a film", _CUT)
-    if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES and path.is_file():
-        raise SceneError(path, "expected a folder of photos, found a picture", "name its folder")
+    """Raise SceneError if a path is a file that holds no photos, or a folder without a photo of a known format."""
+    ending = path.suffix.lower()
+    if path.is_file() and ending not in HOLD_PHOTOS:
+        found, remedy = (FILM, _CUT) if ending in FILMS else ("a file", "name the folder of the photos")
+        raise SceneError(path, f"expected a folder of photos, found {found}", remedy)
     if not path.is_dir() or list_images(path):
         return
-    found, remedy = _find_unread(walk_files(path)) or ("none", _NAME_FOLDER)
+    found, remedy = _find_unread(walk_files(path)) or ("none", _NAME_FOLDER.format(option="--images"))
     raise SceneError(path, f"expected photos ({', '.join(sorted(IMAGE_SUFFIXES))}), found {found}", remedy)
 
 
@@ -162,7 +165,16 @@ def _find_unread(files: Sequence[Path]) -> tuple[str, str] | None:
     if num_pictures := sum(counts[ending] for ending in OTHER_SUFFIXES):
         endings = " and ".join(sorted(ending for ending in counts if ending in OTHER_SUFFIXES))
         return f"{num_pictures} {endings}", "convert them to .jpg or .png, and keep their names"
-    return (FILM, _CUT) if any(counts[ending] for ending in FILMS) else None
+    return (FILM, _CUT) if any(file.suffix.lower() in FILMS and not is_clip(file) for file in files) else None
+
+
+def is_clip(film: Path) -> bool:
+    """Return whether gsmerge wrote a film, by the end of the file."""
+    end = CLIP_ENDS.get(film.suffix.lower(), b"")
+    with suppress(OSError), film.open("rb") as file:
+        file.seek(-len(end), os.SEEK_END)
+        return bool(end) and file.read() == end
+    return False
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -176,16 +188,17 @@ def natural_order(paths: Iterable[PathT]) -> list[PathT]:
     return sorted(sorted(paths), key=lambda path: natural_key(os.fspath(path).replace(os.sep, "/")))
 
 
-def find_image(folder: Path, name: str, remedy: str = _NAME_FOLDER) -> Path | None:
-    """Find the image that a camera file in the folder names, with or without extension; None if there is none.
+def find_image(folder: Path, name: str, cameras: Path, *, option: str = "--images", remedy: str = "") -> Path | None:
+    """Find the image that a file of ``cameras`` names, with or without extension; None if there is none.
 
-    SceneError with the ``remedy`` for an image outside the folder, since a camera file from elsewhere could name any
-    picture of this machine. Links inside the folder are followed.
+    SceneError for an image outside the folder, since a camera file from elsewhere could name any picture of this
+    machine; ``remedy``: by default, to name the folder with the ``option``. Links inside the folder are followed.
     """
     path = os.path.normpath(os.path.join(folder, name))
     candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]
     image = next((Path(candidate) for candidate in candidates if os.path.isfile(candidate)), None)
     full_paths = (Path.absolute, Path.resolve)
     if image is not None and not any(full(image).is_relative_to(full(folder)) for full in full_paths):
-        raise SceneError(folder, f"expected cameras that name photos in this folder, found the name {image}", remedy)
+        problem = f"expected names of photos in its folder, found {image}"
+        raise SceneError(cameras, problem, remedy or _NAME_FOLDER.format(option=option))
     return image

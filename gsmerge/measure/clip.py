@@ -11,6 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
+from threading import Thread
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from PIL import Image
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_output
+from gsmerge.io.image_names import CLIP_ENDS
 from gsmerge.kernels.elementary import sin
 from gsmerge.measure.preview import BLUE_FIRST, FACE, Picture, shorten_text
 from gsmerge.settings.pictures import GIF
@@ -70,7 +72,8 @@ class Caption:
 def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int) -> list[Caption]:
     """Place the captions of scenes side by side at the bottom of a frame, from left to right.
 
-    ``texts``: name, count and size of each scene; count and size share a line if there is room.
+    ``texts``: name, count and size of each scene. Count and size share a line if there is room, and otherwise have a
+    line each, or a line for each word. A name may be shortened; other lines that do not fit are left out.
     """
     scale, thickness = max(0.45, height / 900), max(1, round(height / 600))
     line_height = round(LINE * scale)
@@ -79,12 +82,19 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
     def text_width(text: str) -> int:
         return int(cv2.getTextSize(text, FACE, scale, thickness)[0][0])
 
+    def widest(rows: Sequence[Sequence[str]]) -> int:
+        return max(text_width(text) for row in rows for text in row[1:])
+
     rows: list[tuple[str, ...]] = [(name, f"{count}, {size}") for name, count, size in texts]
-    rows = rows if max(text_width(row[1]) for row in rows) <= max_width else list(texts)
-    scale *= min(1.0, max(MIN_SHRINK, 0.95 * max_width / max(text_width(row[1]) for row in rows)))
+    if widest(rows) > max_width:
+        rows = list(texts)
+    if MIN_SHRINK * widest(rows) > 0.95 * max_width:
+        rows = [(name, *count.split(), size) for name, count, size in texts]
+    scale *= min(1.0, max(MIN_SHRINK, 0.95 * max_width / widest(rows)))
     captions = []
-    for i, row in enumerate(rows):
-        lines = [shorten_text(text, max_width, scale, thickness) for text in row]
+    for i, (name, *others) in enumerate(rows):
+        lines = [shorten_text(name, max_width, scale, thickness)]
+        lines += [text for text in others if text_width(text) <= max_width]
         box = np.zeros((line_height * len(lines) + margin, max(map(text_width, lines)) + 2 * margin), np.uint8)
         for number, text in enumerate(lines, 1):
             start = margin, number * line_height - margin // 4
@@ -192,10 +202,17 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
                     if written:
                         written[-1].result()
                     written.append(encoder.submit(encode, frame))
-        finally:
-            with _silent_stderr():
-                writer.release()
+        except BaseException:
+            ending = Thread(target=writer.release, daemon=True)  # takes seconds, for a file that is removed
+            ending.start()
+            if os.name == "nt":  # where an open file cannot be removed
+                ending.join()
+            raise
+        with _silent_stderr():
+            writer.release()
         _check_frames(path, temporary, len(written))
+        with temporary.open("ab") as file:
+            file.write(CLIP_ENDS[path.suffix.lower()])
     return encoding
 
 

@@ -68,11 +68,19 @@ def label(picture: Picture, text: str) -> Picture:
 
 
 def shorten_text(text: str, width: int, scale: float, thickness: int) -> str:
-    """Cut the end of a text that OpenCV would draw wider than ``width`` pixels."""
+    """Shorten a text that OpenCV would draw wider than ``width`` pixels.
+
+    Its last parts, after commas with spaces, are left out. If the first part is too wide, dots replace its middle.
+    """
+
+    def fits(text: str) -> bool:
+        return bool(cv2.getTextSize(text, FACE, scale, thickness)[0][0] <= width)
+
     text = text.encode("utf-8", "replace").decode()  # lone surrogates would crash OpenCV
-    while len(text) > 1 and cv2.getTextSize(text, FACE, scale, thickness)[0][0] > width:
-        text = text[:-1]
-    return text
+    while ", " in text and not fits(text):
+        text = text.rpartition(", ")[0]
+    cut = (f"{text[: kept - kept // 2]}...{text[len(text) - kept // 2 :]}" for kept in range(len(text) - 1, 1, -1))
+    return next(filter(fits, (text, *cut)), text[:1])
 
 
 def view_pictures(

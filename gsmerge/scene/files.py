@@ -5,6 +5,7 @@ from __future__ import annotations
 import filecmp
 import os
 import re
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -86,7 +87,9 @@ class SceneFiles:
     parts: tuple[Path, ...] = ()  # all files of a scene in several files, ``ply`` first; empty for a single file
     num_copies: int = 0  # number of other files in the folder with the same bytes
     named: frozenset[str] = frozenset()  # names of the fields that the caller gave, which are not searched
-    above: tuple[Path, ...] = ()  # cameras and photos in the folder above, if the scene has none; never read
+    photo_option: str = "--images"  # names the folder of ``images``
+    # Photos and cameras in the folder above or in its folders, if the scene has none, by option; never read
+    above: tuple[tuple[str, Path], ...] = ()
 
     @property
     def plys(self) -> tuple[Path, ...]:
@@ -132,16 +135,16 @@ class SceneFiles:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes that several files are read as one scene, and on cameras and photos in the folder above."""
+        """Notes that several files are read as one scene, and on cameras and photos outside its folder."""
         notes = []
         if self.num_copies:
             notes.append(f"{self.num_copies + 1} files have the same bytes; {self.ply.name} is read")
         elif self.parts:
             notes.append(f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}")
         if self.above:
-            names = " and ".join(map(str, self.above))
-            remedy = "to read them, name that folder as the scene, or name them with --images and --cameras"
-            notes.append(f"{names} are in the folder above the scene and are not read; {remedy}")
+            kinds = " and ".join({"images": "photos"}.get(option, option) for option, _ in self.above)
+            words = shlex.join(word for option, path in self.above for word in (f"--{option}", str(path)))
+            notes.append(f"{kinds} outside the scene's folder are not read; to read them, pass {words}")
         return tuple(notes)
 
 
@@ -254,18 +257,22 @@ def can_be_listed(folder: Path, option: str) -> bool:
     return True
 
 
-def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[Path, ...]:
-    """Find the photos and cameras that a scene lacks in the folder above the searched folders ``roots``."""
+def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Path], ...]:
+    """Find the photos and cameras that a scene lacks in the folder above the searched folders ``roots``.
+
+    Files in a neighbouring folder with Gaussians of its own belong to those.
+    """
     own = Path(os.path.realpath(files.ply))
     folder = min((r for r in roots if own.is_relative_to(r)), default=roots[0], key=lambda r: len(r.parts))
-    places = list[Path | None]()
+    places = dict[str, Path | None]()
     with suppress(SceneError, OSError):
         if files.images is None and "images" not in files.named:
             pictures = (folder.parent / place for place in IMAGE_PLACES)
-            places.append(next((f for f in pictures if f.is_dir() and f not in roots and list_images(f)), None))
+            places["images"] = next((f for f in pictures if f.is_dir() and f not in roots and list_images(f)), None)
         if files.cameras is None and "cameras" not in files.named:
-            places.append(find_cameras(folder.parent))
-    return tuple(place for place in places if place is not None)
+            places["cameras"] = find_cameras(folder.parent)
+    paths = ((option, path) for option, path in places.items() if path is not None)
+    return tuple(pair for pair in paths if not _plys_in(folder.parent / pair[1].relative_to(folder.parent).parts[0]))
 
 
 def _search_roots(path: Path, ply: Path, within: StrPath | None) -> list[Path]:

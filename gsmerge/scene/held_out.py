@@ -26,6 +26,7 @@ from gsmerge.types import Scene, StrPath, Views
 _MAX_ANGLE = 0.2  # degrees by which a view's two poses may differ after one frame is moved to the other
 _MAX_SHIFT = 0.005  # largest distance between a view's two poses, relative to the extent of all views
 _MIN_SHARED = 3  # views that determine the similarity between two worlds
+_OPTION = "evaluate --target-images"  # gsmerge view has no such option
 _SAME_POSE = 1e-4  # largest distance of equal poses, relative to the scene's distance; and difference of rotations
 
 
@@ -56,12 +57,13 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
         problem = "expected held-out views, found only views that the scene was made from"
         raise SceneError(path, problem, "name a camera file that has other views of the scene")
     held_out = select_views(camera_file, places)
-    photos = stored_photos(SceneFiles(load.files.ply, path, _folder(path, held_out, images)), held_out)
+    files = SceneFiles(load.files.ply, path, _folder(path, held_out, images), photo_option=_OPTION)
+    photos = stored_photos(files, held_out)
     if not len(photos):
         root = path if path.is_dir() else path.parent
-        missing = next((name for name in held_out.names if find_image(root, name) is None), held_out.names[0])
+        missing = next((name for name in held_out.names if find_image(root, name, path) is None), held_out.names[0])
         raise SceneError(
-            path, f"expected photos of its views, found none for {missing}", "name their folder with --target-images"
+            path, f"expected photos of its views, found none for {missing}", f"name their folder with {_OPTION}"
         )
     pinholes, photos, _ = as_pinholes(held_out, photos)
     photos, notes = limit_photo_size(photos, 0, AUTO.max_side, unaligned=False)
@@ -99,7 +101,7 @@ def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | N
     if images is not None:
         if not Path(images).is_dir():
             actual = "a file" if Path(images).exists() else "no such folder"
-            raise SceneError(images, f"expected a folder of photos, found {actual}", "name it with --target-images")
+            raise SceneError(images, f"expected a folder of photos, found {actual}", f"name it with {_OPTION}")
         return Path(images)
     if len(cameras.images):
         return path

@@ -153,7 +153,7 @@ def _find_near_cameras(files: SceneFiles, camera_file: CameraFile) -> tuple[Path
     """
     path, names = Path(camera_file.path), camera_file.names
     folder = path if path.is_dir() and path.name not in _MODEL_FOLDERS else path.parent
-    named = [find_image(folder, name) for name in names]
+    named = [find_image(folder, name, path, option=files.photo_option) for name in names]
     pool = list(dict.fromkeys(path for path in named if path is not None))
     if not pool:
         pool, named = _find_reduced(folder, names)
@@ -258,10 +258,6 @@ def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
         return ()
     if is_frame(files.images):
         return _READ_IMAGES(files.plys)
-    if files.images.suffix.lower() == ".txt" and files.images.is_file():
-        raise SceneError(
-            files.images, "expected a folder of photos, found a text file", "name the folder of the photos"
-        )
     same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
     stored = (camera_file if same_file else read_cameras(files.images, scene=files.ply.stem)).images
     may_lack = same_file and files.images.suffix == CHUNK and not len(stored)
@@ -527,17 +523,29 @@ def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None]) -> 
 
 def describe_unused(proposal: Proposal, camera_file: CameraFile) -> str:
     """Note that none of the photos is used, and why."""
-    problem, _ = refuse_photos(proposal, camera_file)
     verb = "not used" if camera_file.source == ESTIMATED else "left out"
-    return f"the photos in {proposal.folder} are {verb}: {problem}"
+    return f"the photos in {proposal.folder} are {verb}: {_describe_mismatch(proposal, camera_file)}"
 
 
-def refuse_photos(proposal: Proposal, camera_file: CameraFile) -> tuple[str, str]:
-    """Return the problem that no photo shows any view, and a remedy."""
+def refuse_photos(
+    files: SceneFiles, proposal: Proposal, camera_file: CameraFile, cause: SceneError | None
+) -> SceneError | None:
+    """Return the error that no photo shows any view; None if the photos may be left out.
+
+    ``cause``: why photos and cameras do not fit. The files that the caller named are at fault, not those beside them.
+    """
+    is_of_cameras = cause is not None and cause.path == camera_file.path and "cameras" not in files.named
+    if "images" not in files.named or not (cause is None or is_of_cameras):
+        return cause
+    return SceneError(proposal.folder, _describe_mismatch(proposal, camera_file), "name their folder with --images")
+
+
+def _describe_mismatch(proposal: Proposal, camera_file: CameraFile) -> str:
+    """Say that no photo shows any view, and which photos are missing."""
     views = f"the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
     faults = [fault for fault in proposal.faults if fault is not None]
     reasons = f" ({list_some(faults, '; ')})" if faults else ""
-    return f"expected photos of {views}, found none that shows one of them{reasons}", "name their folder with --images"
+    return f"expected photos of {views}, found none that shows one of them{reasons}"
 
 
 def without_photo(scene: Scene, views: Sequence[int]) -> Scene:

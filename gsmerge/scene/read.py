@@ -44,7 +44,7 @@ from gsmerge.scene.exporters import (
     find_exporter,
     make_hints,
 )
-from gsmerge.scene.files import IMAGE_PLACES, SceneFiles, find_scene_files
+from gsmerge.scene.files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
 from gsmerge.scene.masks import NO_MASKS, Masks, check_masks
 from gsmerge.scene.photos import (
     SEEN_PLACE,
@@ -331,7 +331,7 @@ def _align(
         inside = photos_inside(files, camera_file) if photos else ()
         load = _combine(ply, files, camera_file, ScenePhotos(inside), hints)
         lacks_photos = photos and "images" not in files.named and load.scene.images is None
-        is_result = RESULT_COMMENT in ply.info.comments  # films beside it are clips of it
+        is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside it are clips of it
         unread = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
         return replace(load, notes=(*load.notes, *unread))
     load = _assign_of_one_shape(ply, files, camera_file, proposal, hints)
@@ -363,12 +363,14 @@ def _assign_of_one_shape(
     """Combine as :func:`_assign`; if that fails, leave out photos or views whose shape is not that of most photos."""
     try:
         return _assign(ply, files, camera_file, proposal, hints)
-    except SceneError:
-        fewer = select_one_shape(camera_file, proposal)
+    except SceneError as error:
+        fewer, cause = select_one_shape(camera_file, proposal), SceneError(error.path, error.problem, error.remedy)
         if fewer is None:
             raise
     cameras, photos, left_out = fewer
-    return _assign(ply, files, cameras, photos, hints).with_left_out(left_out)
+    with suppress(SceneError):
+        return _assign(ply, files, cameras, photos, hints).with_left_out(left_out)
+    raise cause
 
 
 def _assign(
@@ -396,10 +398,8 @@ def _assign(
     proposal = proposal.without_views(guessed)
     chosen = assign_to_views(base.scene, base.views.of_scene, proposal, read=is_read, guessed=guessed, fit=fit)
     if not any(chosen):
-        if cause is not None:
-            raise cause
-        if "images" in files.named:
-            raise SceneError(proposal.folder, *refuse_photos(proposal, camera_file))
+        if (refusal := refuse_photos(files, proposal, camera_file, cause)) is not None:
+            raise refusal
         bare = base if load is None else _combine(ply, files, camera_file, ScenePhotos(), hints)
         return bare.with_left_out([describe_unused(proposal, camera_file)])
     described, left_out = describe_assignment(proposal, chosen, camera_file)

@@ -127,7 +127,7 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
     totals, report = Totals(1000), REPORT
     for number in range(300):
         totals.add(record("done", f"{number}", f"{number}.ply", report=report))
-        totals.add(record("failed", f"{number}", f"{number}.ply", error="no"))
+        totals.add(record("failed", f"{number}", f"{number}.ply", error=f"no {number}"))
         totals.add(record("skipped", f"{number}", f"{number}.ply"))
     totals.add(record("done", "x", "x.ply", report={**report, "unmet": "too few", "notes": ["not used: t (time)"]}))
     *table, last = totals.lines()
@@ -145,6 +145,13 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
     alone = Totals(1)
     alone.add(record("done", "y", "y.ply", report={**report, "choices": {"fidelity": {"psnr": 32.8}}}))
     assert alone.lines()[1].split()[-4:] == ["the", "input", "32.80", "1.5"]
+
+
+def test_equal_reasons_are_listed_once() -> None:
+    totals = Totals(4)
+    for name, error in (("a", "no"), ("b", "no"), ("c", "c/x.ply: no"), ("d", "no")):
+        totals.add(record("failed", name, f"{name}.ply", error=error))
+    assert totals.lines()[:-1] == ["failed: a and 2 others: no", "failed: c/x.ply: no"]
 
 
 def test_what_a_scene_lacks_is_said(rooms: Path, tmp_path: Path, run: Run) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from bare_files import write_without_grid
+from PIL import Image
 
 from gsmerge.cli import main
 from gsmerge.cli.usage import expand_home
@@ -23,6 +24,8 @@ USAGE = {
     "compact room --set superpixels=0%": "superpixels*'0%'",
     "compact room --set match=magic": "--set match*overlap*'magic'",
     "compact room --magic": "*--magic",
+    "-effort draft room": "-effort*--effort*after the name",
+    "compact room -effort draft": "-effort*--effort",
     "compact room --up y": "*--up*gsmerge convert",
     "inspect room --masks room": "*--masks*gsmerge compact",
     "lab chart room --k 1,2": "*--k*--set k=VALUE*--grid k=A,B",
@@ -55,6 +58,7 @@ USAGE = {
     "compact room --budget 0.02": "budget*'0.02'*\"2%\"",
     "compact room --ratio 0.1": "*--ratio*--budget*--k",
     "compact room out.ply": "out.ply*-o",
+    "room room": "room*twice*-o",
     "compress room": "*'compress'*'compact'",
     "batch room -o out --set fit=none --quality 30": "quality*'30'",
     "batch room -o out --name {{stem:>999999999}}.ply": "--name*{{stem}}*'{{stem:>999999999}}.ply'",
@@ -120,6 +124,13 @@ USAGE = {
     "lab train -o out": "*'--data'",
 }
 PLACES = {
+    "compact room alone.ply -o a.ply": "alone.ply*to join*no cameras*by itself",
+    "compact room --images room/transforms.json": "room/transforms.json*folder of photos*file",
+    "compact room/transforms.json": "room/transforms.json*cameras*--cameras",
+    "inspect other/view_000.png": "other/view_000.png*picture*model",
+    "compact room --images occupied": "occupied*none*--images",
+    "compact room --images other -o a.ply": "other*5 views*48 x 32*none*--images",
+    "evaluate room --lpips none --targets occupied/absolute.json": "absolute.json*photos*targets*--target-images",
     "compact room --set require_checkpoint=true --set checkpoint=gone": "gone*checkpoint",
     "batch gone -o out": "gone*no such",
     "batch room/transforms.json -o out": "transforms.json*list*JSON",
@@ -147,6 +158,8 @@ NEED_THE_SCENE = {  # to be known as wrong: refused by the plan, all others befo
     "compact room --budget 5B",
     "compact room --set method=blocks --hint order=none",
     "compact room --set require_checkpoint=true --set checkpoint=gone",
+    "compact room alone.ply -o a.ply",
+    "compact room --images other -o a.ply",
 }
 
 
@@ -156,9 +169,16 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     folder = tmp_path_factory.mktemp("prepared") / "work"
     shutil.copytree(small_scene, folder / "room")
     write_without_grid(small_scene / "scene.ply", folder / "alone.ply")
+    (folder / "other").mkdir()
+    for name in "012":
+        Image.new("RGB", (20, 30)).save(folder / f"other/view_00{name}.png")
+    targets = json.loads((folder / "room/targets/transforms.json").read_text())
+    for frame in targets["frames"]:
+        frame["file_path"] = str(folder / "room/targets" / frame["file_path"])
     (folder / "run.json").write_text('{"total_seconds": 2}')
     (folder / "occupied").mkdir()
     (folder / "occupied" / "mine.txt").write_text("precious")
+    (folder / "occupied/absolute.json").write_text(json.dumps(targets))
     small = ["--set", "superpixels=60", "--set", "checkpoint=none", "--quiet"]
     paper = ["--set", "superpixels=60", "--set", "recipe=paper", "--quiet"]
     for name, words in (("room", small), ("state", small), ("paper", paper)):

@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 
-from gsmerge.errors import BatchError, GsmergeError, SceneError, TargetError, UsageError
+from gsmerge.errors import OUT_OF_MEMORY, BatchError, GsmergeError, SceneError, TargetError, UsageError
 
 
 @pytest.mark.parametrize(
@@ -19,3 +19,7 @@ def test_errors_can_be_pickled(error: GsmergeError) -> None:
     assert type(copy) is type(error)
     assert str(copy) == str(error)
     assert vars(copy) == vars(error)
+
+
+def test_advice_for_all_commands_names_no_option() -> None:
+    assert "--" not in OUT_OF_MEMORY

@@ -236,6 +236,15 @@ def test_photos_decide_the_count_where_rows_are_fewer_than_pixels(scene: Scene) 
     assert not plan_of(unaligned_scenes.without_order(scene)).keeps_fidelity  # a share is enough of as many as pixels
 
 
+def test_few_rows_are_noted_with_the_option_that_gives_more(scene: Scene) -> None:
+    """As a state has, whose result keeps what it shows, and could show the photos better."""
+    for step, is_few in ((3, True), (1, False)):
+        rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), step))
+        with record_run(None) as record:
+            plan_of(rows)
+        assert noted(record.notes, f"{len(rows.gaussians):,} Gaussians", "--budget") == is_few
+
+
 def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) -> None:
     """Elsewhere a worse result would be called better."""
     rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), 2))

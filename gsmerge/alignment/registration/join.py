@@ -16,6 +16,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.geometry import Similarity, rotmat_to_quat
 from gsmerge.kernels.elementary import arccos
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Pixels, Scene
+from gsmerge.words import count_words
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,11 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
         scene_size = scene.cameras.width, scene.cameras.height
         sh_degree = scene.gaussians.sh_degree
         if not scene.has_own_pixels:
-            problem = "expected one Gaussian per pixel and a camera, to be joined, found none"
-            raise SceneError(path, problem, "compact it by itself; name a result with -o")
+            found = "no cameras"
+            if len(scene):
+                found = count_words(len(scene), "camera", "and Gaussians that are no pixels")
+            problem = f"expected cameras and one Gaussian for each of their pixels, as scenes to join, found {found}"
+            raise SceneError(path, problem, "compact it by itself")
         if scene_size != size:
             problem = f"expected views of {size[0]} x {size[1]} as in {paths[0].name}"
             problem += f", found {scene_size[0]} x {scene_size[1]}"

@@ -59,11 +59,14 @@ def find_other_cameras(folder: Path) -> Path | None:
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _CANDIDATE_ENDINGS)
     files = [path for path in files if path.name not in INTRINSICS and not path.name.endswith(ENDING)]
     files = [path for path in files if path.is_file()][:_MAX_CANDIDATES]
-    files = [path for path in files if _holds_cameras(path)] or [*filter(starts_like_poses, files)][:1]
+    files = [path for path in files if holds_cameras(path)] or [*filter(starts_like_poses, files)][:1]
     return files[0] if len(files) == 1 else None
 
 
-def _holds_cameras(path: Path) -> bool:
+def holds_cameras(path: Path) -> bool:
+    """Return whether a file has an ending of camera files and can be read as one."""
+    if path.suffix not in _CANDIDATE_ENDINGS:
+        return False
     if path.suffix == ".npz":
         return bool(_holds_poses(path))
     try:

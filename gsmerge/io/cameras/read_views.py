@@ -145,7 +145,7 @@ def _with_size(
     if has_size or {"fx", "cx", "cy"} <= values.keys() or keys.get("w") not in layout.optional:
         return values
     w, h = repr(keys["w"]), repr(keys["h"])
-    image = find_image(path.parent, name, f"add {w} and {h} to the camera file")
+    image = find_image(path.parent, name, path, remedy=f"add {w} and {h} to the camera file")
     if image is None:
         raise SceneError(path, f"view {name}: expected {w} and {h}, found neither them nor the image itself")
     return values | dict(zip(("w", "h"), size_of(image), strict=True))

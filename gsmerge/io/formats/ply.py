@@ -31,6 +31,7 @@ from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.types import Gaussians
 
 _PACKED_ROWS = LazyFunction("gsmerge.io.formats.compressed", "packed_rows")
+_HOLDS_CAMERAS = LazyFunction("gsmerge.io.cameras.read", "holds_cameras")
 MAX_DEGREE = 3  # of the harmonics in results; splat-transform 3.7 and gsply refuse a .ply with more
 # Size of the longest comment on new views
 COMMENT_BYTES = len(f"comment {arrays.new_views_comment(arrays.ExpectedScores(-100, -100, -100, -100))}\n")
@@ -220,6 +221,17 @@ def _bytes_by_attribute(row: np.dtype[Any], count: int) -> dict[str, int]:
     return dict(sizes)
 
 
+def no_ply(path: Path) -> SceneError:
+    """Make the error of a file that is no PLY file: a picture by its ending, cameras by its content, or another one."""
+    if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES:
+        remedy = "make Gaussians from photos with a model first, and name its .ply"
+        return SceneError(path, "expected Gaussians, found a picture", remedy)
+    if _HOLDS_CAMERAS(path):
+        return SceneError(path, "expected Gaussians, found cameras", "name the .ply, and this file with --cameras")
+    problem = "expected a PLY file, found a file that does not start with the line 'ply'"
+    return SceneError(path, problem, "name a .ply of Gaussians")
+
+
 def open_ply(path: Path) -> PlyData:
     """Open a PLY file; binary vertices that are not packed are mapped for :func:`open_rows`.
 
@@ -230,11 +242,7 @@ def open_ply(path: Path) -> PlyData:
         with path.open("rb") as file:
             start = file.read(MAX_HEADER_BYTES)
         if start[:4] not in (b"ply\n", b"ply\r"):
-            if path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES:
-                remedy = "make Gaussians from photos with a model first, and name its .ply"
-                raise SceneError(path, "expected Gaussians, found a picture", remedy)
-            problem = "expected a PLY file, found a file that does not start with the line 'ply'"
-            raise SceneError(path, problem, "name a .ply of Gaussians")
+            raise no_ply(path)
         end, text = _check_header(start, budget)
         with _stream(path, end, text=text) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of an empty list, or a number beyond the column's type

@@ -21,7 +21,7 @@ from gsmerge.errors import SceneError
 from gsmerge.facts.views import subset
 from gsmerge.geometry import Similarity, camera_centres
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, make_scene
-from gsmerge.types import Pixels
+from gsmerge.types import NO_CAMERAS, Pixels
 
 VIEWS, WIDTH, HEIGHT = 6, 144, 96
 SCALES = (1.1, 0.8, 1.25, 0.93, 1.0, 0.87)
@@ -128,8 +128,11 @@ def test_opencv_is_left_as_it_was(parts: list[Scene]) -> None:
 
 def test_files_that_cannot_be_joined(parts: list[Scene]) -> None:
     unaligned = replace(parts[1], pixels=None)
-    with refuses(SceneError, "b.ply", "-o"):
+    with refuses(SceneError, "b.ply", "1 camera", "no pixels"):
         join_scenes([parts[0], unaligned], PATHS[:2])
+    bare = replace(unaligned, cameras=NO_CAMERAS, images=None, names=())
+    with refuses(SceneError, "b.ply", "no cameras"):
+        join_scenes([parts[0], bare], PATHS[:2])
     small = replace(parts[1].cameras, width=HEIGHT, height=WIDTH)
     pixels = Pixels.of_grid(np.ones((1, WIDTH, HEIGHT), bool))
     tall = replace(parts[1], cameras=small, images=parts[1].images.reshape(1, WIDTH, HEIGHT, 3), pixels=pixels)

@@ -97,10 +97,14 @@ def test_the_last_failure_stands_below_the_bar_of_a_batch() -> None:
 
 
 def test_without_a_terminal_each_run_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with total_progress(2, quiet=False) as progress:
-        progress("room", "failed", 1, "no photos", 1, 0.5)
-        progress("garden", "done", 2, "", 1, 1.0)
-    assert capsys.readouterr().err == "1/2 room failed: no photos\n2/2 garden done, 1 failed\n"
+    with total_progress(4, quiet=False) as progress:
+        progress("room", "failed", 1, "no photos", 1, 0.25)
+        progress("garden", "done", 2, "", 1, 0.5)
+        progress("hall", "failed", 3, "hall/a.ply: no rows", 2, 0.75)
+        progress("attic", "skipped", 4, "", 2, 1.0)
+    lines = ["1/4 room failed: no photos", "2/4 garden done, 1 failed", "3/4 failed: hall/a.ply: no rows"]
+    lines.append("4/4 attic skipped, since it was done before, 2 failed")
+    assert capsys.readouterr().err.splitlines() == lines
 
 
 def test_runs_as_events_have_their_names_whole(capsys: pytest.CaptureFixture[str]) -> None:

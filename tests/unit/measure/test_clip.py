@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Event
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from messages import refuses
 from PIL import Image
 
 from gsmerge.errors import SceneError
+from gsmerge.io.image_names import is_clip
 from gsmerge.measure import clip
 from gsmerge.measure.preview import Picture
 
@@ -113,6 +115,7 @@ def test_a_video_is_what_was_drawn(name: str, tmp_path: Path, capfd: pytest.Capt
         assert np.abs(drawn.astype(float) - picture).mean() < 12
     assert cv2.VideoCapture(str(tmp_path / name)).get(cv2.CAP_PROP_FPS) == 24
     assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert is_clip(tmp_path / name)
     assert capfd.readouterr() == ("", "")
 
 
@@ -224,3 +227,39 @@ def test_captions_stay_in_their_scene_s_part() -> None:
         assert (frame[: left.top] == 128).all()
     assert tall[480] == pytest.approx(tall[1920], abs=0.03)  # as large a part of a small frame
     assert tall[256] > tall[480]  # a line more, for there is less room
+
+
+@pytest.mark.skipif(os.name == "nt", reason="an open file cannot be removed there")
+def test_an_interruption_does_not_wait_for_the_encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which has frames to encode yet, for a file that is removed."""
+    may_end, waited = Event(), list[bool]()
+
+    class Writer:
+        def write(self, _: Picture) -> None:
+            pass
+
+        def release(self) -> None:
+            waited.append(may_end.wait(20))
+
+    def interrupted() -> Iterator[Picture]:
+        yield from frames(3)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(clip, "_open_writer", lambda *_: (Writer(), "VP9"))
+    with pytest.raises(KeyboardInterrupt):
+        clip.write_clip(tmp_path / "a.mp4", interrupted(), 24)
+    assert (waited, list(tmp_path.iterdir())) == ([], [])
+    may_end.set()
+
+
+@pytest.mark.parametrize(("width", "last"), [(640, 3), (256, 4), (150, 1)])
+def test_captions_have_whole_words(width: int, last: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three scenes side by side: numbers are never cut, and a name has its beginning and its end."""
+    drawn = list[str]()
+    monkeypatch.setattr(clip.cv2, "putText", lambda box, text, *_: drawn.append(text))
+    clip.make_captions([("fox_of_the_best.ply", "1,187,654 Gaussians", "80.4 MB")] * 3, width, 480)
+    name, *others = drawn[: len(drawn) // 3]
+    assert name.startswith("f")
+    assert name.endswith("y")
+    assert len(others) == last - 1
+    assert {word for text in others for word in text.split()} <= {"1,187,654", "Gaussians", "80.4", "MB"}

@@ -77,6 +77,15 @@ def test_small_renders_are_enlarged_by_whole_pixels() -> None:
     assert sheet.shape == (3 * 12 + preview.BAND, 3 * 20, 3)
 
 
+def test_long_labels_lose_their_last_parts_and_then_their_middle() -> None:
+    short, long = (preview.shorten_text("scene.ply: 12,345, 20.1 dB", width, 0.42, 1) for width in (130, 300))
+    assert (short, long) == ("scene.ply: 12,345", "scene.ply: 12,345, 20.1 dB")
+    middle = preview.shorten_text("a_long_name_of_a_scene.ply", 80, 0.42, 1)
+    assert middle.startswith("a_lon")
+    assert middle.endswith(".ply")
+    assert "..." in middle
+
+
 def test_labels_never_widen_a_tile() -> None:
     picture = np.zeros((4, 30, 3), np.uint8)
     assert preview.label(picture, "a label that is far too long for it").shape == (4 + preview.BAND, 30, 3)

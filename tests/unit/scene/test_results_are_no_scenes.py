@@ -9,7 +9,7 @@ import pytest
 from exports import export_rows, save_export
 from messages import noted, refuses
 from plyfile import PlyData
-from tiny_scene import Tiny
+from tiny_scene import Tiny, write_inria
 
 from gsmerge.batch.find import find_scenes
 from gsmerge.cli import main
@@ -105,6 +105,17 @@ def test_a_result_without_cameras_is_noted(tmp_path: Path, tiny: Tiny) -> None:
 
     files = find_scene_files(save_result(tmp_path / "x.ply", tiny))
     assert noted(read_input(files, hints=make_hints({"order": "none"})).notes, "gsmerge", "no Gaussian per pixel")
+
+
+@pytest.mark.parametrize("name", ["x.spz", "x.sog", "x.splat", "x.glb"])
+def test_a_result_in_another_format_is_noted(folder: Path, tiny: Tiny, name: str) -> None:
+    """Its cameras beside it are those that gsmerge writes; a scene with other cameras is no result."""
+    shutil.rmtree(folder / "images")
+    write_gaussians(path := folder / name, tiny.gaussians[::5])
+    files = find_scene_files(path)
+    assert not noted(read_input(files).notes, "gsmerge")
+    write_inria(folder / "x.cameras.json", tiny)
+    assert noted(read_input(find_scene_files(path)).notes, "gsmerge", f"{len(tiny.gaussians[::5])} Gaussians")
 
 
 def test_headers_of_many_files_are_read_up_to_a_bound(

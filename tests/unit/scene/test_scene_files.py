@@ -1,11 +1,12 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
-from messages import refuses
+from messages import noted, refuses
 from tiny_scene import Tiny, write_colmap_binary, write_colmap_text, write_images, write_npz, write_transforms
 
 from gsmerge.errors import SceneError
@@ -144,14 +145,27 @@ def test_files_beside_a_relative_path(tiny_folder: Path, monkeypatch: pytest.Mon
 def test_what_lies_one_folder_above_is_named_and_not_read(tmp_path: Path, tiny: Tiny) -> None:
     (run := tmp_path / "room/run").mkdir(parents=True)
     write_ply(run / "x.ply", tiny.gaussians)
-    write_transforms(tmp_path / "room/transforms.json", tiny)
-    write_images(tmp_path / "room/images", tiny)
+    write_transforms(cameras := tmp_path / "room/transforms.json", tiny)
+    write_images(images := tmp_path / "room/images", tiny)
     for path in (run, run / "x.ply"):
         files = find_scene_files(path)
         assert (files.cameras, files.images) == (None, None)
-        places = f"{tmp_path / 'room/images'} and {tmp_path / 'room/transforms.json'}"
-        assert any(note.startswith(f"{places} are in the folder above") for note in files.notes)
+        options = shlex.join(["--images", f"{images}", "--cameras", f"{cameras}"])
+        words = "are not read; to read them, pass"
+        assert files.notes == (f"photos and cameras outside the scene's folder {words} {options}",)
     assert find_scene_files(tmp_path / "room").notes == find_scene_files(run, cameras="none", images="none").notes == ()
+
+
+def test_files_of_a_neighbouring_folder(tmp_path: Path, tiny: Tiny) -> None:
+    """Cameras alone are offered; those beside other Gaussians belong to them."""
+    (run := tmp_path / "run").mkdir()
+    write_ply(run / "x.ply", tiny.gaussians)
+    cameras = tmp_path / "opensfm/reconstruction.json"
+    make(tmp_path, "opensfm/reconstruction.json")
+    assert noted(find_scene_files(run).notes, "cameras", "--cameras", cameras)
+    assert not noted(find_scene_files(run).notes, "--images")
+    write_ply(cameras.with_name("scene.ply"), tiny.gaussians)  # they belong to that scene
+    assert find_scene_files(run).notes == ()
 
 
 def test_a_folder_without_the_right_to_read_is_named(

@@ -15,6 +15,8 @@ from sweeps import sweep
 from tiny_scene import Tiny, rotation, write_colmap_binary, write_images, write_inria, write_npz, write_transforms
 
 from gsmerge.errors import SceneError
+from gsmerge.io import write_gaussians
+from gsmerge.io.image_names import CLIP_ENDS
 from gsmerge.scene.read import Loaded, load_scene, read_scene
 
 SMOOTH = smooth_scene(56, 40)
@@ -198,3 +200,15 @@ def test_a_scene_without_photos_says_what_beside_it_is_not_read(tiny_folder: Pat
     path.write_bytes(b"\0" * 20)
     assert noted(load_scene(tiny_folder).notes, words, "cannot be read")
     assert not noted(load_scene(tiny_folder, images="none").notes, words)
+
+
+def test_a_clip_is_no_film_of_the_capture(tiny_folder: Path, tiny: Tiny) -> None:
+    """It is known by its end; beside a result, any film is a clip."""
+    shutil.rmtree(tiny_folder / "images")
+    (tiny_folder / "a.mp4").write_bytes(b"\0" * 20 + CLIP_ENDS[".mp4"])
+    assert not noted(load_scene(tiny_folder).notes, "film")
+    (tiny_folder / "b.webm").write_bytes(b"\0" * 20)
+    assert noted(load_scene(tiny_folder).notes, "film")
+    write_gaussians(small := tiny_folder / "small.spz", tiny.gaussians)
+    write_inria(tiny_folder / "small.cameras.json", tiny)
+    assert not noted(load_scene(small).notes, "film")
