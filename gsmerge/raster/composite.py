@@ -22,14 +22,11 @@ NOTEBOOK_VIEWS = 4  # number of a rendering's views that a notebook shows
 
 
 def background_color(background: ArrayLike) -> Array:
-    """Expand a background of one or three numbers from 0 to 1 to ``[3]``; ValueError for others."""
+    """Expand a background of one or three numbers to ``[3]``; ValueError for others."""
     try:
-        color = np.broadcast_to(np.asarray(background, np.float32), (3,)).copy()
+        return np.broadcast_to(np.asarray(background, np.float32), (3,)).copy()
     except (TypeError, ValueError):
         raise ValueError(f"expected a background of 1 or 3 numbers, got {background!r}") from None
-    if not (color.min() >= 0 and color.max() <= 1):
-        raise ValueError(f"expected a background from 0 to 1, got {background!r}")
-    return color
 
 
 def view_colors(tiled: TiledView) -> Array:

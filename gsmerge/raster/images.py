@@ -60,7 +60,7 @@ def render(
     Args:
         gaussians: n Gaussians, SH degrees 0 to 4.
         cameras: c cameras; the skew of their intrinsics is ignored.
-        background: Colour behind the Gaussians, 1 or 3 numbers from 0 to 1.
+        background: Colour behind the Gaussians, 1 or 3 numbers.
         antialiased: Lower the opacity of small Gaussians to compensate for the dilation.
         near: Nearest depth drawn, world units, above 0.
         far: Farthest depth drawn.
@@ -70,8 +70,7 @@ def render(
         Images, alphas and, if requested, depths.
 
     Raises:
-        ValueError: If the background has another number of values, or others than 0 to 1, or if near and far are no
-            valid range.
+        ValueError: If the background has another number of values, or if near and far are no valid range.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")

@@ -37,8 +37,6 @@ CALLS: dict[str, Callable[[], Any]] = {
     "levels: expected a list of Gaussians, got Gaussians": lambda: ANY.write_levels("lod-meta.json", SCENE.gaussians),
     "unknown argument 'foo'; expected cameras": lambda: ANY.read_scene("a.ply", foo=1),
     "unknown argument 'imges'; perhaps images": lambda: ANY.read_scene("a.ply", imges="photos"),
-    "expected a background from 0 to 1, got 5": lambda: ANY.render(SCENE.gaussians, SCENE.cameras, 5),
-    "expected a background from 0 to 1, got nan": lambda: ANY.render(SCENE.gaussians, SCENE.cameras, np.nan),
     "scene: expected a Scene or a path, got int": lambda: ANY.Compactor().extend(3),
 }
 
