@@ -277,10 +277,11 @@ def _read_text(path: Path, header: bytes) -> PlyData | None:
     data = PlyData.read(_text_rows(BytesIO(element_line.sub(rb"\g<1>0", header))))
     if len(data.elements) != len(counts) or any(element.count for element in data.elements):
         return None
-    with path.open("rb") as file, warnings.catch_warnings():
+    binary = path.open("rb")
+    with _text_rows(binary) as file, warnings.catch_warnings():
         warnings.simplefilter("error")  # NumPy would take 1.5 for a whole number
-        file.seek(len(header))
-        lines = iter(_text_rows(file).readline, "")
+        binary.seek(len(header))
+        lines = iter(file.readline, "")
         for element, count in zip(data.elements, counts, strict=True):
             if any(isinstance(column, PlyListProperty) for column in element.properties):
                 return None
