@@ -169,11 +169,11 @@ def find_scene_files(
     - the folders above it up to ``within``, by default up to the given folder.
 
     In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
-    their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, but come last if
-    they may not be its own. Cameras inside the ``.ply`` or of depth maps precede those beside it. If no place has cameras, the only file of any name that holds
-    cameras is taken. Without it, cameras of a program whose files are not read are taken, so that the reader says so.
-    Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder, because the model saw these. A
-    result of gsmerge is taken as the scene only if a folder has nothing else.
+    their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, but come last if they
+    may not be its own. Cameras inside the ``.ply`` or of depth maps precede those beside it. If no place has cameras,
+    the only file of any name that holds cameras is taken. Without it, cameras of a program whose files are not read are
+    taken, so that the reader says so. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder,
+    because the model saw these. A result of gsmerge is taken as the scene only if a folder has nothing else.
 
     Raises:
         SceneError: If there is no ``.ply``, or several to choose from, or if a named file does not exist. Several files

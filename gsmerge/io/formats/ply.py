@@ -159,6 +159,8 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
             remedy = "export it again, since it is compressed but lacks its element 'chunk'"
         elif len(missing) < len(arrays.REQUIRED) // 2:
             remedy = "export it again with them"
+        if arrays.SCALES[0] in missing:  # without any scale, a third one is expected, too
+            missing = [name for name in arrays.REQUIRED if name in {*missing, arrays.SCALES[2]} - columns]
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices", "export it again")
