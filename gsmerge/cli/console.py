@@ -107,12 +107,12 @@ def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
     """Print each note on stderr unless ``quiet``.
 
-    A note that a result is worse than the input, or that held-out views show something else, becomes a warning.
+    A note that a result is worse than the input, or that held-out views may show another scene, becomes a warning.
     """
-    from gsmerge.raster.metrics import NOTHING_SEEN, WORSE
+    from gsmerge.raster.metrics import OTHER_SCENE, WORSE
 
     for note in notes:
-        if WORSE in note or NOTHING_SEEN in note:
+        if WORSE in note or OTHER_SCENE in note:
             say_warning(note, quiet=quiet)
         else:
             say(note, kind="note", quiet=quiet)
