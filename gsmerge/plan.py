@@ -57,7 +57,7 @@ FIDELITY_LOSS = 0.3
 PER_STEP, PER_DRAWN = 700, 40
 RENDERS_STEPS = 0.35  # step sizes of a fit to renders instead of photos, relative to the usual: it begins near to them
 PLACED_STEPS = 0.2  # the same for placed views, which say less about other views
-NO_FIT = "there is no fit without cameras: it needs --effort best, or the default effort with a --budget"
+NO_FIT = "without cameras there is a fit only with --effort best, or with the default effort and a --budget"
 BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic
 WHOLE_GAUSSIANS = 20_000_000  # Gaussians up to which a scene is compacted in one piece, unless it has many views
 BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same two limits in views, if blocks see little of each other
@@ -200,8 +200,7 @@ def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | N
     fit = _fit_renders(prepared, options, fit) if pairs else fit
     if keeps and has_few_rows(size):
         few = f"the scene has only {size.num_gaussians:,} Gaussians, fewer than its photos need"
-        share = f"so superpixels={segment.superpixels} is a share of the photos' pixels, and at most half the Gaussians"
-        note(f"{few}, {share}; a result with more Gaussians may show the photos better: --budget NUMBER")
+        note(f"{few}; the result has at most half of them, and more may show the photos better: --budget NUMBER")
     budget = options.budget
     searches = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
     shares_tree = cuts_views(options, size) and not pairs and (searches or limits.count is not None)

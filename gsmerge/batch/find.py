@@ -13,6 +13,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_budget, read_lines
 from gsmerge.io.formats import depth_maps
+from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import natural_order
 from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
@@ -87,8 +88,11 @@ def _remedy(folder: Path) -> str:
     """Return the remedy for a folder in which no scene was found."""
     if not os.path.isdir(folder):
         return ""
-    results = list_plys(folder)
-    return f"{results[0]} is a result of gsmerge; name this file to compact it" if results else find_remedy(folder)
+    file = next(iter(list_plys(folder)), None)
+    if file is None:
+        return find_remedy(folder)
+    is_result = file.suffix == ".ply"  # the search lists all other .ply; it does not list the meta.json of a .sog
+    return f"{file} is a result of gsmerge; name this file to compact it" if is_result else f"name {file}"
 
 
 @dataclass
@@ -170,7 +174,11 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
             return False
         if named_ply(folder) is not None:
             return True
-        return not other_plys(folder) and bool(depth_maps.find_depth_maps(folder))
+        if other_plys(folder):
+            return False
+        # a file with a usual name but without Gaussians fails alone
+        without_gaussians = [header_content(path) for path in list_plys(folder)] == ["other"]
+        return without_gaussians or bool(depth_maps.find_depth_maps(folder))
     except (SceneError, OSError):  # a frame is missing or cannot be read; reading the scene reports which
         return True
 

@@ -286,6 +286,7 @@ def run(args: Sequence[str] | None = None) -> int:
         with plain_warnings(), _orderly_stop(signals), in_style():
             _check_working_directory()
             words = [LOOK, *words] if words and _is_scene(words[0]) else words
+            words = [*words[1:], "--help"] if words[:1] == ["help"] else words
             command = make_command(_command_of(words))
             code = command(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
             with suppress(BrokenPipeError):  # the reader of a pipe has closed it

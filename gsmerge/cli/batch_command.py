@@ -164,7 +164,10 @@ def run_jobs(
             else:
                 done += weight
             share = done / total if total > 0 else 1.0
-            progress(record[name], record["status"], num_ended, failure, num_failed, share)
+            report = record["report"] or record  # a result that was done before has a record of its doubts alone
+            worse = report.get("worse")
+            notes = report.get("notes", [doubt for doubt in (worse, report.get("left_out")) if doubt])
+            progress(record[name], record["status"], num_ended, failure, num_failed, share, worse, notes)
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
@@ -208,7 +211,7 @@ class Totals:
         if left_out:
             self.left_out.append((record["scene"], left_out))
         elif report and not report["input"].get("num_photos", 1):
-            self.lacking.append((record["scene"], _describe_lack(report["input"]["num_views"])))
+            self.lacking.append((record["scene"], _describe_lack(report)))
         if record["error"] is not None:
             self.failed.append((record["scene"], record["error"]))
         if report:
@@ -269,11 +272,14 @@ def _list_reasons(reasons: Sequence[tuple[str, str]]) -> list[str]:
     return lines
 
 
-def _describe_lack(num_views: int) -> str:
-    """Describe what is missing for a scene that no photo shows."""
-    if num_views:
-        return "no photos found beside it or in the named folder; name them with --images"
-    return "no cameras found beside it or in the named folder; name them with --cameras, and photos with --images"
+def _describe_lack(report: Mapping[str, Any]) -> str:
+    """Describe what is missing for a scene that no photo shows, and what its numbers are measured on."""
+    from gsmerge.facts.row_colors import ROW_COLORS
+
+    if not report["input"]["num_views"]:
+        return "no cameras found beside it or in the named folder; name them with --cameras, and photos with --images"
+    measured = f"; its numbers are of {ROW_COLORS}" if report.get("psnr_reference") == ROW_COLORS else ""
+    return f"no photos found beside it or in the named folder{measured}; name them with --images"
 
 
 def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:

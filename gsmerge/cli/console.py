@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
-RunProgress = Callable[[str, str, int, str, int, float], None]  # arguments: see total_progress
+RunProgress = Callable[..., None]  # arguments: see total_progress
 
 Kind = Literal["info", "note", "warning", "error"]  # of a line on stderr
 PREFIXES: Mapping[Kind, str] = {
@@ -88,13 +88,13 @@ def _erase_opening() -> None:
 def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
     """Print one line on stderr unless ``quiet``; wrap it on a terminal, and ignore a closed stderr.
 
-    Notes, warnings and errors begin with their kind. With progress as JSON, a line is an object whose key is the kind.
+    Notes, warnings and errors begin with their kind. With progress as JSON, a line is an object whose key is the kind,
+    and is printed even if ``quiet``.
     """
-    if quiet:
-        return
     stream = _stream.get()
     if stream is not None:
         stream.print({kind: one_line(message)})
+    if quiet or stream is not None:
         return
     from gsmerge.report import wrap_line
 
@@ -105,11 +105,14 @@ def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
 
 
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
-    """Print each note on stderr unless ``quiet``; a note that the result is worse than the input becomes a warning."""
-    from gsmerge.raster.metrics import WORSE
+    """Print each note on stderr unless ``quiet``.
+
+    A note that a result is worse than the input, or that held-out views may show another scene, becomes a warning.
+    """
+    from gsmerge.raster.metrics import OTHER_SCENE, WORSE
 
     for note in notes:
-        if WORSE in note:
+        if WORSE in note or OTHER_SCENE in note:
             say_warning(note, quiet=quiet)
         else:
             say(note, kind="note", quiet=quiet)
@@ -295,26 +298,35 @@ def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
 def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     """Show one bar for many runs on stderr, with the time left, and the last failure below it.
 
-    Without a terminal it prints a line for each run. Yields ``(name, status, done, failure, num_failed, share) ->
-    None``; ``failure`` is empty after a run that succeeded, and ``share``, 0 to 1, is the part of the work done so far.
+    Without a terminal it prints a line for each run. Yields ``(name, status, done, failure, num_failed, share,
+    worse=None, notes=()) -> None``; ``failure`` is empty after a run that succeeded, and ``share``, 0 to 1, is the part
+    of the work done so far. ``worse``: one of the ``notes``, which are printed only as JSON.
     """
     stream = _stream.get()
     if stream is not None:
         start = time.monotonic()
 
-        def print_event(name: str, status: str, done: int, failure: str, num_failed: int, share: float) -> None:
+        def print_event(
+            name: str, status: str, done: int, failure: str, num_failed: int, share: float,
+            worse: str | None = None, notes: Sequence[str] = (),
+        ) -> None:  # fmt: skip
             seconds = time.monotonic() - start
+            for note in notes:
+                say(f"{name}: {note}", kind="warning" if note == worse else "note")
             stream.move(share, seconds * (1 - share) / share if share > 0 else None)
             event = {"scene": name, "status": status, "done": done, "total": total, "failed": num_failed}
-            stream.print({**event, "error": failure or None})
+            stream.print({**event, "worse": worse, "error": failure or None})
 
         yield print_event
         return
     console = _terminal(quiet=quiet)
     if console is None:
 
-        def print_run(name: str, status: str, done: int, failure: str, num_failed: int, _: float) -> None:
-            text = status if failure.startswith(name) else _run_text(name, status, failure, num_failed)
+        def print_run(
+            name: str, status: str, done: int, failure: str, num_failed: int, _: float,
+            worse: str | None = None, __: Sequence[str] = (),
+        ) -> None:  # fmt: skip
+            text = status if failure.startswith(name) else _run_text(name, status, failure, num_failed, worse)
             say(f"{done}/{total} {text}{f': {failure}' if failure else ''}", quiet=quiet)
 
         yield print_run
@@ -332,17 +344,22 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     with Live(Group(bars, last_failure), console=console, transient=True, refresh_per_second=5):
         task = bars.add_task("", total=total)
 
-        def move(name: str, status: str, done: int, failure: str, num_failed: int, _: float) -> None:
-            bars.update(task, completed=done, description=one_line(_run_text(name, status, failure, num_failed)))
+        def move(
+            name: str, status: str, done: int, failure: str, num_failed: int, _: float,
+            worse: str | None = None, __: Sequence[str] = (),
+        ) -> None:  # fmt: skip
+            text = _run_text(name, status, failure, num_failed, worse)
+            bars.update(task, completed=done, description=one_line(text))
             if failure:
                 last_failure.plain = one_line(f"last failure: {failure}")
 
         yield move
 
 
-def _run_text(name: str, status: str, failure: str, num_failed: int) -> str:
-    """Describe the end of one run, with the number of failures so far."""
+def _run_text(name: str, status: str, failure: str, num_failed: int, worse: str | None) -> str:
+    """Describe the end of one run, with the number of failures so far; ``worse``: see :func:`total_progress`."""
     ending = {"skipped": "skipped, since it was done before"}.get(status, status)
+    ending += ", worse than the input" if worse else ""
     return f"{name} {ending}{f', {num_failed} failed' if num_failed and not failure else ''}"
 
 

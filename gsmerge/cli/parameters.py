@@ -162,7 +162,7 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
         if not sign:
             raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}")
         if name not in settings:
-            similar = join_words(find_near_names(name, settings, 3, 0.5))
+            similar = join_words(find_near_names(name, settings, 3))
             hint = f"; perhaps {similar}" if similar else ""
             remedy = f"{flag} {LIST_SETTINGS} lists all" if flag == "--set" else f"expected {join_words(settings)}"
             raise UsageError(f"{flag} {name}: unknown{hint}; {remedy}")

@@ -143,8 +143,6 @@ def usage_message(error: Any, make_command: Callable[[], Any]) -> str:
     elif message.startswith("Got unexpected extra argument") and has_output:
         message += "; name the output with -o"
     elif match := re.match(r"No such command '(\w+)'", message):
-        if match[1] == "help":
-            return f"help is not a command: use {PROGRAM} --help, or {PROGRAM} COMMAND --help"
         synonym = next((name for name, words in COMMAND_SYNONYMS.items() if match[1] in words), None)
         message = message if synonym is None else f"{match[0]}. Did you mean '{synonym}'?"
     return f"{message}; see '{path} --help'"

@@ -14,6 +14,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.raster.metrics import psnr_words
 from gsmerge.report import document_head, file_sha256, html_table, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share
+from gsmerge.words import count_words
 
 
 @dataclass(frozen=True)
@@ -237,7 +238,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % that the input covers"
         rows += [("", f"{covered['before']:.2f} dB", f"{covered['after']:.2f} dB", share)]
-    if files := document.get("psnr_photo_files"):
+    if files := _scores_on_files(document):
         rows += [
             ("", f"{files['before']:.2f} dB", f"{files['after']:.2f} dB", "on its photos as their files have them")
         ]
@@ -293,7 +294,7 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
         for p in points
     ]
     num_photos = document["choices"].get("curve_left_out")
-    scored_on = f"the {num_photos} photos" if num_photos else "patches of the photos"
+    scored_on = count_words(num_photos, "photo") if num_photos else "patches of the photos"
     return [f"short fits of half the size compare counts, on {scored_on} that they left out:", head, *rows]
 
 
@@ -311,7 +312,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
-    if files := document.get("psnr_photo_files"):
+    if files := _scores_on_files(document):
         quality += f", {files['before']:.2f} -> {files['after']:.2f} dB on the photos as their files have them"
     if protected := document.get("psnr_protected"):
         quality += f", {protected['before']:.2f} -> {protected['after']:.2f} dB where they are protected"
@@ -322,6 +323,14 @@ def summary_line(document: Mapping[str, Any]) -> str:
         f" ({share}), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
         f"{quality}; {seconds_line(document)}{cameras}"
     )
+
+
+def _scores_on_files(document: Mapping[str, Any]) -> Mapping[str, float] | None:
+    """Return the PSNR on the photos as their files have them; None if it is that of the changed photos, as printed."""
+    files, own = document.get("psnr_photo_files"), document["psnr_input_views"]
+    if files is None or own["after"] is None or any(f"{files[name]:.2f}" != f"{own[name]:.2f}" for name in own):
+        return files
+    return None
 
 
 def _own(document: Mapping[str, Any]) -> str:

@@ -49,6 +49,7 @@ WINDOW = np.full(5, 1 / 5, np.float32)
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
 MIDDLE_GREY = 128  # level of 255 at which notes report the change of tone
+LEAST_PERCENT = 1  # of a photo; no note says that less of it differs
 STRAY_PHOTOS = "photos do not show what the Gaussians show"  # part of the note on photos that are not used
 
 
@@ -255,9 +256,9 @@ def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Seq
 def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int]) -> None:
     """Note in which of some photos something covers the scene, at the pixels ``hidden [v,h,w]``."""
     with_hidden = [view for view in views if hidden[view].any()]
-    if not with_hidden:
+    max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
+    if max_percent < LEAST_PERCENT:
         return
-    max_percent = 100 * max(float(hidden[view].mean()) for view in with_hidden)
     note(
         f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians"
         f" (up to {max_percent:.0f} % of a photo; perhaps a mask, a mark, a finger, another look or camera):"

@@ -17,7 +17,15 @@ from gsmerge.io.cameras.read import read_all_cameras
 from gsmerge.io.cameras.table import CAMERA_ENDINGS, CHUNK
 from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.read import degree_notes
-from gsmerge.io.formats.table import META, SCENE_SUFFIXES, SEVERAL_USES, STATE_ENDING, find_format, may_hold_gaussians
+from gsmerge.io.formats.table import (
+    META,
+    READ_ENDINGS,
+    SCENE_SUFFIXES,
+    SEVERAL_USES,
+    STATE_ENDING,
+    find_format,
+    may_hold_gaussians,
+)
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
@@ -115,7 +123,7 @@ def _read(path: Path) -> FileCheck:
         find_scene_files(path)  # which says what a file without Gaussians holds
     if suffix in IMAGE_SUFFIXES | OTHER_SUFFIXES:
         raise ply.no_ply(path)
-    endings = ", ".join(dict.fromkeys((*SCENE_SUFFIXES, *CAMERAS, STATE_ENDING, NETWORKS, streamed.INDEX)))
+    endings = ", ".join(dict.fromkeys((*READ_ENDINGS, *CAMERAS, NETWORKS)))
     raise SceneError(path, f"expected one of {endings}, found another kind of file")
 
 

@@ -196,7 +196,9 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     group = _read(options, photos=True)
     used = list(group.load.views.used)
     cameras, photos = options.resize(group.load.views.cameras[used]), group.load.views.images
-    ids = options.choose([group.load.views.names[view] for view in used], PANEL_VIEWS)
+    all_names = [group.load.views.names[view] for view in used]
+    ids = options.choose(all_names, PANEL_VIEWS)
+    names = [re.split(r"[\\/]", all_names[i])[-1] for i in ids]
     pictured = {group.load.views.of_scene[view] for view in group.load.scene.photo_views}
 
     def draw(_: int) -> Iterator[Picture]:
@@ -205,7 +207,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         plain = options.overlay is None
-        rows = view_pictures(named, cameras[ids], shown, ids, scored=plain, background=options.grey)
+        rows = view_pictures(named, cameras[ids], shown, names, scored=plain, background=options.grey)
         # Without cameras of the scene, views are placed: the first half around it, the second half inside it
         outer_cameras = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
         outside = outside_pictures(named, outer_cameras, photos=shown is not None, background=options.grey)

@@ -22,7 +22,7 @@ from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.raster import render
-from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
+from gsmerge.raster.metrics import OTHER_SCENE, describe_loss, psnr_within, ssim_within
 from gsmerge.raster.photos import COVERED, NEAR_PLANE, WHOLE
 from gsmerge.report import html_table
 from gsmerge.runtime.record import Progress
@@ -309,7 +309,7 @@ def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mend
     if "target" not in splits:
         yield "no held-out views were given; on input views, fitted results score better than on new views"
     elif (share := splits["target"].visible.mean()) < MIN_SEEN_SHARE:
-        yield f"the input views have seen only {100 * share:.0f} % of the held-out views, which may be in another world"
+        yield f"the input views have seen only {100 * share:.0f} % of the held-out views, {OTHER_SCENE}"
     if photos and mended:
         yield MENDED
 

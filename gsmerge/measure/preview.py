@@ -87,7 +87,7 @@ def view_pictures(
     scenes: Sequence[tuple[str, Gaussians]],
     cameras: Cameras,
     photos: Sequence[np.ndarray | None] | None = None,
-    ids: Sequence[int] | None = None,
+    names: Sequence[str] | None = None,
     *,
     scored: bool = True,
     **drawing: Any,
@@ -96,18 +96,18 @@ def view_pictures(
 
     Every picture comes with a line of text. For a scene, the text has the name and the number of Gaussians. If
     ``scored``, the PSNR against the whole photo ``[h,w,3]`` follows, or, if ``photos`` is None, the PSNR against the
-    first scene. For a photo, the text has the number of the view in ``ids``. A view whose photo is None begins with a
+    first scene. For a photo, the text has the name of the view. A view whose photo is None begins with a
     dark picture. ``drawing`` is passed to :func:`gsmerge.render`.
     """
     renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
-    for row, view in enumerate(ids or range(len(cameras))):
+    for row, view in enumerate(names or [f"view {i}" for i in range(len(cameras))]):
         columns = [(f"{name}: {len(g):,}", drawn[row]) for (name, g), drawn in zip(scenes, renders, strict=True)]
         photo = None if photos is None else photos[row]
         if photo is not None:
-            columns.insert(0, (f"photo, view {view}", photo))
+            columns.insert(0, (f"{view}, photo", photo))
         elif photos is not None:
-            columns.insert(0, (f"view {view}: no photo", np.full_like(renders[0][row], DARK / 255)))
+            columns.insert(0, (f"{view}: no photo", np.full_like(renders[0][row], DARK / 255)))
         if scored and (photo is not None or photos is None):
             (_, reference), *compared = columns
             name = "the photo" if photos is not None else scenes[0][0]

@@ -32,6 +32,7 @@ from gsmerge.measure.preview import OUTSIDE, Picture, draw_borders, mean_colors,
 from gsmerge.pages.marks import Marks, draw_marks, find_marks
 from gsmerge.pages.splats import MAX_GAUSSIANS, drawn_rows, highest_degree, pack_splats, pack_support
 from gsmerge.raster import Splats, make_splats, render
+from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import SegmentOptions
@@ -146,7 +147,8 @@ def collect(
 
     ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes``: file sizes of the scene
     and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's cameras.
-    ``new_gains``: bounds of the expected gain of new views, dB. ``light``: show the scene itself in stills only.
+    ``new_gains``: bounds of the expected gain of new views, dB; left out if a result is worse than the scene.
+    ``light``: show the scene itself in stills only.
     """
     stills: Stills = {}
     nets = (LPIPS,) if lpips_available(LPIPS) else ()
@@ -158,8 +160,23 @@ def collect(
     with use_threads():
         data = page_data(title, scene, results, file_bytes, held_out, evaluation, stills, cameras=cameras, light=light)
     progress("done", 0, 0)
-    gains = new_gains or {}
-    return replace(data, sides=tuple(replace(side, new_gain=gains.get(side.name)) for side in data.sides))
+    return _with_gains(data, new_gains or {})
+
+
+def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> ViewData:
+    """Add the expected gains to the results; a result that shows its own photos worse than the scene has none."""
+    sides, notes = [], list[str]()
+    for side in data.sides:
+        own = () if data.held_out else (data.sides[0].mean.psnr, side.mean.psnr)
+        gain = gains.get(side.name)
+        if gain is not None and own and describe_loss("", *own, "") is not None:
+            gain = None
+            notes.append(
+                f"{side.name} shows these photos worse than {data.title} does, so its expected gain of new views is"
+                " left out; is it a result of this scene?"
+            )
+        sides.append(replace(side, new_gain=gain))
+    return replace(data, sides=tuple(sides), notes=(*data.notes, *notes))
 
 
 def still_keeper(stills: Stills) -> OnImage:

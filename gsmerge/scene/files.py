@@ -19,12 +19,13 @@ from gsmerge.io.cameras.foreign import check_program, find_unread
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras, holds_images, read_cameras, read_sharp_camera
 from gsmerge.io.cameras.table import CHUNK
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
-from gsmerge.io.formats.ply import header_content, header_counts
+from gsmerge.io.formats.ply import header_content, header_counts, is_file_from_gsmerge
 from gsmerge.io.formats.table import (
     DEPTHS,
     FRAMES,
     HTML,
     META,
+    OUTPUT_FORMATS,
     POSES,
     SCENE_SUFFIXES,
     SEVERAL_USES,
@@ -168,11 +169,11 @@ def find_scene_files(
     - the folders above it up to ``within``, by default up to the given folder.
 
     In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
-    their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, and cameras inside the
-    ``.ply`` or of depth maps over those beside it. If no place has cameras, the only file of any name that holds
-    cameras is taken. Without it, cameras of a program whose files are not read are taken, so that the reader says so.
-    Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder, because the model saw these. A
-    result of gsmerge is taken as the scene only if a folder has nothing else.
+    their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, but come last if they
+    may not be its own. Cameras inside the ``.ply`` or of depth maps precede those beside it. If no place has cameras,
+    the only file of any name that holds cameras is taken. Without it, cameras of a program whose files are not read are
+    taken, so that the reader says so. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder,
+    because the model saw these. A result of gsmerge is taken as the scene only if a folder has nothing else.
 
     Raises:
         SceneError: If there is no ``.ply``, or several to choose from, or if a named file does not exist. Several files
@@ -217,10 +218,10 @@ def _find_camera_path(ply: Path, roots: Sequence[Path]) -> Path | None:
     if ply.suffix == DEPTHS.ending:
         return ply.parent.parent / POSES if is_frame(ply) else ply
     of_result = result_cameras(ply)
-    if of_result is not None:
+    if of_result is not None and _count_signs(ply) == 2:
         return of_result
     searched = (find(root) for find in (find_cameras, find_other_cameras, find_unread) for root in roots)
-    return next((path for path in searched if path is not None), None)
+    return next((path for path in searched if path is not None), of_result)
 
 
 def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
@@ -307,13 +308,27 @@ def scene_title(ply: Path) -> str:
 
 
 def result_cameras(ply: Path) -> Path | None:
-    """Find the cameras that ``compact`` wrote beside a result; None without.
+    """Find the cameras that gsmerge wrote beside a result; None without.
 
-    A level of detail has the cameras of the result to which it belongs, if it has none of its own.
+    A level of detail has the cameras of the result to which it belongs, if it has none of its own. They belong to a
+    result of the same name beside a ``.ply`` of another program: to ``scene.sog`` beside ``scene.ply``.
     """
     names = ply.name, _LEVEL.sub("", ply.name)
     beside = (viewer_cameras_path(ply.with_name(name)) for name in names)
-    return next((path for path in beside if path.is_file()), None)
+    cameras = next((path for path in beside if path.is_file()), None)
+    return None if cameras is None or not _count_signs(ply) else cameras
+
+
+def _count_signs(ply: Path) -> int:
+    """Count the signs that the cameras of a file's name are its own, 0 to 2.
+
+    The signs are that gsmerge wrote it, and that no other file of Gaussians has this name. A result has both, and so
+    has a file of another format, whose header does not say what it is.
+    """
+    if find_format(ply).ending != ".ply" or header_content(ply) == "result":
+        return 2
+    namesakes = (ply.with_suffix(ending) for ending in OUTPUT_FORMATS if ending != ".ply")
+    return is_file_from_gsmerge(ply) + (not any(path.is_file() for path in namesakes))
 
 
 def named_path(path: StrPath | None) -> Path | None:

@@ -483,7 +483,7 @@ def describe_assignment(
             names = list_some(files)
             notes.append(f"{len(files)} of {count} photos are {kind} relative to their orientation tags: {names}")
     moved = [
-        f"{camera_file.names[view]}: {_inside(proposal.pool[assignment.photo], proposal)}"
+        f"photo {_inside(proposal.pool[assignment.photo], proposal)} for view {camera_file.names[view]}"
         for view, assignment in enumerate(chosen)
         if assignment is not None and assignment.photo != proposal.named[view]
     ]

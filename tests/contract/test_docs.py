@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import fields
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +64,28 @@ def read(page: str) -> str:
     return (ROOT / page).read_text(encoding="utf-8")
 
 
+def blocks_in(page: str) -> list[list[str]]:
+    """Every ``gsmerge ...`` call in each of a page's shell blocks."""
+    blocks = re.findall(r"```(?:bash|console)\n(.*?)```", read(page), re.DOTALL)
+    parts = [[part.strip() for line in block.splitlines() for part in line.split("&&")] for block in blocks]
+    return [[re.sub(r"^\S*/", "", call) for call in calls if re.match(r"(\S*/)?gsmerge ", call)] for calls in parts]
+
+
 def calls_in(page: str) -> list[str]:
     """Every ``gsmerge ...`` call in a page's shell blocks."""
-    blocks = re.findall(r"```(?:bash|console)\n(.*?)```", read(page), re.DOTALL)
-    calls = (part.strip() for block in blocks for line in block.splitlines() for part in line.split("&&"))
-    return [re.sub(r"^\S*/", "", call) for call in calls if re.match(r"(\S*/)?gsmerge ", call)]
+    return [call for calls in blocks_in(page) for call in calls]
+
+
+def written_by(call: str) -> list[str]:
+    """The files that a call writes and does not replace; of ``compact`` also the cameras beside its result."""
+    command, *rest = [word for word in shlex.split(call, comments=True)[1:] if word != "compact"]
+    outputs = [value for name, value in pairwise(rest) if name in ("-o", "--output")]
+    if command == "convert":
+        return [next(word for word in reversed(rest) if "--" not in word and rest[rest.index(word) - 1][:2] != "--")]
+    if command in TOP:
+        return outputs if command == "render" else []
+    result = Path((outputs or [Path(command).with_suffix(".compact.ply")])[0])
+    return [] if "--dry-run" in rest else [str(result), str(result.with_suffix(".cameras.json"))]
 
 
 def parse(call: str) -> None:
@@ -123,6 +141,14 @@ def test_pages_name_only_options_that_exist(page: str) -> None:
 def test_calls_parse(page: str) -> None:
     for call in calls_in(page):
         parse(call)
+
+
+@pytest.mark.parametrize("page", [page for page in WRITTEN if calls_in(page)])
+def test_calls_of_a_block_write_different_files(page: str) -> None:
+    """So that a block can be pasted as a whole."""
+    for calls in blocks_in(page):
+        paths = [path for call in calls for path in written_by(call)]
+        assert len(paths) == len(set(paths)), calls
 
 
 GUIDES = [page for page in PAGES if page.startswith("docs/guide/")]

@@ -168,7 +168,8 @@ def test_what_a_scene_lacks_is_said(rooms: Path, tmp_path: Path, run: Run) -> No
     (other,) = notes(top, "--output", tmp_path / "out")
     assert names(other, f"{top / 'room1'}: the photos in {top / 'images'} are left out")
     one = top / "room1"
-    lacking = f"{one}: no photos found beside it or in the named folder; name them with --images"
+    lacking = f"{one}: no photos found beside it or in the named folder; its numbers are of the model's own pixels"
+    lacking += "; name them with --images"
     assert notes(one, "--output", tmp_path / "out1") == [lacking]
     bare, totals = {"num_gaussians": 8, "num_views": 0, "num_photos": 0}, Totals(1)
     totals.add(record("done", "x", "x.ply", report=REPORT | {"input": bare}))

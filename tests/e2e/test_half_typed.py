@@ -95,7 +95,6 @@ def test_an_empty_name_is_not_this_folder(
         ("convert x.ply -o y.spz", "gsmerge convert a.ply x.spz"),
         ("evaluate x.ply --format json", "the ending of -o sets the format;"),
         ("--quiet x.ply", "after the name of a command or scene"),
-        ("help compact", "gsmerge --help"),
     ],
 )
 def test_what_to_type_instead(words: str, suggestion: str, run: Run) -> None:

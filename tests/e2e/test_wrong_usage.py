@@ -38,6 +38,7 @@ USAGE = {
     "compact room --threads 0": "--threads*1",
     "compact room --budget 5B": "budget*579*5",
     "compact room --effort slow": "--effort*'slow'*'draft'",
+    "convert alone.ply b.ply --images photos": "*--images*--set images=VALUE",
     "convert alone.ply": "*only alone.ply*gsmerge convert alone.ply x.spz",
     "compact room --effort BEST": "--effort*'BEST'*'best'*perhaps best",
     "compact room --budget quest": "budget*'quest'*perhaps quest3",
@@ -223,6 +224,11 @@ def test_nothing_is_written_into_a_shells_files(run: Run) -> None:
     """Completion is printed; whoever wants it puts it where it belongs."""
     assert "--install-completion" in run("--install-completion", code=2).err
     assert "--show-completion" in run("--help", code=0).out
+
+
+def test_help_is_a_word_too(run: Run) -> None:
+    assert run("help", code=0).out == run("--help", code=0).out
+    assert run("help", "convert", code=0).out == run("convert", "--help", code=0).out
 
 
 @pytest.mark.parametrize(

@@ -160,6 +160,8 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
             remedy = "export it again, since it is compressed but lacks its element 'chunk'"
         elif len(missing) < len(arrays.REQUIRED) // 2:
             remedy = "export it again with them"
+        if arrays.SCALES[0] in missing:  # without any scale, a third one is expected, too
+            missing = [name for name in arrays.REQUIRED if name in {*missing, arrays.SCALES[2]} - columns]
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices", "export it again")
@@ -387,18 +389,33 @@ def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
 
     A file that cannot be read, or has a longer header, counts as Gaussians.
     """
-    try:
-        check_file(path)
-        with path.open("rb") as file:
-            header, end, _ = file.read(1 << 12).partition(b"end_header")
-    except (OSError, SceneError):
-        return "Gaussians"
-    if re.search(rb"^comment %s\s*$" % arrays.RESULT_COMMENT.encode(), header, re.MULTILINE):
+    header, end = _read_start(path)
+    if arrays.RESULT_COMMENT in _list_comments(header):
         return "result"
     columns = re.findall(rb"^property .*?(\w+)\s*$", header, re.MULTILINE) if end else []
     expected = (b"scale_", b"rot_", b"f_dc_", b"packed_")
     has_gaussians = any(stem in name for name in columns for stem in expected)  # names may have a prefix
     return "Gaussians" if has_gaussians or not columns else "other"
+
+
+def is_file_from_gsmerge(path: Path) -> bool:
+    """Return whether the comments of a PLY file say that gsmerge wrote it, in the first 4 KiB."""
+    return is_from_gsmerge(_list_comments(_read_start(path)[0]))
+
+
+def _read_start(path: Path) -> tuple[bytes, bytes]:
+    """Return the first 4 KiB of a PLY header without its last line, and that line; both are empty if unreadable."""
+    try:
+        check_file(path)
+        with path.open("rb") as file:
+            header, end, _ = file.read(1 << 12).partition(b"end_header")
+    except (OSError, SceneError):
+        return b"", b""
+    return header, end
+
+
+def _list_comments(header: bytes) -> list[str]:
+    return [text.decode("latin-1") for text in re.findall(rb"^comment (.*?)\s*$", header, re.MULTILINE)]
 
 
 def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:

@@ -14,7 +14,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.geometry import lower_median, median, quantiles, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.table import DEPTHS, META, PLY, SCENE_SUFFIXES, find_format
+from gsmerge.io.formats.table import DEPTHS, META, PLY, READ_ENDINGS, find_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.memory import free_pages, gather, make_array
@@ -168,7 +168,7 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
     path = path / META if path.is_dir() and (path / META).is_file() else path
     format_ = find_format(path)
     if format_.read is None:
-        problem = f"expected one of {', '.join(SCENE_SUFFIXES)}, found {format_.ending}, which is written and not read"
+        problem = f"expected one of {', '.join(READ_ENDINGS)}, found {format_.ending}, which is written and not read"
         raise SceneError(path, problem, "name the file that it was made from")
     if format_.read is ply.read_rows:
         return read_ply(path, opacity=opacity)

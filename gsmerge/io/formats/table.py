@@ -183,6 +183,7 @@ FORMATS = (*FILES, HTML, LEVELS, COLMAP, DEPTHS, STATE, *BY_PROGRAM)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # results that a page shows
 FOLDERS = {row.folder: row for row in FORMATS if row.folder}  # by the name of an output folder
+READ_ENDINGS = tuple(row.ending for row in FORMATS if row.read is not None)
 SCENE_SUFFIXES = tuple(
     dict.fromkeys(
         Path(f"_{row.ending}").suffix

@@ -54,6 +54,18 @@ def test_a_scene_s_own_folders_are_no_scenes_of_their_own() -> None:
     assert actual("all") == ["all", "all/more"]
 
 
+def test_a_point_cloud_with_the_name_of_a_scene_is_a_scene_that_fails() -> None:
+    """Unless its folder has other Gaussians; a point cloud with another name is none."""
+    points = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
+    touch("all/a/scene.ply", "all/b/scene.ply", "all/b/c/deep.ply", "all/d/cloud.ply", "all/e/point_cloud.ply")
+    for name in ("a/scene.ply", "b/scene.ply", "d/cloud.ply", "e/point_cloud.ply"):
+        Path("all", name).write_text(points)
+    assert actual("all") == ["all/a", "all/b/c/deep.ply", "all/e"]
+    assert actual("all/a") == ["all/a"]
+    with refuses(SceneError, "all/d", "cloud.ply"):
+        actual("all/d")
+
+
 def test_the_output_folder_is_not_searched() -> None:
     touch("all/a.ply", "all/out/a.ply", "all/out/deep/b.ply")
     assert actual("all", out=Path("all/out")) == ["all/a.ply"]

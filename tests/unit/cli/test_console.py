@@ -17,9 +17,11 @@ from gsmerge.cli.console import (
     plain_warnings,
     print_document,
     say,
+    say_warning,
     stage_progress,
     total_progress,
 )
+from gsmerge.raster.metrics import WORSE
 
 
 class Terminal(io.StringIO):
@@ -120,6 +122,22 @@ def test_runs_as_events_have_their_names_whole(capsys: pytest.CaptureFixture[str
     assert events[0]["seconds_left"] == pytest.approx(3 * events[0]["seconds"], abs=0.1)
     assert [event["share"] for event in events] == [0.25, 1.0]
     assert events[1]["seconds_left"] == 0
+
+
+def test_a_run_that_is_worse_than_its_input_is_marked(capsys: pytest.CaptureFixture[str]) -> None:
+    """Lines of JSON have all notes, and a warning even if the command is quiet."""
+    worse = f"the result shows its own photos {WORSE}: 20.00 dB, 30.00 dB before"
+    run = "room", "done", 1, "", 0, 1.0, worse, ["no masks", worse]
+    with total_progress(1, quiet=False) as progress:
+        progress(*run)
+    assert capsys.readouterr().err == "1/1 room done, worse than the input\n"
+    with json_progress(), total_progress(1, quiet=True) as progress:
+        progress(*run)
+        say_warning("1 of 1 results", quiet=True)
+    events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    said = [(kind, event[kind]) for event in events for kind in ("note", "warning", "worse") if kind in event]
+    warned = ("warning", f"room: {worse}"), ("worse", worse), ("warning", "1 of 1 results")
+    assert said == [("note", "room: no masks"), *warned]
 
 
 def test_brackets_in_names_are_no_markup_in_bars() -> None:

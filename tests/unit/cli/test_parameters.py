@@ -85,3 +85,5 @@ def test_the_seed_may_come_from_the_environment(monkeypatch: pytest.MonkeyPatch)
 def test_unknown_names_have_near_ones() -> None:
     with refuses(UsageError, "--set superpixel", "superpixels"):
         parse_pairs("--set", ["superpixel=3"], KNOWN)
+    with refuses(UsageError, "--set foo", "unknown; --set help"):
+        parse_pairs("--set", ["foo=1"], flat_settings(CompactOptions))

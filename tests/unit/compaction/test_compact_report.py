@@ -9,7 +9,7 @@ import pytest
 
 from gsmerge.compaction import report
 from gsmerge.compaction.new_views import NewViews
-from gsmerge.compaction.report import CompactReport, Covered
+from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
 from gsmerge.report import to_json
 from gsmerge.settings.compact import CompactOptions
 
@@ -103,6 +103,13 @@ def test_summary_line_without_photos(files: tuple[Path, Path]) -> None:
     assert "dB" not in report.summary_line(make_document(files, psnr_before=None, psnr_after=None))
 
 
+def test_photos_as_their_files_have_them_are_left_out_if_all_is_equal(files: tuple[Path, Path]) -> None:
+    for before, is_shown in ((20.0, False), (20.1, True)):
+        document = make_document(files, photo_files=PhotoFiles(before, 24.5001))
+        for text in (report.summary_line(document), "\n".join(report.result_table(document))):
+            assert ("photos as their files have them" in text) == is_shown
+
+
 def test_the_curve_marks_the_result(files: tuple[Path, Path]) -> None:
     points = [{"count": count, "psnr": 20.0, "ssim": 0.5} for count in (10, 30, 90)]
     heading, _, few, nearest, many = report.curve_lines(make_document(files, choices={"curve": points}))
@@ -111,5 +118,7 @@ def test_the_curve_marks_the_result(files: tuple[Path, Path]) -> None:
     assert "result" not in few + many
     pruned = make_document(files, choices={"curve": points, "curve_left_out": 2, "pruned": 4})
     heading, _, few, nearest, many = report.curve_lines(pruned)
-    assert "the 2 photos that they left out" in heading
+    assert "on 2 photos that they left out" in heading
+    one = report.curve_lines(make_document(files, choices={"curve": points, "curve_left_out": 1}))
+    assert "on 1 photo that they left out" in one[0]
     assert nearest.endswith("nearest to the result: 29, of which 25 are seen")

@@ -12,9 +12,10 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import CompactResult, Scene, compact, render
-from gsmerge.facts.compare_photos import have_other_tones
+from gsmerge.facts.compare_photos import _note_hidden, have_other_tones
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
+from gsmerge.runtime.record import record_run
 from gsmerge.types import PicturedScene
 
 Colors = np.ndarray
@@ -54,6 +55,15 @@ def distances(result: CompactResult, scene: Scene) -> tuple[float, float]:
     """Mean difference of colours from the scene's own Gaussians and from its photos."""
     shown, own = (render(each, scene.cameras).images for each in (result.gaussians, scene.gaussians))
     return float(np.abs(shown - own).mean()), float(np.abs(shown - scene.images).mean())
+
+
+def test_less_than_a_percent_that_differs_is_not_noted(room: Scene) -> None:
+    for rows, is_noted in ((1, True), (0, False)):
+        hidden = np.zeros(room.images.shape[:3], bool)
+        hidden[0, :rows] = hidden[0, -1, :9] = True
+        with record_run() as record:
+            _note_hidden(room, hidden, range(4))
+        assert noted(record.notes, "1 of 4 photos differ in part", "2 %") == is_noted
 
 
 @pytest.mark.parametrize("look", [grey, false_colors, styled])

@@ -18,6 +18,7 @@ from messages import names, refuse_all
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
+from gsmerge.cli.console import say_notes
 from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate, near_plane
 from gsmerge.measure.fog import measure_fog
@@ -103,6 +104,14 @@ def test_what_is_counted(actual: Evaluation, scene: Scene, half: Gaussians) -> N
     assert actual.num_views == {"context": 3, "target": 2}
     assert actual.reference == "photos"
     assert actual.notes == ()
+
+
+def test_held_out_views_of_another_scene_are_a_warning(scene: Scene, capsys: pytest.CaptureFixture[str]) -> None:
+    views = held_out()
+    away = replace(views.cameras, viewmats=np.diag([-1.0, 1, -1, 1]) @ views.cameras.viewmats)  # turned about
+    (note,) = evaluate(scene, {}, replace(views, cameras=away), PLAIN).notes
+    say_notes([note])
+    assert capsys.readouterr().err.startswith("gsmerge: warning: the input views have seen only 0 %")
 
 
 def no_pixels(scene: Scene) -> Scene:

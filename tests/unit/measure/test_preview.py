@@ -44,10 +44,10 @@ def test_contact_sheet_shows_scenes_left_to_right_below_their_labels() -> None:
 
 def test_a_view_without_a_photo_has_none_and_no_score() -> None:
     photo = np.full((12, 20, 3), 0.2, np.float32)
-    first, second = preview.view_pictures([("one", blob(0.3))], cameras(2), [None, photo])
-    assert [text for text, _ in first] == ["view 0: no photo", "one: 1"]
+    first, second = preview.view_pictures([("one", blob(0.3))], cameras(2), [None, photo], ["a.jpg", "b.jpg"])
+    assert [text for text, _ in first] == ["a.jpg: no photo", "one: 1"]
     assert float(first[0][1].mean()) == preview.DARK
-    assert [text.partition(",")[0] for text, _ in second] == ["photo", "one: 1"]
+    assert [text.partition(",")[0] for text, _ in second] == ["b.jpg", "one: 1"]
     assert second[1][0].endswith("dB to the photo")
 
 

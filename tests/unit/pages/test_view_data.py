@@ -28,6 +28,7 @@ from gsmerge.measure.preview import to_picture
 from gsmerge.pages import data, splats
 from gsmerge.pages.data import ViewData, collect, encode_still, short_names
 from gsmerge.pages.marks import DROPS, FAINT, draw_shares, light_shares
+from gsmerge.pages.page import headline
 from gsmerge.pages.splats import pack_splats
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.metrics import psnr
@@ -69,6 +70,15 @@ def held_out() -> Views:
 @pytest.fixture(scope="module")
 def actual(scene: Scene, half: Gaussians, held_out: Views) -> ViewData:
     return collect("room", scene, {"half": half, "all": scene.gaussians}, (300, 200, 100), held_out)
+
+
+def test_a_result_that_is_worse_has_no_expected_gain(small: Scene) -> None:
+    """It may be of another scene; held-out photos say it themselves."""
+    results = {"other": small.gaussians[:10], "same": small.gaussians}
+    made = collect("room", small, results, (300, 10, 300), new_gains=dict.fromkeys(results, (6.5, 9.0)))
+    assert [side.new_gain for side in made.sides] == [None, None, (6.5, 9.0)]
+    assert noted(made.notes, "other", "worse than room")
+    assert "expected" not in headline(made)
 
 
 def decoded(still: bytes | None) -> np.ndarray:

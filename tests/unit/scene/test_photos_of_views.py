@@ -261,7 +261,7 @@ def test_names_that_were_given_to_other_photos(folder: Path, truth: np.ndarray) 
         path.write_bytes(contents[(view + 1) % VIEWS])
     loaded = load_scene(folder)
     assert right_ones(loaded, truth) == [True] * VIEWS
-    assert any("matched with views by their content" in text for text in loaded.notes)
+    assert any("matched with views by their content" in text and ": photo " in text for text in loaded.notes)
 
 
 def test_numbers_of_which_names_say_nothing(folder: Path, truth: np.ndarray) -> None:

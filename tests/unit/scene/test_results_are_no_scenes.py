@@ -100,6 +100,27 @@ def test_a_folder_of_results_alone(folder: Path, tiny: Tiny, tmp_path: Path) -> 
         find_scene_files(folder)
 
 
+def test_cameras_of_a_result_with_the_scene_s_name(folder: Path, tiny: Tiny) -> None:
+    """The scene keeps its own cameras, and without them gets none; results have theirs."""
+    write_inria(cameras := folder / "room.cameras.json", tiny)
+    assert find_scene_files(folder / "room.ply").cameras == folder / "transforms.json"  # the result may be elsewhere
+    write_gaussians(result := folder / "room.sog", tiny.gaussians[::5])
+    assert [find_scene_files(path).cameras for path in (folder, result)] == [folder / "transforms.json", cameras]
+    (folder / "transforms.json").unlink()
+    assert find_scene_files(folder / "room.ply").cameras is None
+    result.unlink()
+    assert find_scene_files(folder / "room.ply").cameras == cameras
+    (folder / "room.ply").unlink()
+    assert find_scene_files(save_result(folder / "room.ply", tiny)).cameras == cameras
+
+
+def test_a_scene_that_gsmerge_wrote_keeps_its_own_cameras(tmp_path: Path, tiny: Tiny) -> None:
+    tiny.save(tmp_path)
+    write_inria(tmp_path / "scene.cameras.json", tiny)
+    write_gaussians(tmp_path / "scene.sog", tiny.gaussians[::5])
+    assert find_scene_files(tmp_path / "scene.ply").cameras == tmp_path / "transforms.json"
+
+
 def test_a_result_without_cameras_is_noted(tmp_path: Path, tiny: Tiny) -> None:
     from gsmerge.scene.exporters import make_hints
 

@@ -152,7 +152,7 @@ def test_images_under_the_names_of_other_views(tiny_folder: Path, tiny: Tiny) ->
     assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)
     assert loaded.left_out is None
     (note,) = loaded.notes
-    assert names(note, "by their content", "images/a b/2.png: a b/11.png")
+    assert names(note, "by their content", "photo a b/11.png for view images/a b/2.png")
 
 
 # What does not fit

@@ -14,7 +14,7 @@ from messages import refuses
 from plyfile import PlyData
 
 from gsmerge.errors import SceneError
-from gsmerge.io import read_ply
+from gsmerge.io import read_gaussians, read_ply
 from gsmerge.io.formats.ply import header_counts, open_ply, open_rows
 
 from .test_read import columns, save
@@ -111,3 +111,12 @@ def test_tensors_of_lyra_1_are_named(tmp_path: Path) -> None:
     torch.save(torch.zeros(1, 5, 14), tmp_path / "gaussians_0.ply")
     with refuses(SceneError, "gaussians_0.ply", "torch.save", "Lyra 1", "save_gaussians_orig: true"):
         read_ply(tmp_path / "gaussians_0.ply")
+
+
+def test_all_missing_columns_are_named(tmp_path: Path) -> None:
+    """Two scales without a third are those of flat Gaussians; a page is written and not read."""
+    points = save(tmp_path / "a.ply", columns(names=("x", "y", "z", "red", "green", "blue")))
+    with refuses(SceneError, points, "columns opacity, scale_0, scale_1, scale_2, rot_0"):
+        read_ply(points)
+    with refuses(SceneError, "a.html", ".compressed.ply, .ply, .spz", ".gsm", "meta.json"):
+        read_gaussians(tmp_path / "a.html")
