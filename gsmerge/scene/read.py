@@ -172,7 +172,7 @@ def read_scene(
         protect: Folder of images with the names of the photos, white where a text or a face has to stay sharp; see
             :attr:`Scene.importance`.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
-        **hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
+        **hints: ``exporter``, ``quats``, ``scales``, ``order``, ``scene_scale``, ``max_side``, see
             :class:`gsmerge.settings.reading.ReadHints`.
 
     Returns:
@@ -254,7 +254,8 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
     # An exporter of raw opacities does not decide: they are recognised, and some of its versions write logits
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
         opacity = "logit"
-    return read_parts(files.parts, opacity=opacity) if files.parts else read_gaussians(files.ply, opacity=opacity)
+    encodings: dict[str, Any] = {"opacity": opacity, "scales": hints.scales}
+    return read_parts(files.parts, **encodings) if files.parts else read_gaussians(files.ply, **encodings)
 
 
 def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True) -> Loaded:
