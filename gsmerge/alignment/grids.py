@@ -43,6 +43,7 @@ class Grid:
     notes: tuple[str, ...]  # notes for the user, one sentence each
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
     given: np.ndarray | None = None  # ``[c,4,4]`` given poses that the photos confirm; Gaussians move there
+    left_out: tuple[str, ...] = ()  # notes on views and cameras that do not fit each other
 
     @property
     def size(self) -> Size:

@@ -511,7 +511,7 @@ def _make_load(
         alignment = check_pixels(scene)
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)
-    return Loaded(
+    load = Loaded(
         scene=without_photo(scene, [view for view, camera in enumerate(views) if camera in absent]),
         info=ply.info,
         files=files,
@@ -524,6 +524,7 @@ def _make_load(
         problem=result.problem,
         moves=result.moves,
     )
+    return load.with_left_out(result.left_out)
 
 
 def _make_scene(
