@@ -103,13 +103,13 @@ def _describe(grid: Grid, fits: _Fits, *, is_left_out: bool) -> tuple[str, ...]:
         notes += [f"{count} of {num_views} views in the file {has} no camera: {its} Gaussians belong to no pixels"]
     if wrong:
         usual = float(np.median(fits.medians.min(0)[fits.cameras >= 0]))
-        px = {camera: min(row[camera + skipped] for skipped, row in enumerate(fits.medians)) for camera in wrong}
-        which = list_some([f"{names[camera]} ({distance:.3g} px)" for camera, distance in px.items()])
+        px = max(min(row[camera + skipped] for skipped, row in enumerate(fits.medians)) for camera in wrong)
+        which = list_some([names[camera] for camera in wrong])
         subject, verb = ("camera of 1", "does") if len(wrong) == 1 else (f"cameras of {len(wrong)}", "do")
         views = "that view is" if len(wrong) == 1 else "these views are"
         effect = f"{views} left out" if is_left_out else "no row gets a pixel"
         notes += [
-            f"the {subject} of {num_views} views {verb} not fit the Gaussians there, so {effect}: {which} from their"
-            f" pixels, where other views have {usual:.2g} px; give the right cameras"
+            f"the {subject} of {num_views} views {verb} not fit the Gaussians there, so {effect}: {which} (up to"
+            f" {px:.3g} px from their pixels, other views {usual:.2g} px); give the right cameras"
         ]
     return tuple(notes)

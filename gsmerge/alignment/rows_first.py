@@ -361,7 +361,7 @@ def _choose_cameras(
 
     Raises SceneError if no cameras see them, or if the rows turn out to be pixels of other cameras or larger photos.
     """
-    from gsmerge.alignment.explain import check_frame, count_error
+    from gsmerge.alignment.explain import check_frame, count_error, describe_lost_order
     from gsmerge.alignment.unaligned import choose_cameras
     from gsmerge.alignment.upright import upright_rotation
 
@@ -386,10 +386,12 @@ def _choose_cameras(
     cameras, camera_file, grid = place.cameras, place.grid.camera_file, place.grid
     if place.frame is not IDENTITY:
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
-    notes, images = (*place.notes(source.camera_file.convention), *more_notes), source.inputs(grid).images
+    notes, images = [*place.notes(source.camera_file.convention), *more_notes], source.inputs(grid).images
     left_out = describe_misfits(source, grid) if place.frame is IDENTITY else ()
+    if not left_out and source.order not in MAY_BE_UNALIGNED:
+        notes += describe_lost_order(source.ply.info, grid.cameras)
     return AlignmentResult(
-        None, cameras, images, camera_file, notes, grid.transform, problem=no_pixels.problem, left_out=left_out
+        None, cameras, images, camera_file, tuple(notes), grid.transform, problem=no_pixels.problem, left_out=left_out
     )
 
 
@@ -445,7 +447,7 @@ def _list_notes(usual: CameraFile, recovery: Recovery) -> list[str]:
         evidence = "own grid" if usual.pixel_ids is None else "own order"
         separate = len(set(map(bytes, usual.Ks))) > 1
         subject = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
-        notes.append(f"no cameras were given: {subject} are estimated from the Gaussians' {evidence}")
+        notes.append(f"no cameras are used: {subject} are estimated from the Gaussians' {evidence}")
     in_order = layout.is_plain and frame is IDENTITY and len(layout.views) == count
     orders = view_orders(usual.names)
     if in_order and layout.views == orders[1] != orders[0]:

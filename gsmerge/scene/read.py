@@ -310,7 +310,7 @@ def _note_left_out(load: Loaded, files: SceneFiles, cause: SceneError) -> Loaded
     verb = "is" if names == [str(files.cameras)] else "are"
     remedy = cause.remedy or _name_files(load, files)
     note = " ".join(f"{' and '.join(names)} {verb} left out: {where}{cause.problem}; {remedy}".split())
-    return replace(load, notes=(*(text for text in load.notes if text not in repeated), note), left_out=note)
+    return replace(load, notes=(note, *(text for text in load.notes if text not in repeated)), left_out=note)
 
 
 def _name_files(load: Loaded, files: SceneFiles) -> str:
@@ -460,7 +460,9 @@ def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> 
     notes = [advice] if advice else []
     _check_hints(ply, hints)
     if files.images is not None:
-        reason = "no cameras were found, such as a transforms.json or a COLMAP model; name them with --cameras"
+        reason = "there are no cameras, such as a transforms.json or a COLMAP model; name them with --cameras"
+        if "cameras" in files.named:
+            reason = f"only cameras show which views they have, and --cameras {NONE} leaves cameras out"
         notes += [f"the photos in {files.images} are not used: {reason}"]
     problem = "expected one Gaussian per pixel, found no cameras"
     return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)

@@ -1,4 +1,4 @@
-"""One of several views has no camera, or a wrong one: the other views keep their pixels."""
+"""Rows of which some or all lack the camera, or the order, that tells their pixels."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from messages import names
+from messages import names, noted
 from tiny_scene import edited_json
 
+from gsmerge.io.formats.read import read_ply
+from gsmerge.io.formats.write import write_ply
 from gsmerge.scene.read import load_scene
 
 VIEWS, AREA = 5, 96 * 72
@@ -67,3 +69,14 @@ def test_too_few_cameras_fit(folder: Path) -> None:
     assert loaded.left_out is not None
     assert names(loaded.left_out, "cameras of 2 of 5 views", "view_003.png", "view_004.png")
     assert not loaded.scene.has_own_pixels
+
+
+def test_rows_in_no_order_are_noted(folder: Path) -> None:
+    """Other numbers of rows are usual: merged and trained scenes have no pixels."""
+    gaussians = read_ply(folder / "scene.ply").gaussians
+    shuffled = gaussians[np.random.default_rng(0).permutation(len(gaussians))]
+    write_ply(folder / "scene.ply", shuffled, overwrite=True)
+    assert noted(load_scene(folder).notes, "34,560 rows", "in no known order")
+    assert not noted(load_scene(folder, order="none").notes, "in no known order")
+    write_ply(folder / "scene.ply", shuffled[:-7], overwrite=True)
+    assert not noted(load_scene(folder).notes, "in no known order")
