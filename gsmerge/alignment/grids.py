@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment.cameras import Poses, describe_other_convention
-from gsmerge.alignment.layouts import TRIMS, da3_box
+from gsmerge.alignment.layouts import ESTIMATED, TRIMS, da3_box
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Similarity
@@ -27,6 +27,7 @@ SIDES = (504, 518)  # pixels to which Depth Anything 3 and others resize the lon
 SQUARE = 256  # side of the images of pixelSplat and its relatives, pixels
 _MULTIPLES = (8, PATCH)  # if photos are cropped, both sides of the grid are multiples of one of these
 _STRETCHED, _MAX_STRETCH = 16, 0.15  # ReSplat stretches photos to multiples of 16 pixels, and by at most 15 %
+_STRETCHES = 0.1  # relative difference of the scales of width and height above which few models resize photos
 _MIN_CROP = 0.5  # smallest share of a photo's area that is left after cropping
 _NEAR_SIZE = 0.05  # largest difference between assumed camera sizes and photo sizes, divided by the longer side
 _MAX_ENLARGED = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
@@ -42,6 +43,7 @@ class Grid:
     notes: tuple[str, ...]  # notes for the user, one sentence each
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
     given: np.ndarray | None = None  # ``[c,4,4]`` given poses that the photos confirm; Gaussians move there
+    left_out: tuple[str, ...] = ()  # notes on views and cameras that do not fit each other
 
     @property
     def size(self) -> Size:
@@ -122,6 +124,8 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
     x, y = (file_side / side for file_side, side in zip(file_size, size, strict=True))
     transform = replace(transform, scale_x=x * transform.scale_x, scale_y=y * transform.scale_y)
     note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
+    if camera_file.source == ESTIMATED and abs(transform.scale_x / transform.scale_y - 1) > _STRETCHES:
+        note += "; if the model did not squeeze them, rows were left out of the file: name its cameras with --cameras"
     is_same = file_size == (transform.width, transform.height)
     return Grid(camera_file, to_cameras(camera_file), transform, () if is_same else (note,))
 

@@ -19,6 +19,7 @@ _MAX_TRIM = 0.25  # largest trim at every border, over the shorter side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
 _FEW_ROWS = 0.01  # parts with a smaller share of the rows of the largest part count as empty
 _ORDERED = 0.99  # share of pairs of consecutive rows whose pixels must be in ascending order
+_MAX_STEP = 10  # pixels from one to the next that was kept or dropped
 DEPTH_SHARE = 0.9  # share of each view's pixels that Depth Anything 3 exports, the nearest ones
 
 
@@ -174,6 +175,18 @@ def dropped_layout(pixel_ids: np.ndarray, views: int, width: int, height: int) -
     pixels = tuple(pixel_ids[rows] % area for rows in parts)
     cameras = tuple(range(views))
     return Layout(f"some pixels dropped, {order}", "pruned", order, width, height, cameras, tuple(parts), pixels)
+
+
+def thinned_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:
+    """Yield the layouts of ``count`` rows if every k-th pixel of all views was kept, or every k-th one dropped."""
+    total = views * width * height
+    for step in range(2, _MAX_STEP + 1):
+        for first in range(step):
+            num_chosen = len(range(first, total, step))
+            if count in (num_chosen, total - num_chosen):
+                is_chosen = np.arange(total) % step == first
+                pixel_ids = np.flatnonzero(is_chosen if count == num_chosen else ~is_chosen)
+                yield dropped_layout(pixel_ids, views, width, height)
 
 
 def move_layout(layout: Layout, width: int, height: int, left: int, top: int) -> Layout:

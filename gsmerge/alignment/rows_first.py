@@ -45,6 +45,7 @@ from gsmerge.alignment.layouts import (
     view_orders,
 )
 from gsmerge.alignment.match import GridLayout, RowSource, match_views, other_grids, rescore
+from gsmerge.alignment.most_views import align_most_views, describe_misfits
 from gsmerge.alignment.score import AS_NEAR_PX, SHUFFLED_MARGIN, score_layout
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
@@ -77,6 +78,7 @@ class AlignmentResult:
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
     given: np.ndarray | None = None  # ``[c,4,4]`` given poses, to which views are to be moved with their Gaussians
     problem: str | None = None  # why the rows belong to no pixels; None if they do
+    left_out: tuple[str, ...] = ()  # notes on views and cameras that do not fit each other
 
     @property
     def layout(self) -> Layout | None:
@@ -196,6 +198,7 @@ def _run_searches(source: RowSource, known_grids: Sequence[Grid]) -> Iterator[Re
     yield recovery
     if recovery is None and known_grids:
         yield _move_cameras(source, known_grids[0])
+        yield align_most_views(source, known_grids[0])
     yield _align_by_centres(source, (place for grid in known_grids for place in _usual_places(source, grid)))
     if source.order not in MAY_BE_UNALIGNED:
         from gsmerge.alignment.row_grid import find_layouts  # here because few files need it
@@ -358,7 +361,7 @@ def _choose_cameras(
 
     Raises SceneError if no cameras see them, or if the rows turn out to be pixels of other cameras or larger photos.
     """
-    from gsmerge.alignment.explain import check_frame, count_error
+    from gsmerge.alignment.explain import check_frame, count_error, describe_lost_order
     from gsmerge.alignment.unaligned import choose_cameras
     from gsmerge.alignment.upright import upright_rotation
 
@@ -383,8 +386,13 @@ def _choose_cameras(
     cameras, camera_file, grid = place.cameras, place.grid.camera_file, place.grid
     if place.frame is not IDENTITY:
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
-    notes, images = (*place.notes(source.camera_file.convention), *more_notes), source.inputs(grid).images
-    return AlignmentResult(None, cameras, images, camera_file, notes, grid.transform, problem=no_pixels.problem)
+    notes, images = [*place.notes(source.camera_file.convention), *more_notes], source.inputs(grid).images
+    left_out = describe_misfits(source, grid) if place.frame is IDENTITY else ()
+    if not left_out and source.order not in MAY_BE_UNALIGNED:
+        notes += describe_lost_order(source.ply.info, grid.cameras)
+    return AlignmentResult(
+        None, cameras, images, camera_file, tuple(notes), grid.transform, problem=no_pixels.problem, left_out=left_out
+    )
 
 
 def _check_photo_size(source: RowSource) -> None:
@@ -424,6 +432,7 @@ def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
         transform=grid.transform,
         recovery=recovery,
         moves=grid.moves,
+        left_out=grid.left_out,
         given=None if grid.given is None else frame.move_viewmats(grid.given),
     )
 
@@ -438,7 +447,7 @@ def _list_notes(usual: CameraFile, recovery: Recovery) -> list[str]:
         evidence = "own grid" if usual.pixel_ids is None else "own order"
         separate = len(set(map(bytes, usual.Ks))) > 1
         subject = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
-        notes.append(f"no cameras were given: {subject} are estimated from the Gaussians' {evidence}")
+        notes.append(f"no cameras are used: {subject} are estimated from the Gaussians' {evidence}")
     in_order = layout.is_plain and frame is IDENTITY and len(layout.views) == count
     orders = view_orders(usual.names)
     if in_order and layout.views == orders[1] != orders[0]:
@@ -446,5 +455,5 @@ def _list_notes(usual: CameraFile, recovery: Recovery) -> list[str]:
     elif not (in_order and layout.views in orders):
         used = len(set(layout.views))
         notes.append(f"read as: {recovery.description}")
-        notes += [f"{used} of {count} views are in the file"] * (used < count)
+        notes += [f"{used} of {count} views are in the file"] * (used < count and not grid.left_out)
     return notes

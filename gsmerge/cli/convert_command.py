@@ -32,7 +32,8 @@ class PhotoOptions(Settings):
                  "a .npz for the arrays of its Feature Gaussians."),
     opt.changed("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
-    opt.changed("hint", help="How the files store opacity, if it is not recognised: opacity=logit or opacity=raw."),
+    opt.changed("hint", help="How the files store opacity and scales, if it is not recognised: opacity=logit or "
+                "raw, scales=log or linear."),
     opt.settings_option(FileOptions, PhotoOptions, CleanOptions, PlacementOptions, example="normals=false"),
     "up scale rotate translate sh_degree crop drop overwrite",
 )  # fmt: skip
@@ -58,7 +59,7 @@ def convert(args: opt.Args) -> None:
     from gsmerge.runtime.record import record_run
 
     options = ConvertOptions(
-        inputs, output, args.cameras, images, args.opacity, cleaning, placement,
+        inputs, output, args.cameras, images, args.opacity, args.hints().scales, cleaning, placement,
         normals=writing.normals, full_columns=writing.columns == "full",
         site=writing.site, overwrite=args.overwrite,
     )  # fmt: skip

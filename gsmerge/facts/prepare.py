@@ -196,8 +196,10 @@ def _with_references(
     elif own:
         reference = Reference(ROW_COLORS, every, every)
     else:
-        reason = "no photos" if input_scene.images is None else "photos do not count"
-        note(f"{reason}: renders of the scene itself are used instead")
+        lacks_photos = input_scene.images is None
+        reason = "no photos, and the rows are not the pixels of the views" if lacks_photos else "photos do not count"
+        remedy = "; name photos with --images" if lacks_photos else ""
+        note(f"{reason}: renders of the scene itself are used instead{remedy}")
         scene = draw_pictures(scene)
         shown = tuple(view for view in every if scene.images[view].any())  # any result equals an empty view
         return Prepared(input_scene, scene, frame, Reference(RENDERS, every, shown or every), repeated, False, unseen)

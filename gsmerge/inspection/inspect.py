@@ -215,7 +215,7 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         facts["num_unseen"] = int((count_views_in_world(scene.gaussians, scene.cameras) == 0).sum())
     if not is_result:
         is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)
-        facts["exporter"] = exporter_names(load.exporters) if is_known else f"not known: {load.info.layout}"
+        facts["exporter"] = (is_known and exporter_names(load.exporters)) or f"not known: {load.info.layout}"
     return facts
 
 

@@ -450,6 +450,5 @@ def find_cameras_of_model(info: FileInfo) -> str:
 
 
 def exporter_names(exporters: Sequence[Exporter]) -> str:
-    """Join the titles of exporters for a message."""
-    titles = join_words(model.title for exporter in exporters for model in exporter.models)
-    return titles or "none of the known ones"
+    """Join the titles of exporters for a message; empty without any."""
+    return join_words(model.title for exporter in exporters for model in exporter.models)

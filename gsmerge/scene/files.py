@@ -236,7 +236,15 @@ def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> 
     # If a folder has several scenes, each may have its own folder of images
     names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
     own_folders = [folder / name for folder in folders for name in names]
-    return next((folder for folder in own_folders + folders if folder.is_dir() and list_images(folder)), None)
+    may_be = (folder for folder in own_folders + folders if folder.is_dir() and not _is_other_scene(folder, ply))
+    return next((folder for folder in may_be if list_images(folder)), None)
+
+
+def _is_other_scene(folder: Path, ply: Path) -> bool:
+    """Return whether a folder has other Gaussians than ``ply``, and its photos are in folders below, as in a scene."""
+    if Path(os.path.realpath(ply)).is_relative_to(os.path.realpath(folder)):
+        return False
+    return bool(_plys_in(folder)) and all(photo.parent != folder for photo in list_images(folder))
 
 
 def _find_mask_path(images: Path | None, roots: Sequence[Path]) -> Path | None:

@@ -506,7 +506,7 @@ def _explain(proposal: Proposal, view: int, name: str) -> str:
     photo = proposal.named[view]
     if photo is None:
         return f"{name}: no photo shows this view"
-    return f"{_inside(proposal.pool[photo], proposal)}: shows something else"
+    return f"{_inside(proposal.pool[photo], proposal)}: shows something else than its camera"
 
 
 def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None]) -> list[str]:

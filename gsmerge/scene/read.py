@@ -172,7 +172,7 @@ def read_scene(
         protect: Folder of images with the names of the photos, white where a text or a face has to stay sharp; see
             :attr:`Scene.importance`.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
-        **hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
+        **hints: ``exporter``, ``quats``, ``scales``, ``order``, ``scene_scale``, ``max_side``, see
             :class:`gsmerge.settings.reading.ReadHints`.
 
     Returns:
@@ -254,7 +254,8 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
     # An exporter of raw opacities does not decide: they are recognised, and some of its versions write logits
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
         opacity = "logit"
-    return read_parts(files.parts, opacity=opacity) if files.parts else read_gaussians(files.ply, opacity=opacity)
+    encodings: dict[str, Any] = {"opacity": opacity, "scales": hints.scales}
+    return read_parts(files.parts, **encodings) if files.parts else read_gaussians(files.ply, **encodings)
 
 
 def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True) -> Loaded:
@@ -309,7 +310,7 @@ def _note_left_out(load: Loaded, files: SceneFiles, cause: SceneError) -> Loaded
     verb = "is" if names == [str(files.cameras)] else "are"
     remedy = cause.remedy or _name_files(load, files)
     note = " ".join(f"{' and '.join(names)} {verb} left out: {where}{cause.problem}; {remedy}".split())
-    return replace(load, notes=(*(text for text in load.notes if text not in repeated), note), left_out=note)
+    return replace(load, notes=(note, *(text for text in load.notes if text not in repeated)), left_out=note)
 
 
 def _name_files(load: Loaded, files: SceneFiles) -> str:
@@ -459,7 +460,9 @@ def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> 
     notes = [advice] if advice else []
     _check_hints(ply, hints)
     if files.images is not None:
-        reason = "no cameras were found, such as a transforms.json or a COLMAP model; name them with --cameras"
+        reason = "there are no cameras, such as a transforms.json or a COLMAP model; name them with --cameras"
+        if "cameras" in files.named:
+            reason = f"only cameras show which views they have, and --cameras {NONE} leaves cameras out"
         notes += [f"the photos in {files.images} are not used: {reason}"]
     problem = "expected one Gaussian per pixel, found no cameras"
     return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
@@ -510,7 +513,7 @@ def _make_load(
         alignment = check_pixels(scene)
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)
-    return Loaded(
+    load = Loaded(
         scene=without_photo(scene, [view for view, camera in enumerate(views) if camera in absent]),
         info=ply.info,
         files=files,
@@ -523,6 +526,7 @@ def _make_load(
         problem=result.problem,
         moves=result.moves,
     )
+    return load.with_left_out(result.left_out)
 
 
 def _make_scene(

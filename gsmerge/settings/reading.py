@@ -9,6 +9,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.settings.setting import Settings, setting
 
 OpacityChoice = Literal["auto", "logit", "raw"]
+ScaleChoice = Literal["auto", "log", "linear"]
 QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
 Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
 
@@ -24,6 +25,8 @@ class ReadHints(Settings):
     quats: QuatChoice = setting("auto", "How the file stores rotations: wxyz, xyzw, xyzw-root (w last; the rotation "
         "applied twice), or camera (relative to the camera of each view).",
         "`auto`: as the exporter does. Where the pixels are known, this is checked against the surface.")  # fmt: skip
+    scales: ScaleChoice = setting("auto", "How the file stores scales: log or linear; auto reads them as logarithms, "
+        "unless the size of the scene shows that they are linear.")  # fmt: skip
     order: Order = setting("auto", "Order of the rows; none: the Gaussians belong to no pixels.",
         "`unordered`: each Gaussian may come from a pixel, but its row does not show which.")  # fmt: skip
     scene_scale: float | None = setting(None, "Scale of the Gaussians' world relative to that of the cameras; null: "

@@ -118,4 +118,4 @@ def test_photos_are_used_with_order_none_where_cameras_are_known(
 
 def test_an_effort_that_is_too_short_for_a_fit_says_so(bare: Path, tmp_path: Path, run: Any) -> None:
     report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", "--budget", "20%", "--effort", "fast")
-    assert noted(report["notes"], "there is no fit", "--effort best")
+    assert noted(report["notes"], "without cameras there is a fit only", "--effort best")

@@ -351,3 +351,22 @@ def test_a_new_format_of_several_files_with_cameras_is_one_row(
     assert_refused(run("compact", small_scene, *quick, "--levels", "2"), 2, "small.parts", "--levels")
     run("compact", small_scene, *quick, code=0)
     assert (tmp_path / "small.views").read_text() == str(len(gsmerge.read_scene(small_scene)))
+
+
+def test_linear_scales_by_a_hint(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    """The commands that read files take the hint, and results have logarithms."""
+    scene = gsmerge.read_ply(small_scene / "scene.ply").gaussians
+    data = PlyData.read(str(small_scene / "scene.ply"))
+    for axis in range(3):
+        data["vertex"][f"scale_{axis}"] = scene.scales[:, axis]
+    data.write(str(tmp_path / "linear.ply"))
+    run("convert", tmp_path / "linear.ply", tmp_path / "out.ply", "--hint", "scales=linear", code=0)
+    np.testing.assert_allclose(read(tmp_path / "out.ply").scales, scene.scales, rtol=1e-5)
+    loaded = gsmerge.read_scene(tmp_path / "linear.ply", cameras="none", images="none", scales="linear")
+    np.testing.assert_allclose(loaded.gaussians.scales, scene.scales, rtol=1e-5)
+    assert_refused(
+        run("compact", small_scene, "-o", tmp_path / "x.ply", "--hint", "scales=linear"),
+        3,
+        "scene.ply",
+        "scales=linear",
+    )

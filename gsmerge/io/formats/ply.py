@@ -70,7 +70,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
     unused = check_columns(path, rows.dtype, layers)
     names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(comment for element in data.elements for comment in element.comments))
-    linear, white, notes = _value_conventions(path, rows)
+    white, notes = _find_white(path, rows)
     if arrays.SCALES[2] not in names:
         notes += [f"2D Gaussians have two scales; the third is set to {THIN:g} of the smaller one"]
         comments += (arrays.FLAT_COMMENT,)
@@ -83,24 +83,17 @@ def read_rows(path: Path) -> arrays.StoredRows:
         comments=comments,
         extra_elements=extra_elements,
         notes=(*notes, *([_PREFIXED.format(prefix)] if prefix else []), *unused),
-        adapt=partial(_adapt_rows, linear=linear, white=white) if notes else None,
+        adapt=partial(_adapt_rows, white=white) if notes else None,
     )
 
 
-def _value_conventions(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[bool, float, list[str]]:
-    """Find how scales and plain colours are stored.
-
-    Returns whether scales are linear, the stored value of a full colour channel, and notes on both.
-    """
-    colors, notes = arrays.color_columns(rows.dtype.names), list[str]()
-    linear = colors == arrays.PLAIN_COLORS[1] and not arrays.are_logarithms(_read_column(path, rows, arrays.SCALES[0]))
-    if linear:
-        notes += ["scales are read as linear, since the columns are r, g and b and hardly any scale is negative"]
+def _find_white(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[float, list[str]]:
+    """Find the stored value of a full channel of plain colours; also return notes."""
+    colors = arrays.color_columns(rows.dtype.names)
     float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
     if float_colors and np.nanmedian(_read_column(path, rows, colors[0])) > 1:
-        notes += [f"colours are read as 0 to 255, since half of the values of {colors[0]} are above 1"]
-        return linear, 255.0, notes
-    return linear, 1.0, notes
+        return 255.0, [f"colours are read as 0 to 255, since half of the values of {colors[0]} are above 1"]
+    return 1.0, []
 
 
 def read_columns(path: Path, rows: np.ndarray | arrays.PackedRows, names: Sequence[str]) -> np.ndarray:
@@ -119,17 +112,16 @@ def _read_column(path: Path, rows: np.ndarray | arrays.PackedRows, name: str) ->
     return np.asarray(read_columns(path, rows, [name])[name])
 
 
-def _adapt_rows(rows: np.ndarray, *, linear: bool, white: float) -> np.ndarray:
+def _adapt_rows(rows: np.ndarray, *, white: float) -> np.ndarray:
     """Return a block of rows with three log scales; 2D Gaussians get a thin third scale.
 
-    ``linear``: the stored scales are linear, not logarithms. ``white``: stored value of a full colour channel.
+    ``white``: stored value of a full colour channel.
     """
     columns = {name: rows[name] for name in rows.dtype.names or ()}
     if white != 1:
         columns |= {name: columns[name] / white for name in arrays.color_columns(rows.dtype.names)}
     scales = [columns[name].astype(np.float64) for name in arrays.SCALES if name in columns]
-    with np.errstate(all="ignore"):  # a scale of 0
-        scales = [log(scale) for scale in scales] if linear else scales
+    with np.errstate(all="ignore"):  # scales that are not finite
         scales = scales if len(scales) == 3 else [*scales, np.minimum(*scales) + float(log(THIN))]
         columns |= {name: scale.astype(np.float32) for name, scale in zip(arrays.SCALES, scales, strict=True)}
     out = np.empty(len(rows), [(name, column.dtype) for name, column in columns.items()])

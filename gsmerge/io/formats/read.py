@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +12,17 @@ import numpy as np
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import lower_median, median, quantiles, rgb_to_sh0
+from gsmerge.geometry import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
+from gsmerge.io.formats.scale_units import LINEAR_NOTE, ScaleJudgement, judge_scales, log_of_scales
 from gsmerge.io.formats.table import DEPTHS, META, PLY, READ_ENDINGS, find_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.stored_rows import convert_rows
-from gsmerge.runtime.memory import free_pages, gather, make_array
+from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.reading import OpacityChoice
+from gsmerge.settings.reading import OpacityChoice, ScaleChoice
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.words import count_words
 
@@ -29,12 +31,7 @@ MIN_PADDING = 16  # number of equal rows at the origin that are padding; fewer m
 MIN_FINITE = 0.002  # least share of finite rows; a file with fewer is refused
 MAX_HARMONIC = 1e6  # larger harmonics are clipped, so that float32 can square and sum the rendered values
 FREED_ROWS = 1 << 17  # rows after which the memory of large columns is freed
-_MIN_JUDGED = 100  # least number of Gaussians or values for a judgement of scales or encodings
-_SCALE_GAUSSIANS = 20_000  # size of the sample for the judgement of scales
-_MAX_WIDTH = 0.25  # scales are wrong if half of the standard deviations exceed this share of the scene's width
-# Bound on half of the standard deviations, in units of the scene's width divided by the square root of the number of
-# Gaussians. Sound files have 0.3 to 2. Files with linear scales, read as logarithms, have 10 to 1,000.
-_MAX_SPACINGS = 6.0
+_MIN_JUDGED = 100  # least number of values for a judgement of encodings
 _RAW_ROUNDING = 0.01  # opacities that were rounded to half floats may exceed [0, 1] by this
 
 
@@ -111,7 +108,7 @@ def degree_notes(info: FileInfo) -> tuple[str, ...]:
 
 
 @check_arguments
-def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
+def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto") -> GaussianFile:
     """Read a PLY file of Gaussians, binary or ascii, with harmonics of any degree up to 4.
 
     The column ``filter_3D`` is applied to scales and opacities; other additional columns are not used. Without
@@ -122,42 +119,47 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
         path: The file.
         opacity: How opacities are stored. "auto" reads them as opacities if the finite values lie in [0, 1], else
             as logits. Infinite logits are opacities of 0 and 1.
+        scales: How scales are stored. "auto" reads them as logarithms, unless the size of the scene shows that
+            they are linear.
 
     Raises:
         SceneError: If the file cannot be read, lacks columns, or has fewer than 2 finite Gaussians in 1,000 rows.
-        ValueError: If ``opacity`` is not "auto", "logit" or "raw".
+        ValueError: If ``opacity`` is not "auto", "logit" or "raw", or ``scales`` not "auto", "log" or "linear".
 
     Example:
         >>> len(gsmerge.read_ply("demo/scene.ply").gaussians)
         7680
     """
-    return read_parts([Path(path)], opacity=opacity)
+    return read_parts([Path(path)], opacity=opacity, scales=scales)
 
 
-def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> GaussianFile:
+def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto") -> GaussianFile:
     """Read files as one, in the given order: a PLY file, PLY files with equal columns, or files of depth maps.
 
     Errors are those of :func:`read_ply`.
     """
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
+    if scales not in ("auto", "log", "linear"):
+        raise ValueError(f"scales: expected 'auto', 'log' or 'linear', got {scales!r}")
     is_depth = find_format(paths[0]) is DEPTHS
     parts = _READ_FRAMES(paths) if is_depth else parallel_map(ply.read_rows, paths)
     for path, part in zip(paths, parts, strict=True):
         if part.rows.dtype != parts[0].rows.dtype:
             problem = f"expected the same columns as in {paths[0].name}, found others, so these are no parts of a scene"
             raise SceneError(path, problem, "name one of the files")
-    return convert_files(paths, parts, opacity)
+    return convert_files(paths, parts, opacity, scales)
 
 
 @check_arguments
-def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
+def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto") -> GaussianFile:
     """Read a file of Gaussians; the ending of its name tells the format.
 
     Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2), ``.glb``, and ``.npz`` of depth maps. The
     finest level of a ``lod-meta.json`` is read. splat-transform reads ``.ksplat``, ``meta.json`` or its folder,
-    ``.lcc`` and ``.lcc2``. Everything else is read by :func:`read_ply`; only this uses ``opacity``. SceneError if the
-    file cannot be read, is damaged, or holds no finite Gaussian. ValueError for an unknown ``opacity``.
+    ``.lcc`` and ``.lcc2``. Everything else is read by :func:`read_ply`; only this uses ``opacity``
+    and ``scales``. SceneError if the file cannot be read, is damaged, or holds no finite Gaussian. ValueError for an
+    unknown ``opacity`` or ``scales``.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
@@ -171,17 +173,24 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
         problem = f"expected one of {', '.join(READ_ENDINGS)}, found {format_.ending}, which is written and not read"
         raise SceneError(path, problem, "name the file that it was made from")
     if format_.read is ply.read_rows:
-        return read_ply(path, opacity=opacity)
+        return read_ply(path, opacity=opacity, scales=scales)
     return convert_files([path], [format_.read(path)], "auto")
 
 
-def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice) -> GaussianFile:
+def convert_files(
+    paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice, scales: ScaleChoice = "auto"
+) -> GaussianFile:
     """Convert the rows of files to Gaussians, file by file; facts that are not sums are those of the first file."""
     path, stored, dtype = paths[0], parts[0], parts[0].rows.dtype
     names = tuple(dtype.names or ())
     file_bytes = sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True))
     out = _make_arrays(dtype, sum(len(part.rows) for part in parts), file_bytes)
     num_clipped, num_zero_quats = _fill_arrays(paths, parts, out)
+    judgement = _judge_scales(paths, parts, out, scales)
+    scale_notes = (LINEAR_NOTE.format(judgement.why),) if judgement.linear and judgement.why else ()
+    if judgement.linear:
+        parts = [_with_linear_scales(part) for part in parts]
+        num_clipped, num_zero_quats = _fill_arrays(paths, parts, out)
     empty = find_empty(path, out)
     encoding, is_guess = _choose_encoding(paths, parts, out["opacities"], empty, opacity)
     _activate(out["opacities"], out["valid"], encoding)
@@ -210,8 +219,8 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         num_empty=len(empty),
         num_clipped_scales=num_clipped,
         num_zero_quats=max(0, num_zero_quats - len(empty)),  # empty rows usually have zero quaternions
-        odd_scales=_describe_wrong_scales(out["means"], out["scales"], out["valid"]),
-        adapted=(*filter_notes, *stored.notes, *_describe_incomplete(out["valid"])),
+        odd_scales="" if judgement.linear else judgement.why,
+        adapted=(*filter_notes, *scale_notes, *stored.notes, *_describe_incomplete(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
@@ -239,6 +248,35 @@ def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[s
         clipped, zero_quats = _convert_file(path, part, {name: array[part_rows] for name, array in out.items()})
         num_clipped, num_zero_quats, start = num_clipped + clipped, num_zero_quats + zero_quats, part_rows.stop
     return num_clipped, num_zero_quats
+
+
+def _judge_scales(
+    paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray], choice: ScaleChoice
+) -> ScaleJudgement:
+    """Judge whether stored scales are linear, from ``out``, into which they were read as logarithms.
+
+    Only rows of a PLY file may be linear. Unless the caller states it, they are not in files that gsmerge wrote.
+    """
+    judgement, columns = judge_scales(out), arrays.color_columns(parts[0].rows.dtype.names)
+    if not isinstance(parts[0].rows, np.ndarray) or (choice == "auto" and parts[0].encoding is not None):
+        return ScaleJudgement(False, "" if judgement.linear else judgement.why)
+    if choice == "linear":
+        with np.errstate(all="ignore"):
+            negative = 100 * float(np.count_nonzero(out["scales"][out["valid"]] < 1)) / max(1, 3 * out["valid"].sum())
+        if negative > 100 * arrays.MAX_STRAY:
+            problem = f"expected scales of at least 0, as --hint scales=linear says, found {negative:.3g} % below"
+            raise SceneError(paths[0], f"{problem}, like logarithms", "leave out --hint scales=linear")
+    if choice != "auto":
+        return ScaleJudgement(choice == "linear", "")
+    if columns == arrays.PLAIN_COLORS[1] and not arrays.are_logarithms(log(out["scales"][:, 0])):
+        return ScaleJudgement(True, "the columns are r, g and b and hardly any scale is negative")
+    return judgement
+
+
+def _with_linear_scales(part: StoredRows) -> StoredRows:
+    """Return rows whose scales are stored linearly as rows with log scales."""
+    adapt = part.adapt
+    return replace(part, adapt=lambda rows: log_of_scales(rows) if adapt is None else adapt(log_of_scales(rows)))
 
 
 def _extra_columns(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -465,26 +503,6 @@ def _guess_encoding(opacities: np.ndarray) -> str:
     num_close = int(np.count_nonzero((excess <= 0) & (excess > -_RAW_ROUNDING)))
     are_few = num_outside < num_close and num_outside < arrays.MAX_STRAY * len(excess)
     return "raw" if len(excess) and (are_few or num_outside == 0) else "logit"
-
-
-def _describe_wrong_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:
-    """Explain why ``scales [n,3]`` are likely wrong for ``means [n,3]``; "" if they are plausible."""
-    rows = range(len(valid)) if valid.all() else np.flatnonzero(valid)
-    if len(rows) < _MIN_JUDGED:
-        return ""
-    sample = np.asarray(rows[:: max(1, len(rows) // _SCALE_GAUSSIANS)])
-    low, high = quantiles(gather(means, sample).astype(np.float64), (0.05, 0.95))
-    width, sizes = float((high - low).max()), gather(scales, sample)
-    size = median(sizes.max(1))
-    text = f"half of the Gaussians have a standard deviation above {size:.3g} in a scene of width {width:.3g}"
-    max_size = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
-    stored = float(log(size))
-    if stored <= max_size < size and not arrays.are_logarithms(log(sizes)):
-        signs = f"the stored scales are hardly ever negative (median {stored:.3g})"
-        return f"scales seem to be linear, but logarithms are expected: {signs}, and {text}"
-    if size > _MAX_WIDTH * width:
-        return f"scales, which are stored as logarithms, seem too large: {text}"
-    return ""
 
 
 def _spread_low_degree(shN: np.ndarray) -> None:

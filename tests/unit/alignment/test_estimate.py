@@ -71,3 +71,18 @@ def test_every_other_view(tmp_path: Path) -> None:
     loaded = export(tmp_path, tiny, np.concatenate(kept[::2]))
     assert loaded.scene.names == (tiny.names[0], tiny.names[2])
     assert np.allclose(loaded.scene.cameras.centres, tiny.c2w[::2, :3, 3], atol=0.03)
+
+
+@pytest.mark.parametrize(("step", "drops"), [(3, True), (2, False), (7, True)])
+def test_rows_of_every_nth_pixel(tmp_path: Path, step: int, drops: bool) -> None:
+    """Every n-th row dropped, or only every n-th one kept: the views have the photos' size, not a narrower one."""
+    tiny = textured()
+    ids = np.arange(tiny.depths.size)
+    kept = ids[(ids % step != 1) if drops else (ids % step == 0)]
+    loaded = export(tmp_path, tiny, kept)
+    shift = pixels_of(loaded, len(kept)) - kept
+    assert (shift == shift[0]).all()
+    assert abs(shift[0]) < step
+    assert loaded.pixel_scene().cameras.width == WIDTH
+    assert np.allclose(loaded.scene.cameras.Ks[:, (0, 1), (0, 1)], 170, rtol=0.01)
+    assert not any("resized" in note for note in loaded.notes)

@@ -8,6 +8,7 @@ from messages import refuses
 from tiny_scene import Tiny, make_tiny
 
 from gsmerge.alignment import check_alignment, explain_misalignment
+from gsmerge.alignment.explain import misalignment_error
 from gsmerge.io.cameras.camera_file import CONVENTIONS, FLIP, W2C_OPENCV, from_viewmats, to_viewmats
 from gsmerge.types import Cameras
 
@@ -110,3 +111,12 @@ def test_other_orders_are_named(tiny: Tiny) -> None:
     assert "view fastest" in str(explain(rows.transpose(1, 2, 0).reshape(-1)))
     assert "column-major" in str(explain(rows.transpose(0, 2, 1).reshape(-1)))
     assert explain(np.random.default_rng(0).permutation(n)) is None
+
+
+def test_the_share_in_front_is_named_if_it_explains_the_distance(tiny: Tiny) -> None:
+    cameras = cameras_of(tiny)
+    shifted = replace(cameras, Ks=cameras.Ks + np.array([[0, 0, 9.0], [0, 0, 0], [0, 0, 0]]))
+    behind = cameras_of(tiny, np.diag([-1.0, -1, -1, 1]) @ tiny.w2c)
+    for wrong, is_named in ((shifted, False), (behind, True)):
+        error = misalignment_error("c.json", check_alignment(tiny.gaussians, wrong, valid_of(tiny)), None)
+        assert ("0 % in front" in str(error)) == is_named

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
+from messages import noted, refuses
 
 from gsmerge import Scene
 from gsmerge.facts.prepare import prepare
@@ -13,6 +13,7 @@ from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.frame import canonicalise, scene_frame
 from gsmerge.geometry import project
 from gsmerge.raster.photos import scene_pictures
+from gsmerge.runtime.record import record_part
 
 
 @pytest.fixture(scope="module")
@@ -101,3 +102,6 @@ def test_renders_stand_in_for_photos_where_no_pixels_are_known_alone(scene: Scen
     assert aligned.reference.name == ROW_COLORS
     assert unaligned.scene.images is not None
     assert unaligned.input_scene.images is None
+    with record_part(silent=True) as record:
+        prepare(replace(bare, pixels=None))
+    assert noted(record.notes, "no photos", "the rows are not the pixels of the views", "--images")

@@ -227,6 +227,15 @@ def test_rows_in_no_order(tmp_path: Path) -> None:
     assert "rows" not in lines
 
 
+def test_columns_that_no_known_exporter_writes(tmp_path: Path) -> None:
+    """Files whose rows are pixels and others are called unknown in the same words."""
+    rows = export_rows(SMOOTH)
+    for name, kept in (("pixels", rows), ("others", rows[:3000])):
+        save_export(tmp_path / name, SMOOTH, kept)
+    pixels, others = (said(tmp_path / name)["exporter"] for name in ("pixels", "others"))
+    assert pixels == others == "not known: 17-column export"
+
+
 def test_no_cameras(tmp_path: Path) -> None:
     save_export(tmp_path, SMOOTH, export_rows(SMOOTH)[np.lexsort(SMOOTH.gaussians.means.T)], cameras=False)  # no grid
     lines = said(tmp_path)

@@ -155,6 +155,14 @@ def test_photos_of_any_size(tmp_path: Path, larger: int, margin: int, trim: int)
     assert (scene.large_photos is not None) == (larger > 1)
 
 
+def test_photos_of_another_shape_are_noted(tmp_path: Path) -> None:
+    """Rows without every third pixel look like a narrower grid; larger photos do not show which size they had."""
+    tiny = made()
+    ids = np.arange(3 * WIDTH * HEIGHT)
+    write_photos(tmp_path / "images", tiny, 3, 0)
+    assert noted(read_bare(tmp_path, tiny, ids[ids % 3 != 1]).notes, "288 x 192", "64 x 64", "--cameras")
+
+
 def test_photos_are_told_by_their_colors(tmp_path: Path) -> None:
     tiny = made()
     write_photos(tmp_path / "images", tiny, 2, 10)

@@ -101,6 +101,17 @@ def test_image_folders_in_order(tmp_path: Path, tiny: Tiny) -> None:
     assert find_scene_files(tmp_path).images == tmp_path / "images"
 
 
+def test_photos_of_a_scene_in_a_folder_of_photos(tmp_path: Path, tiny: Tiny) -> None:
+    """A folder called ``rgb`` with Gaussians and a folder of photos is a scene of its own."""
+    write_ply(make(tmp_path, "rgb/images/1.png") / "x.ply", tiny.gaussians)
+    assert find_scene_files(tmp_path / "x.ply").images == tmp_path / "rgb"
+    write_ply(tmp_path / "rgb/scene.ply", tiny.gaussians)
+    assert find_scene_files(tmp_path / "x.ply").images is None
+    assert find_scene_files(tmp_path / "rgb").images == tmp_path / "rgb/images"
+    make(tmp_path, "rgb/1.png")  # AnySplat writes its Gaussians among the photos
+    assert find_scene_files(tmp_path / "x.ply").images == tmp_path / "rgb"
+
+
 @pytest.mark.parametrize("folder", ["color", "corrected_images", "keyframes/corrected_images", "keyframes/images"])
 def test_image_folders_of_other_programs(tmp_path: Path, folder: str) -> None:
     make(tmp_path, "scene.ply", f"{folder}/1.png")

@@ -98,7 +98,8 @@ def test_what_belongs_to_something_else_is_left_out(
     assert same(actual, alone[kind])
     assert actual.left_out is not None
     assert actual.files.cameras is None
-    others = [note for note in actual.notes if note != actual.left_out]
+    assert actual.notes[0] == actual.left_out  # the others follow from it
+    others = list(actual.notes[1:])
     assert [note for note in others if "photos" not in note or kind == "voxels"] == list(alone[kind].notes)
     assert actual.recognised["left_out"] == actual.left_out
 
@@ -109,8 +110,10 @@ def test_cameras_that_are_named_are_refused(tmp_path: Path, kind: str) -> None:
     write_transforms(folder / "transforms.json", another())
     with refuses(SceneError, "scene.ply", "--cameras none"):
         load_scene(folder, cameras=folder / "transforms.json")
+    write_images(folder / "images", another())
     alone = load_scene(folder, cameras="none")
-    assert alone.left_out is None
+    assert noted(alone.notes, folder / "images", "not used")
+    assert not noted(alone.notes, "name them with --cameras")
     assert alone.files.cameras is None
 
 

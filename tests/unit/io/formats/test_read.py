@@ -308,8 +308,8 @@ def test_extreme_scales_are_clipped_and_counted(tmp_path: Path) -> None:
     [
         (1.0, elementary.log, ""),
         (500.0, elementary.log, ""),  # millimetres: no logarithm is negative
-        (100.0, np.positive, "seem to be linear"),
-        (1.0, np.positive, "seem to be linear"),
+        (100.0, np.positive, "read as linear"),
+        (1.0, np.positive, "read as linear"),
         (1.0, lambda scales: elementary.log(1000 * scales), "too large"),
     ],
 )
@@ -324,6 +324,49 @@ def test_scales_that_are_no_logarithms_or_too_large_are_noted(
         rows[f"scale_{axis}"] = stored(factor * rng.uniform(0.01, 0.09, len(rows)))
     notes = [note for note in file_notes(read_ply(save(tmp_path / "a.ply", rows)).info) if "scale" in note]
     assert [part in note for note in notes] == [True] * bool(part)
+
+
+@pytest.mark.parametrize("factor", [0.01, 1.0, 10.0])
+def test_linear_scales_are_recognised_by_the_size_of_the_scene(tmp_path: Path, factor: float) -> None:
+    """Logarithms of the same scales are kept in any unit."""
+    rng = np.random.default_rng(0)
+    rows = columns(40_000)
+    for name in ("x", "y", "z"):
+        rows[name] = factor * rng.uniform(-1, 1, len(rows))
+    scales = factor * rng.lognormal(-5, 0.5, (len(rows), 3)).astype(np.float32)
+    for axis in range(3):
+        rows[f"scale_{axis}"] = scales[:, axis]
+    linear = read_ply(save(tmp_path / "linear.ply", rows))
+    np.testing.assert_allclose(linear.gaussians.scales, scales, rtol=1e-6)
+    assert any("--hint scales=log" in note for note in file_notes(linear.info))
+    kept = read_ply(tmp_path / "linear.ply", scales="log")
+    np.testing.assert_allclose(kept.gaussians.scales, elementary.exp(scales), rtol=1e-6)
+    for axis in range(3):
+        rows[f"scale_{axis}"] = elementary.log(scales[:, axis])
+    logs = read_ply(save(tmp_path / "log.ply", rows))
+    np.testing.assert_allclose(logs.gaussians.scales, scales, rtol=1e-5)
+    assert not any("scales" in note for note in file_notes(logs.info))
+
+
+def test_scales_are_logarithms_in_doubt(tmp_path: Path) -> None:
+    """Equal positive scales may be either; the note names the hint."""
+    rng = np.random.default_rng(0)
+    rows = columns(40_000)
+    for name in ("x", "y", "z"):
+        rows[name] = rng.uniform(0, 10, len(rows))
+    for axis in range(3):
+        rows[f"scale_{axis}"] = 0.05
+    doubtful = read_ply(save(tmp_path / "a.ply", rows))
+    np.testing.assert_allclose(doubtful.gaussians.scales, np.exp(0.05), rtol=1e-5)
+    assert any("if they are linear, use --hint scales=linear" in note for note in file_notes(doubtful.info))
+    stated = read_ply(tmp_path / "a.ply", scales="linear")
+    np.testing.assert_allclose(stated.gaussians.scales, 0.05, rtol=1e-5)
+    assert not any("scales" in note for note in file_notes(stated.info))
+    rows["scale_0"] = -3
+    with refuses(SceneError, "b.ply", "--hint scales=linear"):
+        read_ply(save(tmp_path / "b.ply", rows), scales="linear")
+    with refuses(ValueError, "scales", "raw"):
+        read_ply(tmp_path / "a.ply", scales="raw")
 
 
 def test_zero_and_extreme_quaternions(tmp_path: Path) -> None:

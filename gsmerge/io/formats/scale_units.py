@@ -1,0 +1,76 @@
+"""Judge whether stored scales are logarithms, as in most files, or linear, by the size of the scene."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gsmerge.frozen import dataclass
+from gsmerge.geometry import median, quantiles
+from gsmerge.io.formats import arrays
+from gsmerge.kernels.elementary import log
+from gsmerge.runtime.memory import gather
+
+MIN_JUDGED = 100  # least number of Gaussians for a judgement
+LINEAR_NOTE = "scales are read as linear, since {}; if they are logarithms, use --hint scales=log"
+_SAMPLES = 20_000  # Gaussians whose scales are judged
+_MAX_WIDTH = 0.25  # scales are wrong if half of the standard deviations exceed this share of the scene's width
+# Bounds on half of the standard deviations, in units of the scene's width divided by the square root of the number of
+# Gaussians. Sound files have 0.3 to 2. Files with linear scales, read as logarithms, have 10 to 1,000.
+_MIN_SPACINGS, _MAX_SPACINGS = 0.01, 6.0
+# Natural logarithm of large sizes divided by small ones, at least, in units of 1 and of the difference of the stored
+# values. Sizes in a file vary by 1.5:1 and more; linear scales that are read as logarithms are all close to 1
+_MIN_VARIATION, _LESS = 0.4, 4.0
+
+
+@dataclass(frozen=True)
+class ScaleJudgement:
+    """The more likely reading of stored scales; ``why`` is a clause, or "" if there is nothing to say."""
+
+    linear: bool
+    why: str
+
+
+def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
+    """Judge ``scales [n,3]`` that were read as logarithms, by ``means [n,3]`` and ``valid [n]``.
+
+    Scales are linear if they would be too large for the scene as logarithms, but not as they are stored, and if one of
+    two signs confirms it: as logarithms all Gaussians would be about equally large, or half of them nearly as large as
+    the scene.
+    """
+    valid = out["valid"]
+    rows = range(len(valid)) if valid.all() else np.flatnonzero(valid)
+    if len(rows) < MIN_JUDGED:
+        return ScaleJudgement(False, "")
+    sample = np.asarray(rows[:: max(1, len(rows) // _SAMPLES)])
+    points, sizes = gather(out["means"], sample).astype(np.float64), gather(out["scales"], sample)
+    low, high = quantiles(points, (0.05, 0.95))
+    width, size = float((high - low).max()), median(sizes.max(1))
+    text = f"half of the Gaussians have a standard deviation above {size:.3g} in a scene of width {width:.3g}"
+    spacing, stored = width / float(np.sqrt(len(rows))), log(sizes)
+    typical, is_vast = float(log(size)), size > _MAX_WIDTH * width
+    is_likely = _MIN_SPACINGS * spacing <= typical <= _MAX_SPACINGS * spacing < size
+    if is_likely and not arrays.are_logarithms(stored):
+        if is_vast or _vary_little_as_logs(stored.max(1)):
+            signs = f"they are hardly ever negative (median {typical:.3g})"
+            return ScaleJudgement(True, f"{signs}, and as logarithms {text}")
+        advice = "if they are linear, use --hint scales=linear"
+        return ScaleJudgement(False, f"scales, which are read as logarithms, seem too large: {text}; {advice}")
+    return ScaleJudgement(False, f"scales, which are stored as logarithms, seem too large: {text}" if is_vast else "")
+
+
+def _vary_little_as_logs(stored: np.ndarray) -> bool:
+    """Return whether positive ``stored [s]`` vary much as sizes, but hardly as logarithms of sizes."""
+    low, high = (float(value) for value in quantiles(stored.astype(np.float64), (0.1, 0.9)))
+    return low > 0 and float(log(high / low)) > max(_MIN_VARIATION, _LESS * (high - low))
+
+
+def log_of_scales(rows: np.ndarray) -> np.ndarray:
+    """Return a copy of a block of rows with the logarithms of its linear scales; of a negative scale it is NaN."""
+    out: Any = rows.copy()
+    with np.errstate(all="ignore"):
+        for name in arrays.SCALES:
+            if name in (rows.dtype.names or ()):
+                out[name] = log(rows[name].astype(np.float64))
+    return np.asarray(out)
