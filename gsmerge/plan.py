@@ -110,6 +110,7 @@ class Plan:
     settings: dict[str, Any]  # All settings by flat name, for reports
     free_poses: bool = False  # The options ask for moved cameras, even where the scene does not need it
     new_views: bool = False  # Estimate the quality of new views
+    is_trial: bool = False  # Only a score of the fit counts, in which neither unseen Gaussians nor filled gaps show
     before: PhotoScore | None = None  # Score of the input, if photos and not pixels decide the count
     # [h,w] bool for each scored view, if renders of the input stand for photos: the pixels that the input covers; None:
     # nearly all
@@ -143,7 +144,7 @@ class Plan:
     @property
     def prunes(self) -> bool:
         """Whether Gaussians that no photo shows are dropped after the fit."""
-        return self.fit.min_contribution > 0 and not self.merges_pairs
+        return self.fit.min_contribution > 0 and not (self.merges_pairs or self.is_trial)
 
     @property
     def limits(self) -> CountLimits:

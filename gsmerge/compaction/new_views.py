@@ -161,7 +161,7 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Bu
     short = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(STEPS, plan.fit.steps))
     # no photo shows the views from outside, so these cannot change the score
     inside = replace(short.fit, tuning=replace(short.fit.tuning, outside_from=1.0))
-    compacted = build(left_out.rest, replace(short, fit=inside), None).gaussians
+    compacted = build(left_out.rest, replace(short, fit=inside, is_trial=True), None).gaussians
     drawn = small.file_gaussians, left_out.rows, compacted
     return np.stack([left_out.shares, *(left_out.score(gaussians) for gaussians in drawn)])
 
