@@ -311,7 +311,7 @@ class Region:
     rounding: float = 0.0  # Rounding of stored positions; clamped positions stay inside the border by this distance
 
 
-def _number_views(count: int) -> tuple[str, ...]:
+def number_views(count: int) -> tuple[str, ...]:
     """Name views by their numbers."""
     return tuple(f"view {view}" for view in range(count))
 
@@ -366,7 +366,7 @@ class Scene:
         if self.cameras is None:
             object.__setattr__(self, "cameras", NO_CAMERAS)
         if self.names is None:
-            object.__setattr__(self, "names", _number_views(len(self.cameras)))
+            object.__setattr__(self, "names", number_views(len(self.cameras)))
         check_fields(self)
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
         if self.pixels is not None:
@@ -457,7 +457,7 @@ class Scene:
 
 def make_scene(gaussians: Gaussians, cameras: Cameras) -> Scene:
     """Make a scene of Gaussians and cameras alone, whose views have numbers for names."""
-    return Scene(gaussians, cameras, None, None, _number_views(len(cameras)))
+    return Scene(gaussians, cameras, None, None, number_views(len(cameras)))
 
 
 def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:

@@ -23,7 +23,6 @@ from gsmerge.io.formats.read import FileInfo
 from gsmerge.types import Cameras, Gaussians
 
 _SOME_CAMERA = 4.0  # rows nearer than this multiple of the limit are the pixels of some projective camera
-_ALL = 0.995  # a larger share counts as all
 _ORDERS = {  # other orders of rows in words, by the order of the layout
     "view-fastest": "row, column, view (view fastest)",
     "column-major": "view, column, row (column-major)",
@@ -69,10 +68,11 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
             f" {alignment.worst_px:.1f} px"
         )
         return SceneError(path, problem, "name their order with --hint order=NAME")
-    in_front = f" and only {100 * alignment.share_in_front:.0f} % in front of their camera"
+    percent = f"{100 * alignment.share_in_front:.0f}"
+    in_front = "" if percent == "100" else f" and only {percent} % in front of their camera"
     problem = (
         f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
-        f"found a median of up to {alignment.worst_px:.1f} px{in_front if alignment.share_in_front < _ALL else ''}"
+        f"found a median of up to {alignment.worst_px:.1f} px{in_front}"
     )
     unknown = "no other convention fits either: give the cameras that belong to the Gaussians"
     return SceneError(path, problem, f"{reason}: convert one to the other" if reason else unknown)

@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say, say_warning, separate_stdout, terminal_columns, total_progress
+from gsmerge.cli.console import (
+    RunEnd,
+    print_document,
+    say,
+    say_warning,
+    separate_stdout,
+    terminal_columns,
+    total_progress,
+)
 from gsmerge.errors import BatchError, TargetError, UsageError
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import Engine
@@ -167,7 +175,7 @@ def run_jobs(
             report = record["report"] or record  # a result that was done before has a record of its doubts alone
             worse = report.get("worse")
             notes = report.get("notes", [doubt for doubt in (worse, report.get("left_out")) if doubt])
-            progress(record[name], record["status"], num_ended, failure, num_failed, share, worse, notes)
+            progress(RunEnd(record[name], record["status"], num_ended, failure, num_failed, share, worse, notes))
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:

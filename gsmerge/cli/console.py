@@ -12,10 +12,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
-RunProgress = Callable[..., None]  # arguments: see total_progress
 
 Kind = Literal["info", "note", "warning", "error"]  # of a line on stderr
 PREFIXES: Mapping[Kind, str] = {
@@ -294,40 +293,55 @@ def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
         yield
 
 
+class RunEnd(NamedTuple):
+    """The end of one of many runs."""
+
+    name: str
+    status: str
+    done: int  # Runs that have ended
+    failure: str  # Empty after a run that succeeded
+    num_failed: int  # Runs that have failed
+    share: float  # Part of the work done so far, 0 to 1
+    worse: str | None = None  # The note that the result is worse than its input, one of ``notes``
+    notes: Sequence[str] = ()  # Printed only as JSON
+
+    @property
+    def text(self) -> str:
+        """Description, with the number of failures so far."""
+        ending = {"skipped": "skipped, since it was done before"}.get(self.status, self.status)
+        ending += ", worse than the input" if self.worse else ""
+        return f"{self.name} {ending}{f', {self.num_failed} failed' if self.num_failed and not self.failure else ''}"
+
+
+RunProgress = Callable[[RunEnd], None]
+
+
 @contextmanager
 def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     """Show one bar for many runs on stderr, with the time left, and the last failure below it.
 
-    Without a terminal it prints a line for each run. Yields ``(name, status, done, failure, num_failed, share,
-    worse=None, notes=()) -> None``; ``failure`` is empty after a run that succeeded, and ``share``, 0 to 1, is the part
-    of the work done so far. ``worse``: one of the ``notes``, which are printed only as JSON.
+    Without a terminal it prints a line for each run. Yields a function that is called at the end of each run.
     """
     stream = _stream.get()
     if stream is not None:
         start = time.monotonic()
 
-        def print_event(
-            name: str, status: str, done: int, failure: str, num_failed: int, share: float,
-            worse: str | None = None, notes: Sequence[str] = (),
-        ) -> None:  # fmt: skip
-            seconds = time.monotonic() - start
-            for note in notes:
-                say(f"{name}: {note}", kind="warning" if note == worse else "note")
+        def print_event(end: RunEnd) -> None:
+            seconds, share = time.monotonic() - start, end.share
+            for note in end.notes:
+                say(f"{end.name}: {note}", kind="warning" if note == end.worse else "note")
             stream.move(share, seconds * (1 - share) / share if share > 0 else None)
-            event = {"scene": name, "status": status, "done": done, "total": total, "failed": num_failed}
-            stream.print({**event, "worse": worse, "error": failure or None})
+            event = {"scene": end.name, "status": end.status, "done": end.done, "total": total}
+            stream.print({**event, "failed": end.num_failed, "worse": end.worse, "error": end.failure or None})
 
         yield print_event
         return
     console = _terminal(quiet=quiet)
     if console is None:
 
-        def print_run(
-            name: str, status: str, done: int, failure: str, num_failed: int, _: float,
-            worse: str | None = None, __: Sequence[str] = (),
-        ) -> None:  # fmt: skip
-            text = status if failure.startswith(name) else _run_text(name, status, failure, num_failed, worse)
-            say(f"{done}/{total} {text}{f': {failure}' if failure else ''}", quiet=quiet)
+        def print_run(end: RunEnd) -> None:
+            text = end.status if end.failure.startswith(end.name) else end.text
+            say(f"{end.done}/{total} {text}{f': {end.failure}' if end.failure else ''}", quiet=quiet)
 
         yield print_run
         return
@@ -344,23 +358,12 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     with Live(Group(bars, last_failure), console=console, transient=True, refresh_per_second=5):
         task = bars.add_task("", total=total)
 
-        def move(
-            name: str, status: str, done: int, failure: str, num_failed: int, _: float,
-            worse: str | None = None, __: Sequence[str] = (),
-        ) -> None:  # fmt: skip
-            text = _run_text(name, status, failure, num_failed, worse)
-            bars.update(task, completed=done, description=one_line(text))
-            if failure:
-                last_failure.plain = one_line(f"last failure: {failure}")
+        def move(end: RunEnd) -> None:
+            bars.update(task, completed=end.done, description=one_line(end.text))
+            if end.failure:
+                last_failure.plain = one_line(f"last failure: {end.failure}")
 
         yield move
-
-
-def _run_text(name: str, status: str, failure: str, num_failed: int, worse: str | None) -> str:
-    """Describe the end of one run, with the number of failures so far; ``worse``: see :func:`total_progress`."""
-    ending = {"skipped": "skipped, since it was done before"}.get(status, status)
-    ending += ", worse than the input" if worse else ""
-    return f"{name} {ending}{f', {num_failed} failed' if num_failed and not failure else ''}"
 
 
 def duration(seconds: float) -> str:

@@ -25,7 +25,7 @@ from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_distance, describe_loss
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record
-from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene
+from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene, number_views
 from gsmerge.words import count_words
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class CompactResult:
             'small.sog'
         """
         cameras, levels = self.cameras.numpy(), [level.gaussians for level in (self, *self.coarser)]
-        names = self.names or tuple(f"view {view}" for view in range(len(cameras)))
+        names = self.names or number_views(len(cameras))
         return write_result(Path(path), levels, cameras, names, self.report.new_views, overwrite=overwrite)
 
     @check_arguments

@@ -32,7 +32,7 @@ from gsmerge.measure.preview import OUTSIDE, Picture, draw_borders, mean_colors,
 from gsmerge.pages.marks import Marks, draw_marks, find_marks
 from gsmerge.pages.splats import MAX_GAUSSIANS, drawn_rows, highest_degree, pack_splats, pack_support
 from gsmerge.raster import Splats, make_splats, render
-from gsmerge.raster.metrics import describe_loss
+from gsmerge.raster.metrics import is_worse
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import SegmentOptions
@@ -167,9 +167,8 @@ def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> Vie
     """Add the expected gains to the results; a result that shows its own photos worse than the scene has none."""
     sides, notes = [], list[str]()
     for side in data.sides:
-        own = () if data.held_out else (data.sides[0].mean.psnr, side.mean.psnr)
         gain = gains.get(side.name)
-        if gain is not None and own and describe_loss("", *own, "") is not None:
+        if gain is not None and not data.held_out and is_worse(data.sides[0].mean.psnr, side.mean.psnr):
             gain = None
             notes.append(
                 f"{side.name} shows these photos worse than {data.title} does, so its expected gain of new views is"

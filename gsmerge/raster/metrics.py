@@ -71,12 +71,17 @@ def psnr_words(psnr: float) -> str:
     return "no difference" if psnr >= MAX_PSNR else f"{psnr:.1f} dB"
 
 
+def is_worse(before: float | None, after: float | None) -> bool:
+    """Return whether a PSNR (dB) falls by more than ``MAX_LOSS``; False if one of them is None."""
+    return before is not None and after is not None and before - after > MAX_LOSS  # the difference of infinities is NaN
+
+
 def describe_loss(name: str, before: float | None, after: float | None, pictures: str) -> str | None:
     """Describe a loss of quality on the scene's own ``pictures``; None if the loss is at most ``MAX_LOSS``.
 
     ``before`` and ``after`` are the PSNR (dB) of the pictures from the input and from the result, or None.
     """
-    if before is None or after is None or not before - after > MAX_LOSS:  # the difference of infinities is NaN
+    if before is None or after is None or not is_worse(before, after):
         return None
     loss = f"{after:.2f} dB, {before:.2f} dB before"
     return f"{name} shows {pictures} {WORSE}: {loss}"

@@ -364,14 +364,13 @@ def _assign_of_one_shape(
     """Combine as :func:`_assign`; if that fails, leave out photos or views whose shape is not that of most photos."""
     try:
         return _assign(ply, files, camera_file, proposal, hints)
-    except SceneError as error:
-        fewer, cause = select_one_shape(camera_file, proposal), SceneError(error.path, error.problem, error.remedy)
-        if fewer is None:
-            raise
-    cameras, photos, left_out = fewer
-    with suppress(SceneError):
-        return _assign(ply, files, cameras, photos, hints).with_left_out(left_out)
-    raise cause
+    except SceneError:
+        fewer = select_one_shape(camera_file, proposal)
+        if fewer is not None:
+            cameras, photos, left_out = fewer
+            with suppress(SceneError):
+                return _assign(ply, files, cameras, photos, hints).with_left_out(left_out)
+        raise
 
 
 def _assign(

@@ -238,8 +238,8 @@ def open_ply(path: Path) -> PlyData:
             start = file.read(MAX_HEADER_BYTES)
         if start[:4] not in (b"ply\n", b"ply\r"):
             raise no_ply(path)
-        end, text = _check_header(start, budget)
-        if text and (table := _read_text(path, start[:end])) is not None:
+        end, text, elements = _check_header(start, budget)
+        if text and (table := _read_text(path, start[:end], elements)) is not None:
             return table
         with _stream(path, end, text=text) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of an empty list, or a number beyond the column's type
@@ -261,32 +261,30 @@ def open_ply(path: Path) -> PlyData:
         raise SceneError(path, problem, _AGAIN) from error
 
 
-def _read_text(path: Path, header: bytes) -> PlyData | None:
+def _read_text(path: Path, header: bytes, elements: Sequence[_Element]) -> PlyData | None:
     """Read a PLY file of text; None if it has lists, or a row that is not as the ``header`` says.
 
     NumPy takes a quarter of the parser's time, but says less of faults.
     """
-    element_line = re.compile(rb"^(element\s+\S+\s+)([0-9]+)(?=\s*$)", re.MULTILINE)
-    counts = [int(match[2]) for match in element_line.finditer(header)]
-    data = PlyData.read(_text_rows(BytesIO(element_line.sub(rb"\g<1>0", header))))
-    if len(data.elements) != len(counts) or any(element.count for element in data.elements):
+    if any(words[0] == "list" for element in elements for words in element.properties):
         return None
+    without_rows = re.sub(rb"(?m)^(element\s+\S+\s+)\S+", rb"\g<1>0", header)
+    data = PlyData.read(_text_rows(BytesIO(without_rows)))
     binary = path.open("rb")
     with _text_rows(binary) as file, warnings.catch_warnings():
         warnings.simplefilter("error")  # NumPy would take 1.5 for a whole number
         binary.seek(len(header))
         lines = iter(file.readline, "")
-        for element, count in zip(data.elements, counts, strict=True):
-            if any(isinstance(column, PlyListProperty) for column in element.properties):
+        for table, element in zip(data.elements, elements, strict=True):
+            if element.count == 0:
+                continue
+            try:
+                rows = np.loadtxt(islice(lines, element.count), table.dtype(), comments=None, ndmin=1)
+            except (ValueError, Warning):
                 return None
-            if count:
-                try:
-                    rows = np.loadtxt(islice(lines, count), element.dtype(), comments=None, ndmin=1)
-                except (ValueError, Warning):
-                    return None
-                if len(rows) < count:
-                    return None
-                element.data = rows
+            if len(rows) < element.count:
+                return None
+            table.data = rows
     return data
 
 
@@ -355,7 +353,7 @@ def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Call
 def bytes_after_rows(path: Path) -> int:
     """Count the bytes of a binary PLY file after its last row; 0 for text or list rows."""
     with path.open("rb") as file:
-        end, is_text = _check_header(file.read(MAX_HEADER_BYTES), budget := read_budget(path))
+        end, is_text, _ = _check_header(file.read(MAX_HEADER_BYTES), budget := read_budget(path))
     if is_text:
         return 0
     data = open_ply(path)
@@ -410,10 +408,11 @@ def _list_comments(header: bytes) -> list[str]:
     return [text.decode("latin-1") for text in re.findall(rb"^comment (.*?)\s*$", header, re.MULTILINE)]
 
 
-def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
-    """Return the size of a header in bytes and whether rows are text; SceneError if the file is too short for its rows.
+def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool, list[_Element]]:
+    """Return the size of a header in bytes, whether rows are text, and the elements.
 
-    ``start``: the first bytes of the file. The parser checks the rest of the header.
+    SceneError if the file is too short for its rows. ``start``: the first bytes of the file. The parser checks the rest
+    of the header.
     """
     path, size = Path(budget.path), budget.file_bytes
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
@@ -434,7 +433,7 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
         if bytes_left < -1:  # the last row of a text may end without a new line
             expected = f"element '{element.name}' with {element.count} rows"
             raise _truncated(path, expected, bytes_before // row_bytes, "early end of file")
-    return end + len(last_line), is_text
+    return end + len(last_line), is_text, elements
 
 
 @dataclass(frozen=True)

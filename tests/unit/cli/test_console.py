@@ -12,6 +12,7 @@ import pytest
 
 from gsmerge.cli.console import (
     OPENING,
+    RunEnd,
     json_progress,
     opening_line,
     plain_warnings,
@@ -85,9 +86,9 @@ def test_bars_end_full(monkeypatch: pytest.MonkeyPatch, columns: str, bar: int) 
 def test_the_last_failure_stands_below_the_bar_of_a_batch() -> None:
     why = "scenes/room/scene.ply: truncated " + "or damaged " * 20
     with redirect_stderr(Terminal()) as terminal, total_progress(3, quiet=False) as progress:
-        progress("kitchen", "done", 1, "", 0, 0.3)
-        progress("room", "failed", 2, why, 1, 0.6)
-        progress("garden", "done", 3, "", 1, 1.0)
+        progress(RunEnd("kitchen", "done", 1, "", 0, 0.3))
+        progress(RunEnd("room", "failed", 2, why, 1, 0.6))
+        progress(RunEnd("garden", "done", 3, "", 1, 1.0))
     lines = terminal.lines()
     bars = [line for line in lines if re.search(r"\d/3 ", line)]
     assert all(len(line) < 100 for line in lines)
@@ -100,10 +101,10 @@ def test_the_last_failure_stands_below_the_bar_of_a_batch() -> None:
 
 def test_without_a_terminal_each_run_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     with total_progress(4, quiet=False) as progress:
-        progress("room", "failed", 1, "no photos", 1, 0.25)
-        progress("garden", "done", 2, "", 1, 0.5)
-        progress("hall", "failed", 3, "hall/a.ply: no rows", 2, 0.75)
-        progress("attic", "skipped", 4, "", 2, 1.0)
+        progress(RunEnd("room", "failed", 1, "no photos", 1, 0.25))
+        progress(RunEnd("garden", "done", 2, "", 1, 0.5))
+        progress(RunEnd("hall", "failed", 3, "hall/a.ply: no rows", 2, 0.75))
+        progress(RunEnd("attic", "skipped", 4, "", 2, 1.0))
     lines = ["1/4 room failed: no photos", "2/4 garden done, 1 failed", "3/4 failed: hall/a.ply: no rows"]
     lines.append("4/4 attic skipped, since it was done before, 2 failed")
     assert capsys.readouterr().err.splitlines() == lines
@@ -112,8 +113,8 @@ def test_without_a_terminal_each_run_is_a_line(capsys: pytest.CaptureFixture[str
 def test_runs_as_events_have_their_names_whole(capsys: pytest.CaptureFixture[str]) -> None:
     """Also after others have failed, and with a space in them."""
     with json_progress(), total_progress(2, quiet=True) as progress:
-        progress("my room", "failed", 1, "no photos", 1, 0.25)
-        progress("garden", "done", 2, "", 1, 1.0)
+        progress(RunEnd("my room", "failed", 1, "no photos", 1, 0.25))
+        progress(RunEnd("garden", "done", 2, "", 1, 1.0))
     events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert [(event["scene"], event["status"], event["error"]) for event in events] == [
         ("my room", "failed", "no photos"), ("garden", "done", None),
@@ -129,10 +130,10 @@ def test_a_run_that_is_worse_than_its_input_is_marked(capsys: pytest.CaptureFixt
     worse = f"the result shows its own photos {WORSE}: 20.00 dB, 30.00 dB before"
     run = "room", "done", 1, "", 0, 1.0, worse, ["no masks", worse]
     with total_progress(1, quiet=False) as progress:
-        progress(*run)
+        progress(RunEnd(*run))
     assert capsys.readouterr().err == "1/1 room done, worse than the input\n"
     with json_progress(), total_progress(1, quiet=True) as progress:
-        progress(*run)
+        progress(RunEnd(*run))
         say_warning("1 of 1 results", quiet=True)
     events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     said = [(kind, event[kind]) for event in events for kind in ("note", "warning", "worse") if kind in event]
@@ -142,7 +143,7 @@ def test_a_run_that_is_worse_than_its_input_is_marked(capsys: pytest.CaptureFixt
 
 def test_brackets_in_names_are_no_markup_in_bars() -> None:
     with redirect_stderr(Terminal()) as terminal, total_progress(2, quiet=False) as progress:
-        progress("z[/b]", "done", 2, "", 0, 1.0)
+        progress(RunEnd("z[/b]", "done", 2, "", 0, 1.0))
     assert "z[/b] done" in terminal.getvalue()
     with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as move:
         move("[/b]: z[/b]", 1, 2)
