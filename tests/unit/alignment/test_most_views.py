@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +22,6 @@ def made(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene of which each row has its pixel. Read only."""
     folder: Path = make_scene(tmp_path_factory.mktemp("most") / "room", num_views=VIEWS, width=96, height=72)
     return folder
-
-
-@pytest.fixture
-def folder(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "room"))
 
 
 @pytest.mark.parametrize("images", [None, "none"])

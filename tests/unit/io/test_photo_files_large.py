@@ -32,12 +32,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return generate_scene(tmp_path_factory.mktemp("large") / "scene", options, seed=2)
 
 
-@pytest.fixture
-def folder(made: Path, tmp_path: Path) -> Path:
-    """A copy that a test may change."""
-    return Path(shutil.copytree(made, tmp_path / "scene"))
-
-
 def change_cameras(folder: Path, change: Callable[[dict[str, float]], None]) -> None:
     with edited_json(folder / "transforms.json") as document:
         change(document)

@@ -30,11 +30,6 @@ def made(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def folder(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "room"))
-
-
 @pytest.fixture(scope="module")
 def truth(made: Path) -> np.ndarray:
     """The photos of all views ``[v,h,w,3]``."""
