@@ -4,36 +4,24 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from gsmerge.alignment import (
-    ESTIMATED,
-    MAY_BE_UNALIGNED,
-    Alignment,
-    AlignmentResult,
-    Recovery,
-    align,
-    check_pixels,
-    read_rotations,
-)
+from gsmerge.alignment import ESTIMATED, Alignment, AlignmentResult, Recovery, align, check_pixels
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import move_views
-from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
-from gsmerge.io.cameras.read import read_depths
 from gsmerge.io.formats.arrays import FLAT_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
-from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
+from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import (
     AUTO,
@@ -66,26 +54,11 @@ from gsmerge.scene.photos import (
     stored_photos,
     without_photo,
 )
-from gsmerge.scene.rows import color_from_photos, set_rotations, take_gaussians, use_depths
+from gsmerge.scene.rows import read_rotations, take_gaussians
 from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
-from gsmerge.types import NO_CAMERAS, Cameras, LargePhotos, Scene, StrPath
+from gsmerge.types import NO_CAMERAS, LargePhotos, Scene, StrPath
 from gsmerge.words import count_words
-
-
-@dataclass(frozen=True)
-class SceneViews:
-    """All c views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures."""
-
-    cameras: Cameras
-    images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
-    names: tuple[str, ...]
-    of_scene: tuple[int, ...]  # for each view of the scene, its index among these c views
-
-    @property
-    def used(self) -> tuple[int, ...]:
-        """Indices of the views that the scene has, each once, in the scene's order."""
-        return tuple(dict.fromkeys(self.of_scene))
 
 
 @dataclass(frozen=True)
@@ -97,7 +70,6 @@ class Loaded:
     files: SceneFiles
     # the cameras as stored in their file, in the order of the views; None without cameras, or if they do not fit
     cameras: CameraFile | None
-    views: SceneViews  # all views of the camera file, including those that the scene does not have
     exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
     notes: tuple[str, ...]  # adapted or unusual content, one sentence each, without a full stop
     # how well every view's Gaussians project into their own pixels; None if rows have no pixels
@@ -116,9 +88,8 @@ class Loaded:
         raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
 
     def without_photos(self) -> Loaded:
-        """Return a copy without the photos of all views, which frees their memory; the scene keeps its own photos."""
-        cameras = None if self.cameras is None else replace(self.cameras, images=())
-        return replace(self, cameras=cameras, views=replace(self.views, images=NO_IMAGES))
+        """Return a copy without the photos inside the camera file, which frees memory; the scene keeps its own."""
+        return replace(self, cameras=None if self.cameras is None else replace(self.cameras, images=()))
 
     def with_left_out(self, notes: Sequence[str]) -> Loaded:
         """Return a copy with notes on files that were found beside the scene and are not used."""
@@ -235,10 +206,9 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
         scene=scene,
         info=replace(used[0].info, num_nonfinite=sum(load.info.num_nonfinite for load in used)),
         files=files,
-        views=SceneViews(scene.cameras, photo_array(scene.images), scene.names, tuple(range(len(scene)))),
         exporters=tuple(dict.fromkeys(exporter for load in used for exporter in load.exporters)),
         notes=(*notes, *joined.notes),
-        alignment=check_pixels(scene),
+        alignment=check_pixels(scene) if scene.has_own_pixels else None,
         moves=[move for load in used for move in load.moves],
         joined=joined.facts,
         left_out="; ".join(load.left_out for load in loads if load.left_out is not None) or None,
@@ -396,7 +366,7 @@ def _assign(
         fit = fit_to_grid(base.scene, proposal)
     guessed, is_read = list_guessed(base.scene, camera_file), load is not None
     proposal = proposal.without_views(guessed)
-    chosen = assign_to_views(base.scene, base.views.of_scene, proposal, read=is_read, guessed=guessed, fit=fit)
+    chosen = assign_to_views(base.scene, range(len(base.scene)), proposal, read=is_read, guessed=guessed, fit=fit)
     if not any(chosen):
         if (refusal := refuse_photos(files, proposal, camera_file, cause)) is not None:
             raise refusal
@@ -419,14 +389,13 @@ def _combine(
     notes += [camera_file.focal] if camera_file.focal else []
     without_bars, bar_notes = cut_bars(pictures, camera_file)
     limited, size_notes = limit_photo_size(without_bars, len(ply.gaussians), hints.max_side, unaligned=order == "none")
-    depths = cache(partial(read_depths, Path(camera_file.path)))
     if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians
         problem = "expected one Gaussian per pixel, found the Gaussians of a state"
         cameras = to_cameras(pinholes, photo_size(limited))
         result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
     else:
         frames = partial(read_dataparser, files.ply, files.cameras)
-        result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, depths=depths, frames=frames)
+        result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, frames=frames)
     notes += [*bar_notes, *size_notes, *result.notes]
     if result.pixel_ids is None:
         _check_hints(ply, hints)
@@ -439,9 +408,9 @@ def _combine(
         reason = "the photos have bars, which are cut off" if size else "there are no photos"
         notes.append(f"the pictures of {' and '.join(unused)} are not used, since {reason}")
     if had_bars:  # photos with bars have neither larger files nor masks
-        return _make_load(ply, files, hints, result, notes, absent=photos.absent, depths=depths)
+        return _make_load(ply, files, hints, result, notes, absent=photos.absent)
     large, masks, mask_notes = find_larger_and_masks(files, camera_file, photos, size, result.transform, result.cameras)
-    return _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent, depths)
+    return _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
 
 
 def _choose_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
@@ -468,11 +437,9 @@ def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> 
 
 
 def _check_hints(ply: GaussianFile, hints: ReadHints) -> None:
-    """Raise SceneError for rows without pixels if a hint describes the pixels' order or rotations."""
-    given = [] if hints.order in ("auto", *MAY_BE_UNALIGNED) else [f"order={hints.order}"]
-    given += [f"quats={hints.quats}"] if hints.quats in ("camera", "xyzw-root") else []
-    if given:
-        problem = f"expected rows that are pixels of views, as --hint {given[0]} says, found rows without pixels"
+    """Raise SceneError for rows without pixels if a hint describes the order of pixels."""
+    if hints.order not in ("auto", "none"):
+        problem = f"expected rows that are pixels of views, as --hint order={hints.order} says, found others"
         raise SceneError(ply.info.path, problem, "leave the hint out, or name the cameras that fit with --cameras")
 
 
@@ -485,76 +452,50 @@ def _make_load(
     large: LargePhotos | None = None,
     masks: Masks = NO_MASKS,
     absent: Sequence[int] = (),
-    depths: Callable[[], np.ndarray | None] = lambda: None,
 ) -> Loaded:
     """Make the scene from rows, their pixels and the views, with notes on how it was read.
 
-    ``absent``: indices of the cameras without a photo. ``depths`` reads the depth maps beside the cameras.
+    ``absent``: indices of the cameras without a photo.
     """
-    camera_file, layout, views = result.camera_file, result.layout, list(result.views)
-    scene, more = _make_scene(ply, files, result, large, masks)
-    frame = None if result.recovery is None else result.recovery.best.frame
+    camera_file, recovery = result.camera_file, result.recovery
+    scene, more = _make_scene(ply, files, hints, result, large, masks)
+    if recovery is not None and result.given is not None:
+        scene = move_views(scene, result.given)
+        result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
     source = "" if camera_file is None else camera_file.source
-    exporters, alignment = choose_exporters(hints.exporter, ply.info, layout, frame, source), None
-    if layout is None or frame is None:
-        scene = read_rotations(scene, hints.quats)
-        if camera_file is not None and hints.exporter != "auto":
-            remedy = f"only those of the given exporter {hints.exporter} were tried; --hint exporter=auto tries all"
-            more.append(f"the rows are the pixels of no views in any known order: {remedy}")
-    else:
-        assert camera_file is not None, "pixels belong to cameras"
-        scene, depth_notes = use_depths(scene, depths, layout, frame.scale)
-        scene, rotation_notes = set_rotations(scene, hints, exporters, frame)
-        more += [*depth_notes, *rotation_notes]
-        if result.given is not None:
-            scene = move_views(scene, result.given[views])
-            result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
-        alignment = check_pixels(scene)
-        if layout.per_pixel == 1:
-            camera_file = select_views(camera_file, views)
-    load = Loaded(
-        scene=without_photo(scene, [view for view, camera in enumerate(views) if camera in absent]),
+    order = "none" if recovery is None else recovery.layout.order
+    return Loaded(
+        scene=without_photo(scene, absent),
         info=ply.info,
         files=files,
         cameras=camera_file,
-        views=SceneViews(result.cameras, result.images, _camera_names(result), tuple(views)),
-        exporters=exporters,
+        exporters=choose_exporters(hints.exporter, ply.info, order, source),
         notes=(*files.notes, *file_notes(ply.info), *notes, *more),
-        alignment=alignment,
-        recovery=result.recovery,
+        alignment=None if recovery is None else check_pixels(scene),
+        recovery=recovery,
         problem=result.problem,
         moves=result.moves,
     )
-    return load.with_left_out(result.left_out)
 
 
 def _make_scene(
-    ply: GaussianFile, files: SceneFiles, result: AlignmentResult, large: LargePhotos | None, masks: Masks
+    ply: GaussianFile,
+    files: SceneFiles,
+    hints: ReadHints,
+    result: AlignmentResult,
+    large: LargePhotos | None,
+    masks: Masks,
 ) -> tuple[Scene, list[str]]:
-    """Make the scene of the visible Gaussians and the views to which rows belong; also return notes.
-
-    ``large`` and ``masks`` belong to all views of the camera file.
-    """
-    views, camera_names = list(result.views), _camera_names(result)
+    """Make the scene of the visible Gaussians and all views, of which ``large`` and ``masks`` are; return notes too."""
     gaussians, pixels = take_gaussians(ply, result)
     num_faint = int(ply.valid.sum()) - len(gaussians)
     faint = "fainter than 1/255, which nothing draws, set aside"
     notes = [count_words(num_faint, "Gaussian", faint)] if num_faint else []
-    cameras, images = result.cameras, result.images
-    if views != list(range(len(cameras))):
-        cameras, images = cameras[views], images[views] if len(images) else images
-    gaussians = color_from_photos(gaussians, pixels, images, files)
-    large = None if large is None else large[views]
-    masks, mask_notes = check_masks(masks[views], files)
-    photos = images if len(images) else None
-    names = tuple(camera_names[view] for view in views)
-    scene = Scene(gaussians, cameras, photos, pixels, names, large, masks.counts, masks.importance)
-    return scene, [*notes, *mask_notes]
-
-
-def _camera_names(result: AlignmentResult) -> tuple[str, ...]:
-    """Return the names of all views of the camera file; empty without cameras."""
-    return () if result.camera_file is None else result.camera_file.names
+    masks, mask_notes = check_masks(masks, files)
+    photos = result.images if len(result.images) else None
+    names = () if result.camera_file is None else result.camera_file.names
+    scene = Scene(gaussians, result.cameras, photos, pixels, names, large, masks.counts, masks.importance)
+    return read_rotations(scene, hints.quats), [*notes, *mask_notes]
 
 
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:

@@ -9,10 +9,12 @@ from dataclasses import fields, replace
 import cv2
 import numpy as np
 
+from gsmerge.frame import canonicalise
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import camera_depths, lower_median
+from gsmerge.geometry import lower_median
 from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.raster.photos import row_pictures
+from gsmerge.raster.images import MIN_ALPHA, render
+from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.types import Scene
 
 SIDE = 1600  # longest side of a photo in which keypoints are searched, pixels
@@ -21,7 +23,6 @@ KEYPOINTS = 4000  # most keypoints of a photo
 CONTRAST = 0.02  # least contrast of a keypoint; OpenCV's default finds too few on plain walls
 GREY = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
 RATIO = 0.8  # largest distance of the best match, divided by the distance of the second best (Lowe 2004)
-OPAQUE = 0.5  # the surface of a pixel is its nearest Gaussian with at least this share of its largest opacity
 SAME_DEPTH = 0.15  # largest relative difference of depths around a keypoint on one surface
 PIXEL_SPREAD = 0.003  # standard deviation of a keypoint, divided by the diagonal of the picture
 
@@ -69,34 +70,34 @@ class KeypointMatches:
 
 
 def find_keypoints(scene: Scene) -> list[Photo]:
-    """Find the keypoints in the photo of every camera of a scene of pixels; leave out those at edges of surfaces.
+    """Find the keypoints in the photo of every camera of a scene; leave out those at edges of surfaces.
 
-    Views from the same camera are layers of one photo.
+    Without photos, pictures are the drawn Gaussians.
     """
-    cameras = scene.cameras.numpy()
-    poses = cameras.viewmats.reshape(len(scene), -1)
-    keys = np.concatenate([poses, cameras.Ks.reshape(len(scene), -1)], 1)
-    firsts = [int((keys == key).all(1).argmax()) for key in keys]
-    photos = []
-    for view in sorted(set(firsts)):
-        layers = [i for i, first in enumerate(firsts) if first == view]
+    cameras, photos = scene.cameras.numpy(), []
+    canonical, frame = canonicalise(scene)
+    drawn = render(canonical.gaussians, canonical.cameras, near=NEAR_PLANE, with_depths=True)
+    assert drawn.depths is not None
+    depths = np.where(drawn.alphas > MIN_ALPHA, frame.unit * drawn.depths, np.inf)[..., 0]
+    pictures = drawn.images if scene.images is None else scene.images
+    for view in range(len(scene)):
         K = cameras.Ks[view].astype(np.float64)
         viewmat = cameras.viewmats[view].astype(np.float64)
-        picture, shown = _picture(scene, view, K)
+        picture, shown = _picture(scene, pictures[view], view, K)
         places, descriptors = _describe(picture, shown[1, 1] / shown[0, 0])
         zoom = K[0, 0] / shown[0, 0], K[1, 1] / shown[1, 1]
         pixels = (places - shown[:2, 2]) * zoom + K[:2, 2]
-        z, ok = _depths_at(_surface(scene, layers, viewmat), pixels)
+        z, ok = _depths_at(depths[view], pixels)
         rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
         points = matmul(rays[ok] * z[ok, None] - viewmat[:3, 3], viewmat[:3, :3])
         photos.append(Photo(pixels[ok], points, descriptors[ok], viewmat, K))
     return photos
 
 
-def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _picture(scene: Scene, picture: np.ndarray, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a picture ``[h,w,3]`` uint8 of a view, and its intrinsics.
 
-    The picture is the largest photo, reduced to SIDE pixels. Without photos it has the base colours of the Gaussians.
+    It is the larger photo, reduced to SIDE pixels, or else the given ``picture [h,w,3]`` with intrinsics ``K``.
     """
     if scene.large_photos is not None:
         large = scene.large_photos
@@ -106,8 +107,7 @@ def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.nda
         scale = np.array([[size[0] / large.width], [size[1] / large.height], [1.0]])
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if share < 1 else photo
         return small, large.Ks[view].astype(np.float64) * scale
-    colors = row_pictures(scene)[view] if scene.images is None else scene.images[view]
-    return (colors.clip(0, 1) * 255).round().astype(np.uint8), K
+    return (picture.clip(0, 1) * 255).round().astype(np.uint8), K
 
 
 def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
@@ -138,19 +138,6 @@ def _any_processor() -> Iterator[None]:
         yield
     finally:
         cv2.setUseOptimized(before)
-
-
-def _surface(scene: Scene, layers: Sequence[int], viewmat: np.ndarray) -> np.ndarray:
-    """Return the depth ``[h,w]`` of the nearest opaque Gaussian of each pixel of a camera; infinite without any.
-
-    ``layers`` are the views with the pose ``viewmat`` of that camera.
-    """
-    rows = scene.get_pixels().fronts[list(layers)]
-    means = scene.gaussians.means[rows].astype(np.float64)
-    opacities = scene.gaussians.opacities[rows] * (rows >= 0)
-    depths = camera_depths(means, viewmat)
-    seen = (depths > 0) & (opacities > 0) & (opacities >= OPAQUE * opacities.max(0))
-    return np.asarray(np.where(seen, depths, np.inf).min(0))
 
 
 def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
