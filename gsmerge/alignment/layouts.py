@@ -26,7 +26,10 @@ class Layout:
     @property
     def description(self) -> str:
         """Description in words, for messages."""
-        return f"{'every pixel' if self.ids is None else 'some pixels dropped'}, {self.order}"
+        if self.ids is None:
+            return f"every pixel, {self.order}"
+        has_layers = len(self.ids) > self.views * self.width * self.height
+        return f"{'several Gaussians per pixel' if has_layers else 'some pixels dropped'}, {self.order}"
 
     def pixel_ids(self) -> np.ndarray:
         """Return the pixel of each row; see ``ids``."""

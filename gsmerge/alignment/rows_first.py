@@ -164,15 +164,18 @@ def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     """Find the pixels of the rows in a grid; None if they are not the pixels in order."""
     if source.order == "none":
         return None
-    count, views = len(source.ply.gaussians), len(grid.cameras)
+    count, num_pixels = len(source.ply.gaussians), len(grid.cameras) * math.prod(grid.size)
+    layout, layers = Layout(len(grid.cameras), *grid.size), count // num_pixels
     if source.camera_file.pixel_ids is not None:
-        layout = Layout(views, *grid.size, ids=source.camera_file.pixel_ids)
-    elif count == views * math.prod(grid.size) and source.order != "view-fastest":
-        layout = Layout(views, *grid.size)
-    else:
+        layouts = [replace(layout, ids=source.camera_file.pixel_ids)]
+    elif count != layers * num_pixels or source.order == "view-fastest":
         return _follow_order(source, grid)
-    has_rows = int(source.ply.valid.sum()) >= min(_MIN_ROWS, _MIN_SHARE * count)
-    return _place_layout(source, grid, layout) if has_rows else None
+    else:  # several Gaussians of a pixel follow each other, or there are several layers of all pixels
+        rows = np.arange(count)
+        layouts = [layout] if layers == 1 else [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
+    if int(source.ply.valid.sum()) < min(_MIN_ROWS, _MIN_SHARE * count):
+        return None
+    return next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
 
 
 def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | None:
@@ -191,7 +194,8 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
         is_right = alignment.ok and alignment.worst_px <= limit and median(pixel_errors(shuffled, cameras)) >= far_px
         return Recovery(PlacedGrid(grid, frame, _EVIDENCE), layout, alignment) if is_right else None
 
-    if source.scale is None and (recovery := accept(grid, IDENTITY, _PLAIN_PX)):
+    usual = exporter_frames(grid.cameras, source.scale)[0]
+    if recovery := accept(grid, usual, _PLAIN_PX):
         return recovery
     own = own_poses(pairs, grid.cameras.Ks)
     if len(own) == len(grid.cameras):
@@ -311,7 +315,7 @@ def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
     if usual.source == ESTIMATED:
         separate = len(set(map(bytes, usual.Ks))) > 1
         subject = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
-        notes.append(f"no cameras are used: {subject} are estimated from the order of the Gaussians")
+        notes.append(f"no cameras are used: {subject} are estimated from the Gaussians' own grid")
     return AlignmentResult(
         pixel_ids=recovery.layout.pixel_ids(),
         cameras=place.cameras,

@@ -355,8 +355,9 @@ def _rotation_notes(quats: np.ndarray) -> list[str]:
     Quaternions computed from matrices rarely have a negative w. An exception is Depth Anything 3, which makes the last
     component of wxyz positive.
     """
-    seems_last = quats[:, 3].min(initial=0) >= 0 > quats[:, 0].min(initial=0)
-    return ["the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]"] * seems_last
+    if not quats[:, 3].min(initial=0) >= 0 > quats[:, 0].min(initial=0):
+        return []
+    return ["the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]"]
 
 
 def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> list[str]:

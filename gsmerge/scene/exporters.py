@@ -63,7 +63,8 @@ class Exporter:
 
     def may_have_written(self, info: FileInfo, order: str, cameras: str) -> bool:
         """Return whether this exporter may have written a file; see :func:`choose_exporters` for the arguments."""
-        return self.writes_columns(info) and order == self.order and (not self.cameras or cameras in self.cameras)
+        is_order = self.is_marked or order == self.order
+        return is_order and self.writes_columns(info) and (not self.cameras or cameras in self.cameras)
 
     def writes_columns(self, info: FileInfo) -> bool:
         """Return whether a file has the header and the opacities that this exporter writes."""

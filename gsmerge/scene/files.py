@@ -6,7 +6,7 @@ import filecmp
 import os
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
@@ -97,25 +97,6 @@ class SceneFiles:
         """Paths of all files and folders that the scene is read from: Gaussians, cameras and pictures."""
         beside = (self.cameras, self.images, self.masks, self.protect)
         return (*self.plys, *(path for path in beside if path is not None))
-
-    def without_found(self, unusable: str) -> Iterator[SceneFiles]:
-        """Yield copies without files that were searched and may not belong to the scene.
-
-        ``unusable``: path of the file that the scene could not be read with. If the caller named its folder of
-        pictures, there are no copies. Images inside the cameras' file are left out together with the cameras.
-        """
-        without_images, path = self, Path(unusable)
-        if any(name in self.named and path.is_relative_to(getattr(self, name) or os.devnull) for name in _PICTURES):
-            return
-        if "masks" not in self.named and self.masks is not None and path.is_relative_to(self.masks):
-            yield replace(self, masks=None)
-        if "images" not in self.named:
-            without_images = replace(self, images=None, named=self.named | {"images"})
-            yield without_images
-        if "cameras" not in self.named and self.cameras not in (None, self.ply):
-            if self.images is None or self.images != self.cameras:
-                yield replace(self, cameras=None)
-            yield replace(without_images, cameras=None)
 
     @property
     def is_state(self) -> bool:

@@ -16,6 +16,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.geometry import Similarity, rotmat_to_quat
 from gsmerge.kernels.elementary import arccos
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Pixels, Scene
+from gsmerge.words import count_words
 
 
 @dataclass(frozen=True)
@@ -32,10 +33,10 @@ class JoinedScene:
 
 
 def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
-    """Join scenes of one place, each with its own frame and scale, into one scene.
+    """Join scenes of pixels of one place, each with its own frame and scale, into one scene.
 
-    ``paths`` are their files, for messages. Raises SceneError if a scene has no cameras, if views or harmonics differ
-    in size, or if no two scenes show the same surfaces.
+    ``paths`` are their files, for messages. Raises SceneError if a scene has no pixels, if views or harmonics differ in
+    size, or if no two scenes show the same surfaces.
     """
     _check(scenes, paths)
     registration = register(scenes)
@@ -72,8 +73,12 @@ def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
     for scene, path in zip(scenes, paths, strict=True):
         scene_size = scene.cameras.width, scene.cameras.height
         sh_degree = scene.gaussians.sh_degree
-        if not len(scene):
-            raise SceneError(path, "expected cameras, as scenes to join, found none", "compact it by itself")
+        if not scene.has_own_pixels:
+            found = "no cameras"
+            if len(scene):
+                found = count_words(len(scene), "camera", "and Gaussians that are no pixels")
+            problem = f"expected cameras and one Gaussian for each of their pixels, as scenes to join, found {found}"
+            raise SceneError(path, problem, "compact it by itself")
         if scene_size != size:
             problem = f"expected views of {size[0]} x {size[1]} as in {paths[0].name}"
             problem += f", found {scene_size[0]} x {scene_size[1]}"

@@ -9,12 +9,10 @@ from dataclasses import fields, replace
 import cv2
 import numpy as np
 
-from gsmerge.frame import canonicalise
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import lower_median
+from gsmerge.geometry import camera_depths, lower_median
 from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.raster.images import MIN_ALPHA, render
-from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.raster.photos import row_pictures
 from gsmerge.types import Scene
 
 SIDE = 1600  # longest side of a photo in which keypoints are searched, pixels
@@ -70,34 +68,26 @@ class KeypointMatches:
 
 
 def find_keypoints(scene: Scene) -> list[Photo]:
-    """Find the keypoints in the photo of every camera of a scene; leave out those at edges of surfaces.
-
-    Without photos, pictures are the drawn Gaussians.
-    """
+    """Find the keypoints in the photo of every view of a scene of pixels; leave out those at edges of surfaces."""
     cameras, photos = scene.cameras.numpy(), []
-    canonical, frame = canonicalise(scene)
-    drawn = render(canonical.gaussians, canonical.cameras, near=NEAR_PLANE, with_depths=True)
-    assert drawn.depths is not None
-    depths = np.where(drawn.alphas > MIN_ALPHA, frame.unit * drawn.depths, np.inf)[..., 0]
-    pictures = drawn.images if scene.images is None else scene.images
     for view in range(len(scene)):
         K = cameras.Ks[view].astype(np.float64)
         viewmat = cameras.viewmats[view].astype(np.float64)
-        picture, shown = _picture(scene, pictures[view], view, K)
+        picture, shown = _picture(scene, view, K)
         places, descriptors = _describe(picture, shown[1, 1] / shown[0, 0])
         zoom = K[0, 0] / shown[0, 0], K[1, 1] / shown[1, 1]
         pixels = (places - shown[:2, 2]) * zoom + K[:2, 2]
-        z, ok = _depths_at(depths[view], pixels)
+        z, ok = _depths_at(_surface(scene, view, viewmat), pixels)
         rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
         points = matmul(rays[ok] * z[ok, None] - viewmat[:3, 3], viewmat[:3, :3])
         photos.append(Photo(pixels[ok], points, descriptors[ok], viewmat, K))
     return photos
 
 
-def _picture(scene: Scene, picture: np.ndarray, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a picture ``[h,w,3]`` uint8 of a view, and its intrinsics.
 
-    It is the larger photo, reduced to SIDE pixels, or else the given ``picture [h,w,3]`` with intrinsics ``K``.
+    The picture is the largest photo, reduced to SIDE pixels. Without photos it has the base colours of the Gaussians.
     """
     if scene.large_photos is not None:
         large = scene.large_photos
@@ -107,7 +97,8 @@ def _picture(scene: Scene, picture: np.ndarray, view: int, K: np.ndarray) -> tup
         scale = np.array([[size[0] / large.width], [size[1] / large.height], [1.0]])
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if share < 1 else photo
         return small, large.Ks[view].astype(np.float64) * scale
-    return (picture.clip(0, 1) * 255).round().astype(np.uint8), K
+    colors = row_pictures(scene)[view] if scene.images is None else scene.images[view]
+    return (colors.clip(0, 1) * 255).round().astype(np.uint8), K
 
 
 def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
@@ -138,6 +129,13 @@ def _any_processor() -> Iterator[None]:
         yield
     finally:
         cv2.setUseOptimized(before)
+
+
+def _surface(scene: Scene, view: int, viewmat: np.ndarray) -> np.ndarray:
+    """Return the depth ``[h,w]`` of the Gaussian in front of each pixel of a view; infinite without any."""
+    rows = scene.get_pixels().fronts[view]
+    depths = camera_depths(scene.gaussians.means[rows].astype(np.float64), viewmat)
+    return np.asarray(np.where((rows >= 0) & (depths > 0), depths, np.inf))
 
 
 def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
