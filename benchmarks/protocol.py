@@ -30,10 +30,10 @@ from quality import setting
 
 import gsmerge
 from gsmerge.facts.views import even_views, midpoint_views
+from gsmerge.geometry import fit_similarity
 from gsmerge.io.cameras.camera_file import select_views
 from gsmerge.measure.evaluate import Quality
 from gsmerge.research.captures import Capture, find_capture, list_captures
-from gsmerge.scene.held_out import fit_similarity
 from gsmerge.scene.read import Loaded, load_scene
 from gsmerge.types import Cameras, Views
 

@@ -15,7 +15,7 @@ import numpy as np
 from gsmerge.arrays import Array
 from gsmerge.frozen import dataclass
 from gsmerge.kernels.elementary import arctan2, cos, sin
-from gsmerge.kernels.matrices import invert, matmul, solve
+from gsmerge.kernels.matrices import closest_rotation, invert, matmul, solve
 from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
@@ -493,6 +493,20 @@ def clamp_inside(region: Region, points: np.ndarray) -> np.ndarray:
     else:
         local = np.clip(local, -half, half)
     return np.asarray(region.middle + matmul(local, region.axes))
+
+
+def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
+    """Fit the similarity that maps cameras ``theirs [c,4,4]`` (world to camera) to ``ours``, by least squares.
+
+    If all cameras stand in one place, they do not determine the scale, and ``scale`` is used.
+    """
+    rotation = closest_rotation(matmul(ours[:, :3, :3].swapaxes(1, 2), theirs[:, :3, :3]).sum(0))
+    a, b = matmul(camera_centres(theirs), rotation.T), camera_centres(ours)
+    a0, b0 = a - a.mean(0), b - b.mean(0)
+    spread = float((a0**2).sum())
+    if spread > 1e-12 * max(float((a**2).sum()), 1e-300) and len(ours) > 1:
+        scale = float((a0 * b0).sum()) / spread
+    return Similarity(rotation, scale, b.mean(0) - scale * a.mean(0))
 
 
 def mean_pose_frame(viewmats: np.ndarray) -> Similarity:

@@ -51,7 +51,6 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
         "images": _as_floats(photos),
         "viewmats": viewmats,
         "Ks": _in_pixels_of(photos, as_array(_field("prediction", prediction, "intrinsics"))),
-        "check_rotations": False,  # the model's renderer uses them as they are
     }
 
 

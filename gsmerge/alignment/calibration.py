@@ -70,14 +70,13 @@ class _Model:
         return count * float(log((errors * errors).mean())) + self.free * float(log(count))
 
 
-def calibrate(pairs: Correspondences, width: int, height: int, count: int = 0) -> Calibration | None:
+def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | None:
     """Calibrate the cameras of views of ``width`` x ``height`` pixels from ``pairs`` of Gaussians and pixels.
 
-    ``count`` is the least number of views; pairs of later views increase it. A view without pairs gets the camera of
-    the view before. None if the points do not determine the cameras, or if they lie farther from their pixels than
-    allowed.
+    A view without pairs gets the camera of the view before. None if the points do not determine the cameras, or if they
+    lie farther from their pixels than allowed.
     """
-    if not len(pairs.rows):
+    if not len(pairs.points):
         return None
     view_ids = np.unique(pairs.views)
     views = [pairs.select(pairs.views == view) for view in view_ids]
@@ -92,7 +91,7 @@ def calibrate(pairs: Correspondences, width: int, height: int, count: int = 0) -
         return None
     viewmats = model.poses.copy()
     viewmats[:, :3, 3] = unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], middle)
-    all_views = np.arange(max(count, int(view_ids[-1]) + 1))
+    all_views = np.arange(int(view_ids[-1]) + 1)
     solved = np.maximum(np.searchsorted(view_ids, all_views, side="right") - 1, 0)  # index of the solved camera
     return Calibration(Cameras(viewmats[solved], model.Ks[solved], width, height), model.worst_px)
 

@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.alignment.calibration import Calibration, calibrate
-from gsmerge.alignment.centres import follow_rows
-from gsmerge.alignment.layouts import Layout, dropped_layout, subsample
+from gsmerge.alignment.layouts import Layout
 from gsmerge.alignment.resection import projective_camera
 from gsmerge.alignment.score import find_correspondences, is_as_near
 from gsmerge.frozen import dataclass
 from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.reproject import follow_pixels
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line
 _SAMPLES = 1500  # number of rows whose nearest neighbour is searched among the rows after them
@@ -51,8 +51,8 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
     for length in _find_lengths(points):
         views = _find_views(points, length)
         if sum(len(view.x) for view in views) >= _MIN_PLACED * len(rows):
-            layout = _make_layout(rows, views)
-            pairs = find_correspondences(means, valid, subsample(layout, _SOLVED_FROM))
+            layout = _make_layout(rows, views, len(means))
+            pairs = find_correspondences(means, valid, layout, _SOLVED_FROM)
             calibration = calibrate(pairs, layout.width, layout.height)
             if calibration is not None:
                 return layout, calibration
@@ -208,6 +208,21 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
         view = grown
 
 
+def follow_rows(
+    points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, width: int, height: int, *, mixed: bool = False
+) -> np.ndarray:
+    """Find pixels ``[n]`` of rows at ``points [n,3]`` float32 so that most rows are in the order of pixels.
+
+    Rows out of order get -1. The order is view by view and line by line. If ``mixed``, it is line by line, and the
+    views of a pixel follow each other.
+    """
+    count, views = len(points), len(viewmats)
+    shapes = ((count, np.int64), (count, np.int64), (count, np.int32), (count * views, np.int32))
+    ids, *scratch = (np.empty(size, dtype) for size, dtype in (*shapes, (views, np.int64), (views, np.int32)))
+    follow_pixels(points, viewmats, Ks, ids, *scratch, width, height, int(mixed))
+    return ids
+
+
 def _free_range(free: np.ndarray, rows: np.ndarray) -> tuple[int, int]:
     """Return the first row and the end of the free rows around ``rows``."""
     before, after = np.flatnonzero(~free[: rows[0]]), np.flatnonzero(~free[rows[-1] :])
@@ -223,15 +238,15 @@ def _solve(points: np.ndarray, view: _View) -> _View:
     return replace(view, camera=camera * np.copysign(1.0, np.median(depths)), px=px)
 
 
-def _make_layout(rows: np.ndarray, views: list[_View]) -> Layout:
-    """Lay out views on grids of one size, so that they have the same principal point."""
+def _make_layout(rows: np.ndarray, views: list[_View], count: int) -> Layout:
+    """Lay out views of ``count`` rows on grids of one size, so that they have the same principal point."""
     lefts, width = _choose_shifts([(view.x, _principal(view, 0)) for view in views])
     tops, height = _choose_shifts([(view.y, _principal(view, 1)) for view in views])
     pixels = tuple((view.y + top) * width + view.x + left for view, top, left in zip(views, tops, lefts, strict=True))
-    ids = np.full(rows[-1] + 1, -1)
+    ids = np.full(count, -1)
     for number, (view, view_pixels) in enumerate(zip(views, pixels, strict=True)):
         ids[rows[view.rows]] = number * height * width + view_pixels
-    return dropped_layout(ids, len(views), width, height)
+    return Layout(len(views), width, height, ids=ids)
 
 
 def _choose_shifts(views: Sequence[tuple[np.ndarray, float]]) -> tuple[list[int], int]:

@@ -1,35 +1,24 @@
-"""Bring cameras and photos to each size that the grid of the rows may have.
-
-Files give some sizes, and the rows themselves show others.
-"""
+"""Bring cameras and photos to each size that the grid of the rows may have: that of the photos or of the cameras."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import numpy as np
 
 from gsmerge.alignment.cameras import Poses, describe_other_convention
-from gsmerge.alignment.layouts import ESTIMATED, TRIMS, da3_box
+from gsmerge.alignment.layouts import ESTIMATED
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Similarity
-from gsmerge.io.cameras.camera_file import PATCH, CameraFile, Convention, sizes_of, to_cameras
+from gsmerge.io.cameras.camera_file import CameraFile, Convention, sizes_of, to_cameras
 from gsmerge.io.cameras.table import FFGS
-from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
 from gsmerge.types import Cameras
 
-SIDES = (504, 518)  # pixels to which Depth Anything 3 and others resize the longer or the shorter side
-SQUARE = 256  # side of the images of pixelSplat and its relatives, pixels
-_MULTIPLES = (8, PATCH)  # if photos are cropped, both sides of the grid are multiples of one of these
-_STRETCHED, _MAX_STRETCH = 16, 0.15  # ReSplat stretches photos to multiples of 16 pixels, and by at most 15 %
 _STRETCHES = 0.1  # relative difference of the scales of width and height above which few models resize photos
-_MIN_CROP = 0.5  # smallest share of a photo's area that is left after cropping
-_NEAR_SIZE = 0.05  # largest difference between assumed camera sizes and photo sizes, divided by the longer side
 _MAX_ENLARGED = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
 
 
@@ -43,7 +32,6 @@ class Grid:
     notes: tuple[str, ...]  # notes for the user, one sentence each
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
     given: np.ndarray | None = None  # ``[c,4,4]`` given poses that the photos confirm; Gaussians move there
-    left_out: tuple[str, ...] = ()  # notes on views and cameras that do not fit each other
 
     @property
     def size(self) -> Size:
@@ -81,13 +69,13 @@ def with_poses(grid: Grid, poses: Poses) -> Grid:
     return replace(grid, camera_file=file, cameras=replace(grid.cameras, viewmats=poses.viewmats))
 
 
-def with_photo_size(camera_file: CameraFile, size: Size | None, tolerance: float = 1) -> CameraFile:
-    """Give cameras the size of the photos if the cameras' own size differs by up to ``tolerance`` pixels.
+def with_photo_size(camera_file: CameraFile, size: Size | None) -> CameraFile:
+    """Give cameras the size of the photos if the cameras' own size differs by one pixel.
 
     The own size may have been computed as twice the principal point. The same cameras are returned otherwise.
     """
     stored = sizes_of(camera_file)
-    if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= tolerance:
+    if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= 1:
         return camera_file
     widths, heights = (np.full_like(camera_file.widths, side) for side in size)
     return replace(camera_file, widths=widths, heights=heights)
@@ -160,94 +148,3 @@ def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
             note = f"cameras of {camera_size[0]} x {camera_size[1]} are {transform.description}, the images' size"
             grids.append(Grid(camera_file, transform.cameras(cameras), None, (note,)))
     return grids
-
-
-def grids_of(
-    camera_file: CameraFile, size: Size | None, transforms: Callable[[Size], list[PhotoTransform]]
-) -> list[Grid]:
-    """List the grids to which ``transforms(size)`` bring the photos, or without photos the cameras.
-
-    ``size`` is the size of the photos. Empty if cameras have several sizes, or another shape than the photos.
-    """
-    sizes = sizes_of(camera_file)
-    base = size or (sizes[0] if len(sizes) == 1 else None)
-    if base is None or any(not same_shape(s, base) for s in sizes):
-        return []
-    at_photo_size = with_photo_size(camera_file, base, _NEAR_SIZE * max(base))
-    files = [camera_file] if at_photo_size is camera_file else [camera_file, at_photo_size]
-    subject = "photos and cameras" if size is not None else "cameras"
-    grids: list[Grid] = []
-    for transform in transforms(base):
-        note = f"{subject} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
-        grids += [Grid(file, transform.cameras(to_cameras(file, base)), transform, (note,)) for file in files]
-        if not sizes and transform.crops:
-            cameras = to_cameras(camera_file, (transform.width, transform.height))
-            grids.append(Grid(camera_file, cameras, transform, (f"{note}; the intrinsics are those of the result",)))
-    return grids
-
-
-def shown_sizes(size: Size, shape: Size) -> list[PhotoTransform]:
-    """List the transforms that shrink photos of a ``size`` to a grid whose borders may have been cut off.
-
-    ``shape`` is (width, height) of the rows, the grid without its borders.
-    """
-    transforms = []
-    for trim in (0, *TRIMS):
-        grid_size = width, height = shape[0] + 2 * trim, shape[1] + 2 * trim
-        if grid_size == size or width > size[0] or height > size[1]:
-            continue
-        aspect = width * size[1] / (height * size[0])
-        is_usual = width == height or any(width % side == height % side == 0 for side in _MULTIPLES)
-        may_stretch = abs(aspect - 1) <= _MAX_STRETCH and width % _STRETCHED == height % _STRETCHED == 0
-        may_crop = min(aspect, 1 / aspect) >= _MIN_CROP and is_usual
-        if abs(aspect - 1) <= ASPECT_TOLERANCE or (may_crop and may_stretch):
-            transforms.append(resize_to(size, grid_size))
-        if may_crop:
-            transforms.append(resize_and_crop(size, grid_size))
-    for transform in (*(resize_to(size, half) for half in _half_sizes(size)), *patch_grids(size)):
-        width, height = transform.width, transform.height
-        if da3_box(width, height).pixels(width, height).shape == shape[::-1]:
-            transforms.append(transform)
-    return list(dict.fromkeys(transforms))
-
-
-def network_sizes(size: Size) -> list[PhotoTransform]:
-    """List the transforms of networks to grids whose rows may lack some pixels."""
-    return [*patch_grids(size), *(resize_to(size, half) for half in _half_sizes(size)), *square_sizes(size)]
-
-
-def square_sizes(size: Size) -> list[PhotoTransform]:
-    """List the transform that crops photos to the square of pixelSplat and similar models; empty for smaller photos."""
-    square = SQUARE, SQUARE
-    return [resize_and_crop(size, square)] if min(size) >= SQUARE and size != square else []
-
-
-def _half_sizes(size: Size) -> Iterator[Size]:
-    """Yield the sizes at which Lyra 2 writes Gaussians: half of each side, maybe rounded to a multiple of 14 first."""
-    yield from product(*({side // 2, PATCH * round(side / PATCH) // 2} - {0} for side in size))
-
-
-def patch_grids(size: Size) -> list[PhotoTransform]:
-    """List the transforms of networks that take multiples of 14 pixels: each side is rounded, or cropped."""
-    transforms = []
-    for side in SIDES:
-        for scale in (side / max(size), side / min(size)):
-            if scale <= 1:
-                width, height = (PATCH * max(1, round(s * scale / PATCH)) for s in size)
-                transforms.append(resize_to(size, (width, height)))
-                width, height = (PATCH * max(1, round(s * scale) // PATCH) for s in size)
-                transforms.append(resize_and_crop(size, (width, height), scale))
-    return list(dict.fromkeys(transforms))
-
-
-def small_photos_error(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
-    """Make the SceneError for rows that fill a grid of the cameras' size, while the photos have another size.
-
-    None for other numbers of rows and for photos of the cameras' size.
-    """
-    grid_size = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
-    if size is None or grid_size is None or grid_size == size:
-        return None
-    problem = f"expected images of the Gaussian grid's size {grid_size[0]} x {grid_size[1]} or larger"
-    problem += f", found {size[0]} x {size[1]}"
-    return SceneError(camera_file.path, problem, "give the images that the backbone saw, or their originals")

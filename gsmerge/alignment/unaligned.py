@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.alignment.cameras import Poses, other_conventions
-from gsmerge.alignment.centres import check_centres, sample_points
 from gsmerge.alignment.frames import exporter_frames
 from gsmerge.alignment.grids import Grid, PlacedGrid, with_poses
-from gsmerge.alignment.score import MARGIN, RANDOM_SHARE, SAME_COLORS, AlignmentInput, photo_colors
+from gsmerge.alignment.score import AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
@@ -19,6 +18,11 @@ from gsmerge.io.cameras.camera_file import Convention
 from gsmerge.kernels.elementary import exp
 from gsmerge.types import Cameras, Gaussians
 
+# Colour error, divided by the colour error of shuffled pixels. Above this share colours agree no better than at random
+RANDOM_SHARE = 0.85
+SAME_COLORS = 0.01  # colour error of shuffled pixels below which colours vary too little to decide
+# Least score of another convention, divided by the score of the usual one: if photos decide, and if none do
+_COLOR_MARGIN, _MARGIN = 1.3, 2.0
 _FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the given frame
 _PEAK_GAIN = 1.05  # least score of a scale chosen by colours, divided by the score of a scale two steps away
 _SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to count those that cameras see
@@ -33,7 +37,6 @@ _SCALES = np.geomspace(1 / 30, 30, 55)  # of the cameras' positions, tried in tu
 _SCALE_GAUSSIANS = 2000  # Gaussians that the scales are tried on
 # Finer searches around the best scale: range (natural logarithm), steps, Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
-_CENTRED = ((0.02, 81), (5e-4, 51))  # last searches, by distances from pixel centres: range and steps
 
 
 @dataclass(frozen=True)
@@ -165,7 +168,8 @@ def choose_poses(
         return None, usual, None
     poses, best = ranked[0]
     rivals = [usual, *(check for _, check in ranked[1:2])]
-    if best.score >= MARGIN * max((check.score for check in rivals if check.ok), default=0.0):
+    margin = _MARGIN if np.isnan(best.color_ratio) else _COLOR_MARGIN
+    if best.score >= margin * max((check.score for check in rivals if check.ok), default=0.0):
         return poses, best, None
     # Without photos other conventions may see as many Gaussians of any scene, so no note is needed
     as_good = usual.ok and usual.num_compared > 0 and _FRAME_GAIN * best.score >= usual.score
@@ -272,15 +276,9 @@ def _scale_frame(frame: Similarity, factor: float) -> Similarity:
 
 
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
-    """Solve for the scale of a frame: first by the colours in the photos, then by the distances from pixel centres."""
+    """Solve for the scale of a frame by the colours in the photos, in ever smaller steps."""
     best, _ = _best_frame(inputs, (_scale_frame(frame, float(scale)) for scale in _SCALES), _SCALE_GAUSSIANS)
     for reach, steps, samples in _FINER:
         factors = exp(np.linspace(-reach, reach, steps))
         best, _ = _best_frame(inputs, [_scale_frame(best, float(factor)) for factor in factors], samples)
-    points = sample_points(inputs.gaussians.means, inputs.valid)
-    for reach, steps in _CENTRED:
-        frames = [_scale_frame(best, float(factor)) for factor in exp(np.linspace(-reach, reach, steps))]
-        checks = [check_centres(points, frame.move(inputs.cameras)) for frame in frames]
-        nearest = min(range(steps), key=lambda i: checks[i].px)
-        best = frames[nearest] if checks[nearest].ok else best
     return best

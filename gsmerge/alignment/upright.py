@@ -16,12 +16,10 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.alignment.frames import UPRIGHT, ray_directions, solve_frame
-from gsmerge.alignment.layouts import TRIMS, trim_box
-from gsmerge.alignment.score import AlignmentInput, Correspondences, base_colors, pixel_errors, pixel_limit
-from gsmerge.errors import SceneError
+from gsmerge.alignment.layouts import TRIMS
+from gsmerge.alignment.score import AlignmentInput, Correspondences, pixel_errors, pixel_limit
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import Similarity
-from gsmerge.io.formats.read import FileInfo
+from gsmerge.geometry import Similarity, sh0_to_rgb
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
@@ -55,7 +53,7 @@ class _Stretch:
     high: int  # end of the places, exclusive
 
 
-def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
+def _find_rotation(inputs: AlignmentInput) -> Similarity | None:
     """Find the camera from which rows were centred, rescaled and turned upright; return the rotation, or None."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
     sample = means[:: max(1, len(means) // _ROUGH_ROWS)]
@@ -75,10 +73,16 @@ def _deviation(points: np.ndarray) -> float:
     return max(float(np.abs(np.median(points, 0)).max()), abs(quantile - 1))
 
 
-def solve_upright(inputs: AlignmentInput, rotation: Similarity) -> Similarity | None:
-    """Solve for the frame of upright rows from their colours in the photos; None if too few stretches agree."""
+def solve_upright(inputs: AlignmentInput) -> Similarity | None:
+    """Solve for the frame of upright rows from their colours in the photos.
+
+    None for rows in another frame, without photos, and if too few stretches agree.
+    """
+    rotation = _find_rotation(inputs) if len(inputs.images) else None
+    if rotation is None:
+        return None
     for pixels, stretches in _possible_orders(len(inputs.gaussians), inputs.cameras):
-        frame = _solve_agreed_frame(inputs, _match(inputs, stretches, pixels), rotation)
+        frame = _solve_agreed_frame(inputs, *_match(inputs, stretches, pixels), rotation)
         if frame is not None:
             return frame
     return None
@@ -86,7 +90,8 @@ def solve_upright(inputs: AlignmentInput, rotation: Similarity) -> Similarity | 
 
 def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray, list[_Stretch]]]:
     """Yield the orders that ``count`` rows may have, as pixels ``[p]`` of a photo and the stretches to search."""
-    trimmed, whole = (trim_box(trim).pixels(cameras.width, cameras.height).reshape(-1) for trim in (TRIMS[0], 0))
+    grid, trim = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), TRIMS[0]
+    trimmed, whole = grid[trim:-trim, trim:-trim].reshape(-1), grid.reshape(-1)
     for per_pixel in _PER_PIXEL:
         stretches = _interleaved_stretches(count, len(cameras), per_pixel, len(trimmed))
         if stretches:
@@ -125,11 +130,13 @@ def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
     return first_view + last_view
 
 
-def _match(inputs: AlignmentInput, stretches: Sequence[_Stretch], pixels: np.ndarray) -> Correspondences:
+def _match(
+    inputs: AlignmentInput, stretches: Sequence[_Stretch], pixels: np.ndarray
+) -> tuple[Correspondences, np.ndarray]:
     """Search for stretches in the photos; return a sample of the rows of all stretches that match a photo.
 
-    A stretch matches if a single place of its photo has nearly the colours of its rows. Each of these stretches is a
-    part of the result.
+    A stretch matches if a single place of its photo has nearly the colours of its rows. Also returns the stretch
+    ``[t]`` of each row.
     """
     rows = np.array([stretch.start + stretch.step * np.arange(_LENGTH) for stretch in stretches])
     places, sums, next_sums = _place_stretches(inputs, stretches, rows, pixels).T
@@ -142,7 +149,8 @@ def _match(inputs: AlignmentInput, stretches: Sequence[_Stretch], pixels: np.nda
     views = np.array([stretch.view for stretch in stretches])[matched].repeat(_PER_STRETCH)
     parts = np.arange(len(matched)).repeat(_PER_STRETCH)
     points = inputs.gaussians.means[ids].astype(np.float64)
-    return Correspondences(points, np.stack([x, y], 1) + 0.5, views, parts, ids).select(inputs.valid[ids])
+    valid = inputs.valid[ids]
+    return Correspondences(points, np.stack([x, y], 1) + 0.5, views).select(valid), parts[valid]
 
 
 def _place_stretches(
@@ -152,7 +160,9 @@ def _place_stretches(
 
     ``rows [s,l]`` are the rows of the stretches, and ``pixels [p]`` the pixels of a photo in which they are searched.
     """
-    colors = np.ascontiguousarray(np.rint(255 * base_colors(inputs.gaussians)).astype(np.int16).T)
+    with np.errstate(invalid="ignore"):
+        base = np.nan_to_num(sh0_to_rgb(inputs.gaussians.sh0[:, 0])).clip(0, 1)
+    colors = np.ascontiguousarray(np.rint(255 * base).astype(np.int16).T)
     shown = [_shown_colors(np.rint(255 * photo).astype(np.uint8), pixels, _LENGTH) for photo in inputs.images]
     places = []
     for stretch, stretch_rows in zip(stretches, rows, strict=True):
@@ -188,16 +198,21 @@ def _place_stretch(shown: np.ndarray, colors: np.ndarray, low: int, high: int) -
     return low + best, int(sums[best]), int(other_sums.min(initial=np.iinfo(np.int32).max))
 
 
-def _solve_agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation: Similarity) -> Similarity | None:
-    """Solve for the scale and shift that most stretches agree on; None if too few agree."""
-    stretches = np.unique(pairs.parts)
-    views = np.array([pairs.views[pairs.parts == stretch][0] for stretch in stretches])
+def _solve_agreed_frame(
+    inputs: AlignmentInput, pairs: Correspondences, parts: np.ndarray, rotation: Similarity
+) -> Similarity | None:
+    """Solve for the scale and shift that most stretches agree on; None if too few agree.
+
+    ``parts [t]`` are the stretches of the pairs.
+    """
+    stretches = np.unique(parts)
+    views = np.array([pairs.views[parts == stretch][0] for stretch in stretches])
     if len(np.unique(views)) < _MIN_VIEWS:
         return None
     limit, rng = pixel_limit(inputs.cameras.width, inputs.cameras.height), np.random.default_rng(0)
 
     def solve(some_stretches: np.ndarray) -> Similarity | None:
-        selected = pairs.select(np.isin(pairs.parts, some_stretches))
+        selected = pairs.select(np.isin(parts, some_stretches))
         rays = ray_directions(selected, inputs.cameras)
         return solve_frame(selected.points, rays, rotation.rotation, shifted=True)
 
@@ -205,7 +220,7 @@ def _solve_agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation
         if frame is None:
             return stretches[:0]
         errors = pixel_errors(pairs, frame.move(inputs.cameras))
-        return stretches[[float(np.median(errors[pairs.parts == stretch])) < limit for stretch in stretches]]
+        return stretches[[float(np.median(errors[parts == stretch])) < limit for stretch in stretches]]
 
     best = stretches[:0]
     for _ in range(_PAIRS):
@@ -221,15 +236,3 @@ def _solve_agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation
         return None
     text = f"{rotation.description}, positions scaled by {frame.scale:.4g} and shifted"
     return replace(frame, description=text, kind=rotation.kind)
-
-
-def upright_error(ply: FileInfo, num_photos: int) -> SceneError:
-    """Make the SceneError for upright rows that no photo locates."""
-    photos = "photos that do not show" if num_photos else "no photos that show"
-    return SceneError(
-        ply.path,
-        "expected cameras in the frame of the Gaussians, found Gaussians that were centred, rescaled and turned upright"
-        f" by amounts that no file states, and {photos} where they lie",
-        "give the photos that the model saw, or cameras in the frame of the Gaussians, or export all pixels without a"
-        " far cut",
-    )

@@ -12,7 +12,6 @@ from pathlib import Path
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_budget, read_lines
-from gsmerge.io.formats import depth_maps
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import natural_order
@@ -23,8 +22,7 @@ from gsmerge.words import count_words
 NamedScene = tuple[Path, Path | None]  # a scene, and the folder that the user named; None if that was the scene itself
 MAX_FOLDERS = 100_000  # folders without a scene after the last scene; a link into a system's folders leads to more
 _JOB_BYTES = 700  # memory for each scene of a list
-DEPTH_NAMES = {Path(place).parts[0] for place in (*depth_maps.PLACES, depth_maps.FRAMES)}
-SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)} | DEPTH_NAMES
+SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
 SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
 
 
@@ -170,16 +168,15 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 def _is_scene(folder: Path, names: list[str]) -> bool:
     """Return whether a folder that contains these names is a scene."""
     try:
-        if SCENE_NAMES.isdisjoint(names) and folder.name != depth_maps.FRAMES:
+        if SCENE_NAMES.isdisjoint(names):
             return False
         if named_ply(folder) is not None:
             return True
         if other_plys(folder):
             return False
         # a file with a usual name but without Gaussians fails alone
-        without_gaussians = [header_content(path) for path in list_plys(folder)] == ["other"]
-        return without_gaussians or bool(depth_maps.find_depth_maps(folder))
-    except (SceneError, OSError):  # a frame is missing or cannot be read; reading the scene reports which
+        return [header_content(path) for path in list_plys(folder)] == ["other"]
+    except (SceneError, OSError):  # reading the scene reports the reason
         return True
 
 

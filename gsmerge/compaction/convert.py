@@ -18,13 +18,12 @@ from gsmerge.frame import scene_frame
 from gsmerge.frozen import dataclass
 from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
-from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, upward_axis
 from gsmerge.io.formats.extra_columns import describe_extra_columns, join_extra_columns, read_extra_columns
 from gsmerge.io.formats.read import FileInfo, kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
-from gsmerge.io.formats.table import DEPTHS, Contents, Format, NamedPhotos, find_format
+from gsmerge.io.formats.table import Contents, Format, NamedPhotos
 from gsmerge.io.formats.write import output_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.report import document_head
@@ -95,8 +94,6 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     notes += [*unread, *describe_extra_columns(columns, missing, format_, moves=options.placement.moves)]
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, left_out["unseen"], count, None if stored is None else stored.path)
-    grey = [path for path in options.inputs if find_format(path) is DEPTHS and not holds_images(path)]
-    notes += [f"{path.name}: depth maps without images: all Gaussians are grey" for path in grey]
     names = () if stored is None else stored.names
     photos = name_photos(_photo_folder(options, stored), names)
     notes += output_notes(options.output, gaussians.sh_degree, photos) + rounding_notes(options.output, gaussians)

@@ -11,13 +11,11 @@ import numpy as np
 from gsmerge.alignment import (
     check_pairs,
     choose_poses,
-    choose_rotations,
     explain_misalignment,
     misalignment_error,
     move_cameras,
     other_conventions,
     sample_pixels,
-    w_seems_last,
 )
 from gsmerge.arrays import Array, as_array, to_float32
 from gsmerge.compaction.compact import compact
@@ -57,11 +55,6 @@ _REMEDIES = {
     W2C_OPENGL: "negate the second and the third row of each",
     C2W_OPENGL: "negate the second and the third column of each, and pass the inverse",
 }
-_ROTATION_REMEDIES = {
-    "xyzw": "pass quats[:, [3, 0, 1, 2]]",
-    "camera": "multiply each by its view's rotation from camera to world",
-    "xyzw-root": "pass the rotations that the model rendered with",
-}
 
 
 def compact_tensors(
@@ -79,7 +72,6 @@ def compact_tensors(
     shape: tuple[int, int, int] | None = None,
     names: Sequence[str] | None = None,
     order: str = "view-major",
-    check_rotations: bool = True,
     progress: Progress | None = None,
     **settings: Unpack[CompactKeywords],
 ) -> CompactResult:
@@ -104,8 +96,6 @@ def compact_tensors(
         names: Names of the views; None: numbers.
         order: ``"view-major"``: one Gaussian per pixel, as above; ``"none"``: Gaussians without pixels
             (trained scenes, voxels); cameras are then optional.
-        check_rotations: Refuse rotations that follow the surface far better in another convention;
-            False for models whose own renderer takes them unchanged.
         progress: See :func:`gsmerge.compact`.
         **settings: Settings of :func:`gsmerge.compact`, such as ``budget="4%"``, ``k=2``.
 
@@ -139,9 +129,7 @@ def compact_tensors(
     if order != "none" or viewmats is not None or images is not None:
         cameras, photos = _read_views(viewmats, Ks, images, shape)
     scene, scene_notes = make_scene(gaussians, valid, cameras, photos, names, order)
-    if scene.has_own_pixels and check_rotations:
-        _check_rotations(scene)
-    scene_notes += _rotation_notes(scene, check_rotations=check_rotations)
+    scene_notes += _rotation_notes(scene.gaussians.quats)
     result = compact(scene, progress=progress, **settings)
     result.report.notes[:0] = notes + scene_notes
     if gaussians.means.dtype == np.float32:
@@ -354,32 +342,22 @@ def _check_pixels(
         problem = f"expected intrinsics of {cameras.width} x {cameras.height} pixels, found those of another size"
         remedy = f"multiply their first row by {factors[0]:.6g} and the second by {factors[1]:.6g}"
         raise SceneError("Ks", problem, remedy)
-    reason = explain_misalignment(gaussians, cameras, valid, W2C_OPENCV)
+    reason = explain_misalignment(gaussians, cameras, valid)
     moved = None if reason else move_cameras(pairs, cameras, names)
     if moved is not None:
         return moved.cameras, [moved.note]
     raise misalignment_error("means", alignment, reason)
 
 
-def _check_rotations(scene: Scene) -> None:
-    """Raise SceneError for rotations that follow the surface far better in another convention."""
-    choice, note = choose_rotations(scene)
-    if choice == "wxyz":
-        return
-    facts = note.partition(";")[0]
-    remedy = f"{_ROTATION_REMEDIES[choice]}; pass check_rotations=False if they are right as they are"
-    raise SceneError("quats", f"expected unit quaternions wxyz, local to world, found that {facts}", remedy)
+def _rotation_notes(quats: np.ndarray) -> list[str]:
+    """Return a note on quaternions whose w may come last, or none: the last column is never negative, the first is.
 
-
-def _rotation_notes(scene: Scene, *, check_rotations: bool) -> list[str]:
-    """Return a note on quaternions whose w may come last, or none.
-
-    If pixels are known, the surface decides. Otherwise there is a note unless the caller has turned off the check.
+    Quaternions computed from matrices rarely have a negative w. An exception is Depth Anything 3, which makes the last
+    component of wxyz positive.
     """
-    if not w_seems_last(scene.gaussians.quats):
+    if not quats[:, 3].min(initial=0) >= 0 > quats[:, 0].min(initial=0):
         return []
-    last_w = choose_rotations(scene)[0] == "xyzw" if scene.has_own_pixels else check_rotations
-    return ["the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]"] * last_w
+    return ["the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]"]
 
 
 def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> list[str]:

@@ -12,7 +12,6 @@ from gsmerge.frozen import dataclass
 from gsmerge.io import file_notes
 from gsmerge.io.archives import damaged_member
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_all_cameras
 from gsmerge.io.cameras.table import CAMERA_ENDINGS, CHUNK
 from gsmerge.io.formats import ply, spz, streamed
@@ -132,11 +131,11 @@ def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileChe
     load = load_files(find_scene_files(path), opacity=opacity, hints=hints)
     if shows_nothing(load.scene):
         raise nothing_left(load.files.ply)
-    info, views = load.info, load.views
-    notes, num_photos = (*load.notes, *degree_notes(info)), 0 if views.images is None else len(views.images)
+    info, images = load.info, load.scene.images
+    notes, num_photos = (*load.notes, *degree_notes(info)), 0 if images is None else len(images)
     return FileCheck(
         str(path), "Gaussians", info.count, info.layout, info.file_bytes, notes=notes,
-        num_views=len(views.cameras), num_photos=num_photos,
+        num_views=len(load.scene), num_photos=num_photos,
     )  # fmt: skip
 
 
@@ -145,8 +144,6 @@ def _read_cameras(path: Path) -> FileCheck:
     count = 0
     for cameras in read_all_cameras(path):
         count += len(cameras)
-    if Path(cameras.path).suffix == ".npz":
-        read_depths(Path(cameras.path))
     return FileCheck(str(path), "cameras", count, cameras.source)
 
 

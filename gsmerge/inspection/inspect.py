@@ -180,7 +180,6 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     return facts | {
         "width": load.scene.cameras.width,
         "height": load.scene.cameras.height,
-        "per_pixel": load.recovery.best.layout.per_pixel,
         "num_missing": 0 if load.scene.covered is None else int((~load.scene.covered).sum()),
         "alignment": asdict(load.alignment),
         "rows": load.recovery.description,
@@ -201,7 +200,7 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     doubts = [unlike_captures(scene.gaussians), None if agreement is None else agreement.doubt]
     facts: dict[str, Any] = {
         "notes": [*load.notes, *views_notes(scene), *_photo_notes(scene), *filter(None, doubts)],
-        "num_views": len(load.views.used),
+        "num_views": len(load.scene),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),
         "sight": sight and asdict(sight),

@@ -101,24 +101,6 @@ API void see_points(const double *points, const double *viewmats, const double *
   }
 }
 
-API void nearest_centres(const float *points, const double *viewmats, const double *Ks, int64_t *ids,
-                         double *squares, int32_t *seen, int64_t width, int64_t height, int64_t n, int64_t v) {
-  for (int64_t i = 0; i < n; i++) {
-    double nearest = __builtin_inf(), point[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]}, place[3];
-    int64_t id = -1;
-    int32_t count = 0;
-    for (int64_t view = 0; view < v; view++) {
-      if (!show(point, viewmats + 16 * view, Ks + 9 * view, width, height, place)) continue;
-      int64_t column = (int64_t)place[0], row = (int64_t)place[1];
-      double right = place[0] - ((double)column + 0.5), down = place[1] - ((double)row + 0.5);
-      double xx = right * right, yy = down * down, square = xx + yy;  // separate products are not fused with the sum
-      count++;
-      if (square < nearest) nearest = square, id = (view * height + row) * width + column;
-    }
-    ids[i] = id, squares[i] = nearest, seen[i] = count;
-  }
-}
-
 // Find the longest ascending series of keys with at most one key of each point (Schensted 1961). tails [length] is the
 // smallest last key of all series of that length, ends its number i * v + view, and before the number that precedes
 // each key in its series.

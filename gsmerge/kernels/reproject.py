@@ -62,18 +62,6 @@ def see_points(points, viewmats, Ks, depths, width, height, near, behind):
 
 
 @native(
-    points=f4("n", 3), viewmats=f8("v", 4, 4), Ks=f8("v", 3, 3), ids=i8("n", out=True),
-    squares=f8("n", out=True), seen=i4("n", out=True), width=i8(least=1), height=i8(least=1),
-)  # fmt: skip
-def nearest_centres(points, viewmats, Ks, ids, squares, seen, width, height):
-    """Write the pixel ``(view·H + y)·W + x`` of all views whose centre is nearest to the projection of each point.
-
-    Also writes the squared distance, in pixels, and the number of views that show the point. If no view shows it, the
-    pixel is -1 and the squared distance is inf.
-    """
-
-
-@native(
     COUNT, points=f4("n", 3), viewmats=f8("v", 4, 4), Ks=f8("v", 3, 3), ids=i8("n", out=True),
     tails=i8("n", out=True), ends=i4("n", out=True), before=i4("m", out=True), keys=i8("v", out=True),
     views=i4("v", out=True), width=i8(least=1), height=i8(least=1), mixed=i4(least=0, most=1),

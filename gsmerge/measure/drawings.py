@@ -21,7 +21,6 @@ from gsmerge.io.atomic import atomic_outputs
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
-from gsmerge.io.photo_files import NO_IMAGES
 from gsmerge.measure.camera_path import parse_path, sample_path, turned_degrees, viewing_depth
 from gsmerge.measure.clip import (
     BY_FFMPEG,
@@ -44,7 +43,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import read_into_frame
-from gsmerge.scene.read import Loaded, SceneViews, move_cameras_to_scene, read_gaussian_file
+from gsmerge.scene.read import Loaded, move_cameras_to_scene, read_gaussian_file
 from gsmerge.settings.pictures import CLIPS, GIF, PICTURES
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
@@ -194,16 +193,14 @@ def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | No
 def prepare_panel(options: DrawOptions) -> Drawing:
     """Prepare one picture with the columns photo, before, after, ... and a row for each view and the outside view."""
     group = _read(options, photos=True)
-    used = list(group.load.views.used)
-    cameras, photos = options.resize(group.load.views.cameras[used]), group.load.views.images
-    all_names = [group.load.views.names[view] for view in used]
-    ids = options.choose(all_names, PANEL_VIEWS)
-    names = [re.split(r"[\\/]", all_names[i])[-1] for i in ids]
-    pictured = {group.load.views.of_scene[view] for view in group.load.scene.photo_views}
+    scene = group.load.scene
+    cameras, photos, pictured = options.resize(scene.cameras), scene.images, scene.photo_views
+    ids = options.choose(scene.names, PANEL_VIEWS)
+    names = [re.split(r"[\\/]", scene.names[i])[-1] for i in ids]
 
     def draw(_: int) -> Iterator[Picture]:
         named = [(f"{path.name}{options.legend}", gaussians) for path, gaussians in group.scenes]
-        shown = [photos[used[i]] if used[i] in pictured else None for i in ids] if pictured else None
+        shown = None if photos is None else [photos[i] if i in pictured else None for i in ids]
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         plain = options.overlay is None
@@ -221,8 +218,8 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
     """Prepare a picture for each camera, or for one camera if the output is no folder; scenes are side by side."""
     group = _read(options, photos=False)
     is_folder = options.output.suffix.lower() not in PICTURES
-    ids = options.choose(group.load.views.names) if is_folder or options.views else [0]
-    views, stems = options.resize(group.load.views.cameras[ids]), picture_stems(group.load.views.names)
+    ids = options.choose(group.load.scene.names) if is_folder or options.views else [0]
+    views, stems = options.resize(group.load.scene.cameras[ids]), picture_stems(group.load.scene.names)
     names = [f"{path.name}{options.legend}: {len(gaussians):,}" for path, gaussians in group.scenes]
 
     def draw(threads: int) -> Iterator[Picture]:
@@ -295,7 +292,7 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
     if is_only_source:
         options = replace(options, framing=replace(options.framing, cameras=file))
     group = _read(options, photos=False)
-    scene_cameras = group.load.views.cameras
+    scene_cameras = group.load.scene.cameras
     cameras = scene_cameras if file is None or is_only_source else _place_file(file, group.load)
     assert not isinstance(options.views, str)
     ids = pick_views(len(cameras), options.views or len(cameras))
@@ -318,7 +315,7 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
 
 def _place_file(file: Path, load: Loaded) -> Cameras:
     """Read the cameras of a path into the frame of a scene; cameras without a size get the scene's size."""
-    cameras = load.views.cameras
+    cameras = load.scene.cameras
     stored = read_cameras(file) if load.cameras is None else read_into_frame(load, file)[0]
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
 
@@ -358,11 +355,10 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     with record_run() as record:
         scene = add_views(load.scene, shown=True)
     scene = scene if inside else subset(scene, range(len(scene) // 2))
-    cameras = fill_cameras(scene.cameras, *PLACED_SIZE)
-    views = SceneViews(cameras, NO_IMAGES, scene.names, tuple(range(len(scene))))
+    scene = replace(scene, cameras=fill_cameras(scene.cameras, *PLACED_SIZE))
     notes = [text for text in record.notes if text != NO_VIEWS]  # that note concerns results
     placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
-    return replace(load, scene=scene, views=views, notes=(*load.notes, *notes, placed))
+    return replace(load, scene=scene, notes=(*load.notes, *notes, placed))
 
 
 def find_view(view: str, names: Sequence[str]) -> int:

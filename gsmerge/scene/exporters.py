@@ -11,18 +11,15 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from gsmerge.alignment import ESTIMATED, MAY_BE_UNALIGNED, Layout
+from gsmerge.alignment import ESTIMATED
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.table import FFGS
-from gsmerge.settings.reading import SCENE_ARGUMENTS, QuatChoice, ReadHints
+from gsmerge.settings.reading import SCENE_ARGUMENTS, Order, ReadHints
 from gsmerge.settings.setting import join_words, suggest_name
 
 if TYPE_CHECKING:
     from gsmerge.io.formats.read import FileInfo
 
-FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "other"]
-TURNED: tuple[FrameKind, ...] = ("first", "middle", "upright")  # frames into which exporters turn means and rotations
 AUTO = ReadHints()
 
 
@@ -56,33 +53,18 @@ class Exporter:
     name: str  # on the command line
     models: tuple[Model, ...]  # the models that use it
     opacity: Literal["logit", "raw"]  # how it stores opacities
-    order: str  # order of its rows; "unordered": each row has a pixel, in no order; "none": rows have no pixels
-    kinds: tuple[str, ...] = ("full",)  # which pixels it writes; see ``gsmerge/alignment/layouts.py``
-    # where its Gaussians may lie in the frame of the cameras; see :class:`gsmerge.geometry.Similarity`
-    frames: tuple[FrameKind, ...] = ("same",)
-    per_pixel: tuple[int, ...] = (1,)  # Gaussians per pixel
+    order: Order  # order of its rows; "none": rows have no pixels, or are in another order
     degrees: tuple[int, ...] = (0,)  # SH degrees that it writes
     normals: bool = True  # whether it writes the columns nx, ny, nz
-    quats: QuatChoice = "wxyz"  # how it stores rotations
-    check_rotations: bool = True  # whether rotations may be read in another convention that fits the surface better
     elements: tuple[str, ...] = ()  # elements besides ``vertex`` that it always writes
     byte_columns: tuple[str, ...] = ()  # columns that it writes as bytes
     comment: str = ""  # part of a comment in the header that it always writes
     cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: it writes none, and any may be given
 
-    def may_have_written(self, info: FileInfo, layout: Layout | None, frame: Similarity | None, cameras: str) -> bool:
+    def may_have_written(self, info: FileInfo, order: str, cameras: str) -> bool:
         """Return whether this exporter may have written a file; see :func:`choose_exporters` for the arguments."""
-        if not self.writes_columns(info) or (self.cameras and cameras not in self.cameras):
-            return False
-        if layout is None or frame is None:
-            return self.order in MAY_BE_UNALIGNED
-        order = self.order if len(layout.views) > 1 or self.order != "view-fastest" else "view-major"
-        return (
-            order == layout.order
-            and layout.kind in self.kinds
-            and layout.per_pixel in self.per_pixel
-            and frame.kind in self.frames
-        )
+        is_order = self.is_marked or order == self.order
+        return is_order and self.writes_columns(info) and (not self.cameras or cameras in self.cameras)
 
     def writes_columns(self, info: FileInfo) -> bool:
         """Return whether a file has the header and the opacities that this exporter writes."""
@@ -101,8 +83,6 @@ class Exporter:
         return bool(self.elements or self.byte_columns or self.comment)
 
 
-_UPRIGHT: tuple[FrameKind, ...] = ("upright",)
-_ANY: tuple[FrameKind, ...] = ("same", "scaled", "shifted", "other")
 _NORMALS = ("nx", "ny", "nz")
 # Results of reading: what users have to add, or what is lost
 _NAME_CAMERAS = "read right with cameras, or with those that its grid shows"
@@ -137,7 +117,7 @@ _EXPORTERS = (
                 "reconstructed_scene.ply", "its cameras.npz has the cameras: keep it beside the file",
             ),
         ),
-        "logit", "view-major", ("box+depth", "box", "pruned"), _ANY, check_rotations=False,
+        "logit", "view-major",
         cameras=("DA3 npz", "COLMAP binary", "COLMAP text", ESTIMATED),
     ),
     # The family of pixelSplat shares code but differs in order, trimming and rotations. Its worlds are recentred on
@@ -145,7 +125,7 @@ _EXPORTERS = (
     Exporter(
         "pixelsplat",
         (Model("pixelSplat", "dcharatan/pixelsplat 32b1b66", "`gaussians/RUN/STEP.ply`; no cameras", _NAME_CAMERAS),),
-        "raw", "view-major", ("full",), _UPRIGHT, per_pixel=(1, 2, 3), quats="camera",
+        "raw", "view-major",
     ),
     Exporter(
         "pixelsplat-script",
@@ -155,7 +135,7 @@ _EXPORTERS = (
                 "`point_clouds/SCENE/gaussians.ply`, far pixels dropped; no cameras", _NAME_CAMERAS,
             ),
         ),
-        "raw", "view-fastest", ("trim", "pruned"), _UPRIGHT, per_pixel=(1, 2, 3), quats="camera",
+        "raw", "view-fastest",
     ),
     Exporter(
         "mvsplat",
@@ -165,7 +145,7 @@ _EXPORTERS = (
                 "`point_clouds/SCENE/gaussians.ply` of two views, far pixels dropped; no cameras", _NAME_CAMERAS,
             ),
         ),
-        "raw", "view-fastest", ("trim", "pruned"), _UPRIGHT,
+        "raw", "view-fastest",
     ),
     Exporter(
         "spfsplat",
@@ -175,7 +155,7 @@ _EXPORTERS = (
                 "`NAME_gaussians.ply` beside `NAME_input_0.png` and drawings; no cameras", _NAME_CAMERAS,
             ),
         ),
-        "raw", "view-fastest", ("trim",), _UPRIGHT,
+        "raw", "view-fastest",
     ),
     Exporter(
         "depthsplat",
@@ -185,7 +165,7 @@ _EXPORTERS = (
                 "`gaussians/NAME.ply`, 8 pixels trimmed; `images/NAME/color/`; no cameras", _NAME_CAMERAS,
             ),
         ),
-        "logit", "view-fastest", ("trim",), ("first", "same"),
+        "logit", "view-fastest",
     ),
     Exporter(
         "zpressor",
@@ -195,7 +175,7 @@ _EXPORTERS = (
                 _NAME_CAMERAS,
             ),
         ),
-        "raw", "view-fastest", ("trim",), ("first", "same"),
+        "raw", "view-fastest",
     ),
     Exporter(
         "volsplat",
@@ -206,7 +186,7 @@ _EXPORTERS = (
                 " wrong; no cameras", f"{_WITH_CAMERAS}; padding is left out",
             ),
         ),
-        "logit", "none", frames=("first", "same"),
+        "logit", "none",
     ),
     Exporter(
         "resplat",
@@ -216,7 +196,7 @@ _EXPORTERS = (
                 "`gaussians.ply` on a grid of a quarter of the photos' size; `input/`; no cameras", _NAME_CAMERAS,
             ),
         ),
-        "logit", "view-major", ("full",), ("middle", "same"), degrees=(3,), quats="camera",
+        "logit", "view-major", degrees=(3,),
     ),
     Exporter(
         "noposplat",
@@ -224,7 +204,7 @@ _EXPORTERS = (
             Model("NoPoSplat", "cvg/NoPoSplat 9b04307", "what its user's call of `export_ply` names", _NAME_CAMERAS),
             Model("TriSplat", "ziplab/TriSplat fcd7ab1; not what calls the exporter", "no cameras", _NAME_CAMERAS),
         ),
-        "raw", "view-major", ("full",), _ANY, degrees=(0, 4),
+        "raw", "view-major", degrees=(0, 4),
     ),
     Exporter(
         "yonosplat",
@@ -235,7 +215,7 @@ _EXPORTERS = (
                 "read right with cameras; without where no row is missing",
             ),
         ),
-        "raw", "view-fastest", ("trim", "pruned"), _ANY, quats="camera",
+        "raw", "view-fastest",
     ),
     Exporter(
         "vicasplat",
@@ -247,12 +227,12 @@ _EXPORTERS = (
             ),
             Model("NAS3R", "mxlcanfly/NAS3R 2ad17fa", "as VicaSplat, with raw opacities; no cameras", _WITH_CAMERAS),
         ),
-        "logit", "unordered", ("pruned",), degrees=(0, 4),
+        "logit", "none", degrees=(0, 4),
     ),
     Exporter(
         "flash3d",
         (Model("Flash3D", "eldar/flash3d", "two layers of one photo; no cameras", _NAME_CAMERAS),),
-        "raw", "layer-major", ("full",), _UPRIGHT, per_pixel=(2,),
+        "raw", "none",
     ),
     Exporter(
         "splatt3r",
@@ -262,7 +242,7 @@ _EXPORTERS = (
                 "read right with its photos",
             ),
         ),
-        "raw", "view-major", ("full",), _ANY, quats="xyzw-root",
+        "raw", "view-major",
     ),
     # Gaussians merged in voxels or across views.
     Exporter(
@@ -303,7 +283,7 @@ _EXPORTERS = (
                 "`NAME.ply` of 14 columns, sRGB, the camera inside", "read right with its photo",
             ),
         ),
-        "logit", "layer-major", ("full",), per_pixel=(2,), normals=False, elements=("extrinsic", "intrinsic"),
+        "logit", "none", normals=False, elements=("extrinsic", "intrinsic"),
     ),
     Exporter(
         "splatter-image",
@@ -313,7 +293,7 @@ _EXPORTERS = (
                 "opacities above 0.08, scales made larger, turned for a viewer; no cameras", _IF_GRID_SHOWS,
             ),
         ),
-        "logit", "view-major", ("pruned", "full"), ("same", "scaled", "other"), degrees=(1,),
+        "logit", "view-major", degrees=(1,),
     ),
     Exporter(
         "lgm",
@@ -331,7 +311,7 @@ _EXPORTERS = (
                 "read right with cameras",
             ),
         ),
-        "logit", "view-major", ("pruned", "full"), ("same", "scaled", "shifted", "first", "other"), normals=False,
+        "logit", "view-major", normals=False,
     ),
     # Normals as bytes, 45 harmonics whatever the degree, sorted by opacity once it prunes.
     Exporter(
@@ -349,12 +329,12 @@ _EXPORTERS = (
                 "read right with cameras of its views alone",
             ),
         ),
-        "logit", "view-major", ("full", "pruned"), _ANY, degrees=(3,), byte_columns=_NORMALS,
+        "logit", "view-major", degrees=(3,), byte_columns=_NORMALS,
     ),
     Exporter(
         "longlrm-sorted",
         (Model("Long-LRM, sorted", "arthurhero/Long-LRM d92dd51", "as Long-LRM, where it prunes", _NO_PIXELS),),
-        "logit", "unordered", ("pruned",), ("same", "scaled"), degrees=(3,), byte_columns=_NORMALS,
+        "logit", "none", degrees=(3,), byte_columns=_NORMALS,
     ),
     # Scenes that were optimised, or predicted without pixels.
     Exporter(
@@ -421,18 +401,16 @@ def find_exporter(name: str) -> Exporter | None:
     return EXPORTERS.get(name)
 
 
-def choose_exporters(
-    name: str, info: FileInfo, layout: Layout | None, frame: Similarity | None, cameras: str
-) -> tuple[Exporter, ...]:
+def choose_exporters(name: str, info: FileInfo, order: str, cameras: str) -> tuple[Exporter, ...]:
     """Return the exporter with a name; for "auto", all exporters that may have written the file.
 
-    Exporters that leave a mark in the header precede exporters that leave none. ``layout`` and ``frame`` belong to the
-    rows; None if the rows belong to no pixels.
+    Exporters that leave a mark in the header precede exporters that leave none. ``order`` is the order of the rows,
+    "none" if they belong to no pixels, and ``cameras`` the format of the cameras, "" without any.
     """
     exporter = find_exporter(name)
     if exporter is not None:
         return (exporter,)
-    possible = [entry for entry in EXPORTERS.values() if entry.may_have_written(info, layout, frame, cameras)]
+    possible = [entry for entry in EXPORTERS.values() if entry.may_have_written(info, order, cameras)]
     return tuple([entry for entry in possible if entry.is_marked] or possible)
 
 

@@ -6,7 +6,7 @@ import filecmp
 import os
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
@@ -21,17 +21,13 @@ from gsmerge.io.cameras.table import CHUNK
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.ply import header_content, header_counts, is_file_from_gsmerge
 from gsmerge.io.formats.table import (
-    DEPTHS,
-    FRAMES,
     HTML,
     META,
     OUTPUT_FORMATS,
-    POSES,
     SCENE_SUFFIXES,
     SEVERAL_USES,
     STATE_ENDING,
     find_format,
-    is_frame,
     may_hold_gaussians,
 )
 from gsmerge.io.image_names import check_photo_folder, list_images, natural_order
@@ -42,7 +38,6 @@ from gsmerge.types import StrPath
 _CHECK_SCENE_FILE = LazyFunction("gsmerge.scene.no_gaussians", "check_scene_file")
 _NO_GAUSSIANS = LazyFunction("gsmerge.scene.no_gaussians", "no_gaussians")
 _HOLDS_VIEWS = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
-_FIND_DEPTH_MAPS = LazyFunction("gsmerge.io.formats.depth_maps", "find_depth_maps")
 # The first of these files that exists and is no result is read; otherwise the folder's only .ply
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
 # Among several trained scenes in a folder, the scene of the most steps is read. The places are INRIA's and gsplat's
@@ -65,7 +60,7 @@ _USUAL_END = re.compile(
 _PARTS = {"view", "chunk", "part", "block", "tile"}
 _LEVEL = re.compile(r"\.level\d+(?=\.)")  # in the name of a level of detail, see :func:`level_output`
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
-_PACKED = {*SCENE_SUFFIXES} - {".ply", DEPTHS.ending}
+_PACKED = {*SCENE_SUFFIXES} - {".ply"}
 _MAX_HEADERS = 1_000  # headers of a folder's files that are read; further files count as scenes
 _MAX_DEPTH = 3  # of the folders that are searched below a folder without a scene
 _MAX_ENTRIES = 10_000  # largest number of files and folders in these folders
@@ -103,25 +98,6 @@ class SceneFiles:
         beside = (self.cameras, self.images, self.masks, self.protect)
         return (*self.plys, *(path for path in beside if path is not None))
 
-    def without_found(self, unusable: str) -> Iterator[SceneFiles]:
-        """Yield copies without files that were searched and may not belong to the scene.
-
-        ``unusable``: path of the file that the scene could not be read with. If the caller named its folder of
-        pictures, there are no copies. Images inside the cameras' file are left out together with the cameras.
-        """
-        without_images, path = self, Path(unusable)
-        if any(name in self.named and path.is_relative_to(getattr(self, name) or os.devnull) for name in _PICTURES):
-            return
-        if "masks" not in self.named and self.masks is not None and path.is_relative_to(self.masks):
-            yield replace(self, masks=None)
-        if "images" not in self.named:
-            without_images = replace(self, images=None, named=self.named | {"images"})
-            yield without_images
-        if "cameras" not in self.named and self.cameras not in (None, self.ply):
-            if self.images is None or self.images != self.cameras:
-                yield replace(self, cameras=None)
-            yield replace(without_images, cameras=None)
-
     @property
     def is_state(self) -> bool:
         """Whether the file is a state (``.gsm``), whose Gaussians have no pixels."""
@@ -129,9 +105,7 @@ class SceneFiles:
 
     @property
     def base(self) -> Path:
-        """Path from which the names of results are made: the file, or ``scene.ply`` for a folder of parts or frames."""
-        if is_frame(self.ply):
-            return self.ply.parent.with_name("scene.ply")
+        """Path from which the names of results are made: the file, or ``scene.ply`` for a folder of parts."""
         return self.ply.with_name("scene.ply") if self.parts else self.ply
 
     @property
@@ -170,7 +144,7 @@ def find_scene_files(
 
     In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
     their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, but come last if they
-    may not be its own. Cameras inside the ``.ply`` or of depth maps precede those beside it. If no place has cameras,
+    may not be its own. Cameras inside the ``.ply`` precede those beside it. If no place has cameras,
     the only file of any name that holds cameras is taken. Without it, cameras of a program whose files are not read are
     taken, so that the reader says so. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder,
     because the model saw these. A result of gsmerge is taken as the scene only if a folder has nothing else.
@@ -193,9 +167,6 @@ def find_scene_files(
         return SceneFiles(path, camera_path or own, photos, mask_path, protect, named=named)
     plys = find_plys(path, camera_path) if os.path.isdir(path) else [path]
     ply, num_copies = plys[0], len(list_plys(path)) - len(plys) if os.path.isdir(path) else 0
-    if ply == path and is_frame(path):
-        problem = "expected the folder with all frames of DA3-Streaming, found a single frame"
-        raise SceneError(path, problem, f"name {path.parent}")
     for part in plys:
         check_file(part)
         if part.suffix.lower() in SEVERAL_USES:
@@ -215,8 +186,6 @@ def find_scene_files(
 
 def _find_camera_path(ply: Path, roots: Sequence[Path]) -> Path | None:
     """Find the cameras of a scene, in the order of precedence of :func:`find_scene_files`; None without."""
-    if ply.suffix == DEPTHS.ending:
-        return ply.parent.parent / POSES if is_frame(ply) else ply
     of_result = result_cameras(ply)
     if of_result is not None and _count_signs(ply) == 2:
         return of_result
@@ -225,9 +194,7 @@ def _find_camera_path(ply: Path, roots: Sequence[Path]) -> Path | None:
 
 
 def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
-    """Find the images of a scene: inside its depth maps or its cameras' file, or in a folder; None without."""
-    if is_frame(ply):
-        return ply
+    """Find the images of a scene: inside its cameras' file, or in a folder; None without."""
     if cameras is not None:
         holds_all = cameras.suffix in (CHUNK, STATE_ENDING)
         if holds_all or (cameras.suffix == ".npz" and holds_images(cameras)):
@@ -288,7 +255,7 @@ def _search_roots(path: Path, ply: Path, within: StrPath | None) -> list[Path]:
     """List the folders in which files that belong to a ``.ply`` are searched; see :func:`find_scene_files`."""
     base = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
-    above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE, FRAMES))
+    above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE))
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
         above = [folder.parent.parent]
     target = Path(os.path.realpath(ply)).parent  # of a link
@@ -362,8 +329,6 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
     if not plys:
         raise _NO_GAUSSIANS(folder)
     places = {path.parent for path in plys}
-    if is_frame(plys[0]):
-        return plys
     if _are_copies(plys):
         return plys[:1]
     parts = _order_parts(folder, plys, cameras or find_cameras(folder)) if len(places) == 1 else None
@@ -406,14 +371,13 @@ def list_plys(folder: Path) -> list[Path]:
     1. the file with a usual name, or else all others in the folder;
     2. files in ``gaussians/``;
     3. files in folders below;
-    4. depth maps;
-    5. results of gsmerge;
-    6. the ``meta.json`` of a ``.sog``;
-    7. a file with a usual name but without Gaussians, so that its reader reports what it lacks.
+    4. results of gsmerge;
+    5. the ``meta.json`` of a ``.sog``;
+    6. a file with a usual name but without Gaussians, so that its reader reports what it lacks.
     """
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
     plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)]
-    plys = plys or _FIND_DEPTH_MAPS(folder) or _results_in(folder)
+    plys = plys or _results_in(folder)
     plys = plys or [path for path in [folder / META] if path.is_file() and find_format(path).holds(path)]
     return plys or [folder / place for place in PLY_PLACES if (folder / place).is_file()][:1]
 

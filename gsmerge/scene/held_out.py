@@ -9,13 +9,12 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import IDENTITY, Similarity, camera_centres
+from gsmerge.geometry import IDENTITY, Similarity, camera_centres, fit_similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.image_names import find_image
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.kernels.elementary import arccos
-from gsmerge.kernels.matrices import closest_rotation, matmul
 from gsmerge.scene.exporters import AUTO
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
 from gsmerge.scene.photos import stored_photos
@@ -147,7 +146,7 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) ->
 def _similarity_from_stored(load: Loaded) -> Similarity:
     """Find the similarity from the world of the scene's own camera file to the world of its Gaussians."""
     if load.recovery is not None:
-        return load.recovery.best.frame
+        return load.recovery.frame
     if load.cameras is None or load.files.cameras is None:
         return IDENTITY
     camera_file = read_cameras(load.files.cameras, scene=load.files.ply.stem, folder=load.files.ply.parent)
@@ -156,20 +155,6 @@ def _similarity_from_stored(load: Loaded) -> Similarity:
     if np.array_equal(camera_file.viewmats, load.cameras.viewmats):
         return IDENTITY  # a fit would differ from it by rounding
     return fit_similarity(camera_file.viewmats, load.cameras.viewmats)
-
-
-def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
-    """Fit the similarity that maps cameras ``theirs [c,4,4]`` (world to camera) to ``ours``, by least squares.
-
-    If all cameras stand in one place, they do not determine the scale, and ``scale`` is used.
-    """
-    rotation = closest_rotation(matmul(ours[:, :3, :3].swapaxes(1, 2), theirs[:, :3, :3]).sum(0))
-    a, b = matmul(camera_centres(theirs), rotation.T), camera_centres(ours)
-    a0, b0 = a - a.mean(0), b - b.mean(0)
-    spread = float((a0**2).sum())
-    if spread > 1e-12 * max(float((a**2).sum()), 1e-300) and len(ours) > 1:
-        scale = float((a0 * b0).sum()) / spread
-    return Similarity(rotation, scale, b.mean(0) - scale * a.mean(0))
 
 
 def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:

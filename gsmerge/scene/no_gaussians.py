@@ -10,7 +10,6 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.npz_files import array_names, missing_of_depths
 from gsmerge.io.first_bytes import FOREIGN
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
@@ -37,32 +36,23 @@ POINTS_ONLY = (
     PointsOnly(
         "Depth Anything 3",
         ("exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "scene.glb"),
-        'run it with export_format="npz", whose depth maps are read, or with "npz-gs_ply", infer_gs=True and a giant'
-        " model",
+        'run it with export_format="npz-gs_ply", infer_gs=True and a giant model',
     ),
     PointsOnly("gsplat's trainer", ("ckpts/ckpt_*.pt",), "run it with its option save_ply"),
     PointsOnly("nerfstudio", ("nerfstudio_models/*.ckpt",), "write Gaussians with ns-export gaussian-splat"),
-    PointsOnly(
-        "DA3-Streaming or VGGT-Long",
-        ("camera_poses.txt",),
-        "run DA3-Streaming with save_depth_conf_result: True, whose results_output/frame_*.npz are read",
-    ),
+    PointsOnly("DA3-Streaming or VGGT-Long", ("camera_poses.txt",), _TRAIN),
     PointsOnly("FLARE", ("pred.npz",), f"FLARE writes no Gaussians; {_TRAIN}"),
     PointsOnly(
         "VGGT or MapAnything",
         ("sparse/points.ply", "dense_mesh.glb", "glbscene_*.glb", "predictions.npz", "points.ply"),
-        "write depth, extrinsic, intrinsic and images to predictions.npz, whose depth maps are read",
+        _TRAIN,
     ),
     PointsOnly(
         "COLMAP",
         tuple(f"{folder}cameras.{kind}" for folder in ("sparse/0/", "sparse/", "0/", "") for kind in ("bin", "txt")),
         _TRAIN,
     ),
-    PointsOnly(
-        "a model of points",
-        ("*.glb", "*.npz"),
-        'write depth, extrinsics, intrinsics and image, as export_format="npz" of Depth Anything 3 does, or Gaussians',
-    ),
+    PointsOnly("a model of points", ("*.glb", "*.npz"), _TRAIN),
 )
 
 
@@ -101,7 +91,7 @@ def _content(folder: Path) -> tuple[str, str] | None:
     for row in POINTS_ONLY:
         file = next((path for pattern in row.files for path in sorted(folder.glob(pattern))), None)
         if file is not None:
-            return f"{file.relative_to(folder).as_posix()} of {row.title}", _remedy(row, file)
+            return f"{file.relative_to(folder).as_posix()} of {row.title}", row.remedy
     points = next((path for path in sorted(folder.glob("[!.]*.ply")) if header_content(path) == "other"), None)
     if points is not None:
         return f"points or a mesh ({points.name})", _NAME
@@ -118,14 +108,7 @@ def check_scene_file(path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix not in SEVERAL_USES or not check_file(path) or may_hold_gaussians(path):
         return
-    if suffix == ".npz" and not array_names(path):  # the reader reports the damage
-        return
     matching = (row for row in POINTS_ONLY if any(path.match(Path(file).name) for file in row.files))
     row = next(matching, POINTS_ONLY[-1])
     problem = f"expected a file of Gaussians, found a {suffix} without Gaussians, as {row.title} writes it"
-    raise SceneError(path, problem, _remedy(row, path))
-
-
-def _remedy(row: PointsOnly, path: Path) -> str:
-    missing = " and ".join(missing_of_depths(path))
-    return f"add {missing} to the file; its depth maps cannot be read without" if missing else row.remedy
+    raise SceneError(path, problem, row.remedy)

@@ -32,7 +32,6 @@ from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.cameras.table import CHUNK
 from gsmerge.io.first_bytes import CONVERT
-from gsmerge.io.formats.table import is_frame
 from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_order, propose_images
 from gsmerge.io.photo_files import (
     PhotoArrays,
@@ -47,14 +46,12 @@ from gsmerge.io.photo_files import (
 )
 from gsmerge.kernels.pictures import is_mirrored, turn_picture
 from gsmerge.raster.photos import row_pictures
-from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.scene.estimate_cameras import GridFit, choose_fit, list_fits
 from gsmerge.scene.files import SceneFiles
+from gsmerge.scene.grid_fit import GridFit, choose_fit, list_fits
 from gsmerge.types import Scene
 
-_READ_IMAGES = LazyFunction("gsmerge.io.formats.depth_maps", "read_images")
 _MODEL_FOLDERS = ("0", "sparse", "colmap")  # names of COLMAP models in a scene's folder, which may also be one itself
 UNNAMED = "view 0"  # name of the first camera if the format, or rows without cameras, have no names
 _REDUCED = "images_*"  # folders of smaller copies; their names end with the factor
@@ -256,8 +253,6 @@ def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
     """Read the photos inside a file; empty if the scene has no file with photos."""
     if files.images is None or files.images.is_dir():
         return ()
-    if is_frame(files.images):
-        return _READ_IMAGES(files.plys)
     same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
     stored = (camera_file if same_file else read_cameras(files.images, scene=files.ply.stem)).images
     may_lack = same_file and files.images.suffix == CHUNK and not len(stored)

@@ -5,35 +5,23 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import numpy as np
-
-from gsmerge.alignment import (
-    ESTIMATED,
-    MAY_BE_UNALIGNED,
-    Alignment,
-    AlignmentResult,
-    Recovery,
-    align,
-    check_pixels,
-    read_rotations,
-)
+from gsmerge.alignment import ESTIMATED, Alignment, AlignmentResult, Recovery, align, check_pixels
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
+from gsmerge.evidence.assign import Assignment
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import move_views
-from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
-from gsmerge.io.cameras.read import read_depths
 from gsmerge.io.formats.arrays import FLAT_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
-from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
+from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import (
     AUTO,
@@ -45,6 +33,7 @@ from gsmerge.scene.exporters import (
     make_hints,
 )
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
+from gsmerge.scene.grid_fit import GridFit
 from gsmerge.scene.masks import NO_MASKS, Masks, check_masks
 from gsmerge.scene.photos import (
     SEEN_PLACE,
@@ -66,26 +55,13 @@ from gsmerge.scene.photos import (
     stored_photos,
     without_photo,
 )
-from gsmerge.scene.rows import color_from_photos, set_rotations, take_gaussians, use_depths
+from gsmerge.scene.rows import read_rotations, take_gaussians
 from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
-from gsmerge.types import NO_CAMERAS, Cameras, LargePhotos, Scene, StrPath
+from gsmerge.types import NO_CAMERAS, LargePhotos, Scene, StrPath
 from gsmerge.words import count_words
 
-
-@dataclass(frozen=True)
-class SceneViews:
-    """All c views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures."""
-
-    cameras: Cameras
-    images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
-    names: tuple[str, ...]
-    of_scene: tuple[int, ...]  # for each view of the scene, its index among these c views
-
-    @property
-    def used(self) -> tuple[int, ...]:
-        """Indices of the views that the scene has, each once, in the scene's order."""
-        return tuple(dict.fromkeys(self.of_scene))
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -97,7 +73,6 @@ class Loaded:
     files: SceneFiles
     # the cameras as stored in their file, in the order of the views; None without cameras, or if they do not fit
     cameras: CameraFile | None
-    views: SceneViews  # all views of the camera file, including those that the scene does not have
     exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
     notes: tuple[str, ...]  # adapted or unusual content, one sentence each, without a full stop
     # how well every view's Gaussians project into their own pixels; None if rows have no pixels
@@ -116,9 +91,8 @@ class Loaded:
         raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
 
     def without_photos(self) -> Loaded:
-        """Return a copy without the photos of all views, which frees their memory; the scene keeps its own photos."""
-        cameras = None if self.cameras is None else replace(self.cameras, images=())
-        return replace(self, cameras=cameras, views=replace(self.views, images=NO_IMAGES))
+        """Return a copy without the photos inside the camera file, which frees memory; the scene keeps its own."""
+        return replace(self, cameras=None if self.cameras is None else replace(self.cameras, images=()))
 
     def with_left_out(self, notes: Sequence[str]) -> Loaded:
         """Return a copy with notes on files that were found beside the scene and are not used."""
@@ -235,7 +209,6 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
         scene=scene,
         info=replace(used[0].info, num_nonfinite=sum(load.info.num_nonfinite for load in used)),
         files=files,
-        views=SceneViews(scene.cameras, photo_array(scene.images), scene.names, tuple(range(len(scene)))),
         exporters=tuple(dict.fromkeys(exporter for load in used for exporter in load.exporters)),
         notes=(*notes, *joined.notes),
         alignment=check_pixels(scene),
@@ -261,152 +234,189 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
 def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True) -> Loaded:
     """Combine Gaussians, cameras and photos to a scene, with the pixel of every row if rows have pixels.
 
-    If the scene can only be read without some files that were found beside it, these are left out, with a note.
-    SceneError as in :func:`read_scene`. ``photos=False``: search no photos.
+    Cameras and photos that were found beside the scene and do not belong to it are left out, with a note. SceneError as
+    in :func:`read_scene`. ``photos=False``: search no photos.
     """
-    try:
-        return _align(ply, files, read_scene_cameras(ply, files), hints=hints, photos=photos)
-    except SceneError as error:
-        cause = SceneError(error.path, error.problem, error.remedy)  # a copy: the traceback keeps arrays in memory
-    for fewer in files.without_found(cause.path):
-        with suppress(SceneError):
-            load = _align(ply, fewer, read_scene_cameras(ply, fewer), hints=hints, photos=photos)
-            if _is_usable(load, fewer, files, cause):
-                return _note_left_out(load, files, cause)
+    answer = _read_views(ply, files, hints, photos=photos)
+    if isinstance(answer, Loaded):
+        return answer
+    if "cameras" not in files.named and files.cameras not in (None, files.ply) and not _is_named(files, answer):
+        fewer = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
+        alone = _read_views(ply, fewer, hints, photos=photos)
+        lacks_named = "images" in files.named and files.images is not None
+        if isinstance(alone, Loaded) and not (lacks_named and alone.scene.images is None):
+            return _note_left_out(alone, files, [str(files.cameras)], answer)
     if "cameras" not in files.named:
         _check_hints(ply, hints)
     options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
     read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
-    raise SceneError(cause.path, cause.problem, "; ".join(filter(None, (cause.remedy, read_alone))))
+    raise SceneError(answer.path, answer.problem, "; ".join(filter(None, (answer.remedy, read_alone))))
 
 
-def _is_usable(load: Loaded, fewer: SceneFiles, files: SceneFiles, cause: SceneError) -> bool:
-    """Return whether a scene that was read from ``fewer`` files replaces the scene that could not be read.
-
-    Photos that the caller named must be in it. If only photos are left out, either they caused the error, or the rows
-    must have pixels, since without photos cameras of another scene may see these Gaussians as well.
-    """
-    if "images" in files.named and files.images is not None and load.scene.images is None:
-        return False
-    if fewer.cameras != files.cameras or fewer.masks != files.masks:
-        return True
-    photo_failed = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES
-    folder_failed = files.images != files.cameras and cause.path == str(files.images)
-    return load.scene.has_own_pixels or photo_failed or folder_failed
+def _answer(read: Callable[[], T]) -> T | SceneError:
+    """Return what files give, or else why they give nothing: a file is damaged, or they do not fit each other."""
+    try:
+        return read()
+    except SceneError as error:
+        return SceneError(error.path, error.problem, error.remedy)  # a copy: the traceback keeps arrays in memory
 
 
-def _note_left_out(load: Loaded, files: SceneFiles, cause: SceneError) -> Loaded:
-    """Add a note to a scene that was read without some ``files``; it says which files are left out, and why."""
-    names = [str(files.cameras)] if load.files.cameras != files.cameras else []
-    if load.files.masks != files.masks:
-        names.append(f"the masks in {files.masks}")
+def _note_left_out(load: Loaded, files: SceneFiles, names: list[str], cause: SceneError) -> Loaded:
+    """Add a note to a scene that was read without some ``files``, which ``names`` describe; it says why."""
     photos = f"the photos in {files.images or files.ply.parent}"
     repeated = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
-    without_photos = load.files.named != files.named and files.images not in (files.cameras, None)
-    if repeated or without_photos or not names:
-        names.append(photos)
-    is_known = cause.path in map(str, (files.ply, files.ply.parent, files.cameras, files.images, files.masks))
+    names = [*names, *([photos] if repeated else [])]
+    is_known = cause.path in map(str, (files.ply, files.ply.parent, files.cameras, files.images))
     where = "" if is_known else f"{cause.path}: "
+    option, value = ("cameras", "FILE") if names[0] == str(files.cameras) else ("images", "FOLDER")
+    remedy = cause.remedy or f"pass --{option} {value}, or --{option} {NONE}"
     verb = "is" if names == [str(files.cameras)] else "are"
-    remedy = cause.remedy or _name_files(load, files)
     note = " ".join(f"{' and '.join(names)} {verb} left out: {where}{cause.problem}; {remedy}".split())
     return replace(load, notes=(note, *(text for text in load.notes if text not in repeated)), left_out=note)
 
 
-def _name_files(load: Loaded, files: SceneFiles) -> str:
-    """Return the remedy for files that are left out: the options that name others, or none."""
-    option, value = "cameras", "FILE"
-    if load.files.cameras == files.cameras:
-        option, value = ("masks" if load.files.masks != files.masks else "images"), "FOLDER"
-    return f"pass --{option} {value}, or --{option} {NONE}"
+def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
+    """Read the cameras and photos of a scene, and combine them with its Gaussians; return why if they do not fit."""
+    camera_file = _answer(partial(read_scene_cameras, ply, files))
+    if camera_file is None:
+        return _without_cameras(ply, files, hints)
+    return camera_file if isinstance(camera_file, SceneError) else _align(ply, files, camera_file, hints, photos=photos)
 
 
 def _align(
-    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile | None, *, hints: ReadHints, photos: bool = True
-) -> Loaded:
-    """Combine Gaussians, cameras and photos as :func:`align_scene`; SceneError if any file cannot be used."""
-    if camera_file is None:
-        return _without_cameras(ply, files, hints)
-    proposal = propose_photos(files, camera_file) if photos else None
-    if proposal is None:
-        inside = photos_inside(files, camera_file) if photos else ()
-        load = _combine(ply, files, camera_file, ScenePhotos(inside), hints)
-        lacks_photos = photos and "images" not in files.named and load.scene.images is None
-        is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside it are clips of it
-        unread = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
-        return replace(load, notes=(*load.notes, *unread))
-    load = _assign_of_one_shape(ply, files, camera_file, proposal, hints)
-    resized = proposal.folder.parent / SEEN_PLACE
-    if proposal.folder == resized or files.images is None or not resized.is_dir() or load.scene.images is None:
+    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints, *, photos: bool
+) -> Loaded | SceneError:
+    """Combine Gaussians and cameras with their photos; return why if the cameras do not see the Gaussians.
+
+    Photos that were found and do not show the views are left out, with a note, unless they are the only evidence
+    against the cameras.
+    """
+    proposal = _answer(partial(propose_photos, files, camera_file)) if photos else None
+    inside = _answer(partial(photos_inside, files, camera_file)) if photos and proposal is None else ()
+    unread = next((answer for answer in (proposal, inside) if isinstance(answer, SceneError)), None)
+    if unread is not None and ("images" in files.named or files.images == files.cameras):
+        return unread
+    if isinstance(proposal, Proposal):
+        load = _assign(ply, files, camera_file, proposal, hints)
+        of_one_shape = select_one_shape(camera_file, proposal) if isinstance(load, SceneError) else None
+        if of_one_shape is not None:
+            cameras_left, photos_left, left_out = of_one_shape
+            answer = _assign(ply, files, cameras_left, photos_left, hints)
+            load = answer.with_left_out(left_out) if isinstance(answer, Loaded) else load
+        if isinstance(load, SceneError):
+            return _without_photos(ply, files, camera_file, hints, load)
+        return _prefer_resized(load, ply, files, proposal, camera_file, hints)
+    pictures = ScenePhotos(() if isinstance(inside, SceneError) else inside)
+    load = _answer(partial(_combine, ply, files, camera_file, pictures, hints))
+    if isinstance(load, SceneError):
         return load
-    return _prefer_resized(load, ply, replace(files, images=resized), camera_file, hints)
+    if unread is not None:
+        return _note_left_out(load, files, [f"the photos in {files.images}"], unread)
+    lacks_photos = photos and "images" not in files.named and load.scene.images is None
+    is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside it are clips of it
+    films = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
+    return replace(load, notes=(*load.notes, *films))
 
 
 def _prefer_resized(
-    load: Loaded, ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints
+    load: Loaded, ply: GaussianFile, files: SceneFiles, proposal: Proposal, camera_file: CameraFile, hints: ReadHints
 ) -> Loaded:
-    """Return the scene with the photos that WorldMirror resized if they fit its Gaussians better, else ``load``.
-
-    ``files`` have the folder of these photos.
-    """
-    with suppress(SceneError):  # they may be of other views
-        proposal = propose_photos(files, camera_file)
-        resized = None if proposal is None else _assign(ply, files, camera_file, proposal, hints)
-        if resized is not None and resized.scene.images is not None and shows_better(resized.scene, load.scene):
-            text = f"photos are read from {SEEN_PLACE}, since they fit the Gaussians better"
-            return replace(resized, notes=(*resized.notes, text))
-    return load
-
-
-def _assign_of_one_shape(
-    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
-) -> Loaded:
-    """Combine as :func:`_assign`; if that fails, leave out photos or views whose shape is not that of most photos."""
-    try:
-        return _assign(ply, files, camera_file, proposal, hints)
-    except SceneError:
-        fewer = select_one_shape(camera_file, proposal)
-        if fewer is not None:
-            cameras, photos, left_out = fewer
-            with suppress(SceneError):
-                return _assign(ply, files, cameras, photos, hints).with_left_out(left_out)
-        raise
+    """Return the scene with the photos that WorldMirror resized if they fit its Gaussians better, else ``load``."""
+    folder = proposal.folder.parent / SEEN_PLACE
+    if proposal.folder == folder or files.images is None or not folder.is_dir() or load.scene.images is None:
+        return load
+    files = replace(files, images=folder)
+    other = _answer(partial(propose_photos, files, camera_file))
+    resized = _assign(ply, files, camera_file, other, hints) if isinstance(other, Proposal) else None
+    if not isinstance(resized, Loaded) or resized.scene.images is None or not shows_better(resized.scene, load.scene):
+        return load
+    text = f"photos are read from {SEEN_PLACE}, since they fit the Gaussians better"
+    return replace(resized, notes=(*resized.notes, text))
 
 
 def _assign(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
-) -> Loaded:
+) -> Loaded | SceneError:
     """Combine Gaussians and cameras with the photos that names propose, or with other photos that show the views.
 
-    Notes name photos that cannot be read, and views without a photo. SceneError if no photo shows any view.
+    Notes name photos that cannot be read, and views without a photo. Returns why if photos and cameras do not fit.
     """
-    load, cause, fit = None, None, None
     is_grid = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED  # photos may have any size
+    load: Loaded | None = None
+    cause: SceneError | None = None
+    fit: GridFit | None = None
     while load is None and cause is None and not is_grid and any(photo is not None for photo in proposal.named):
-        try:
-            load = _combine(ply, files, camera_file, read_photos(proposal, proposal.choice, camera_file), hints)
-        except SceneError as error:
-            fewer = proposal.without_broken() if error.path in map(str, proposal.pool) else None
-            proposal, cause = (proposal, error) if fewer is None else (fewer, None)
-    try:
-        base = load or _combine(ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
-    except SceneError as error:
-        raise cause or error from None
+        answer = _answer(partial(_combine_chosen, ply, files, camera_file, proposal, proposal.choice, hints))
+        sound = None
+        if isinstance(answer, Loaded):
+            load = answer
+        elif answer.path in map(str, proposal.pool):
+            sound = proposal.without_broken()
+        if sound is not None:
+            proposal = sound
+        elif isinstance(answer, SceneError):
+            cause = answer
+    base: Loaded | SceneError | None = load
+    if base is None:
+        pinholes = replace(camera_file, lenses=())
+        base = _answer(partial(_combine, ply, files, pinholes, ScenePhotos(), hints))
+    if isinstance(base, SceneError):
+        return cause or base
     if is_grid and proposal.pool:
         fit = fit_to_grid(base.scene, proposal)
-    guessed, is_read = list_guessed(base.scene, camera_file), load is not None
+    guessed = list_guessed(base.scene, camera_file)
     proposal = proposal.without_views(guessed)
-    chosen = assign_to_views(base.scene, base.views.of_scene, proposal, read=is_read, guessed=guessed, fit=fit)
+    views, is_read = range(len(base.scene)), load is not None
+    chosen = assign_to_views(base.scene, views, proposal, read=is_read, guessed=guessed, fit=fit)
     if not any(chosen):
-        if (refusal := refuse_photos(files, proposal, camera_file, cause)) is not None:
-            raise refusal
-        bare = base if load is None else _combine(ply, files, camera_file, ScenePhotos(), hints)
-        return bare.with_left_out([describe_unused(proposal, camera_file)])
-    described, left_out = describe_assignment(proposal, chosen, camera_file)
+        refusal = refuse_photos(files, proposal, camera_file, cause)
+        if refusal is not None:
+            return refusal
+        alone = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
+        text = describe_unused(proposal, camera_file)
+        return alone.with_left_out([text]) if isinstance(alone, Loaded) else alone
+    described, unused = describe_assignment(proposal, chosen, camera_file)
     if load is None or chosen != proposal.choice:
         camera_file = name_by_photos(camera_file, proposal, chosen, fit)
-        load = _combine(ply, files, camera_file, read_photos(proposal, chosen, camera_file), hints)
-    return replace(load, notes=(*load.notes, *described)).with_left_out(left_out)
+        answer = _answer(partial(_combine_chosen, ply, files, camera_file, proposal, chosen, hints))
+        if isinstance(answer, SceneError):
+            return answer
+        load = answer
+    return replace(load, notes=(*load.notes, *described)).with_left_out(unused)
+
+
+def _combine_chosen(
+    ply: GaussianFile,
+    files: SceneFiles,
+    camera_file: CameraFile,
+    proposal: Proposal,
+    chosen: Sequence[Assignment | None],
+    hints: ReadHints,
+) -> Loaded:
+    """Combine Gaussians and cameras with the chosen photos as :func:`_combine`."""
+    return _combine(ply, files, camera_file, read_photos(proposal, chosen, camera_file), hints)
+
+
+def _without_photos(
+    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints, cause: SceneError
+) -> Loaded | SceneError:
+    """Leave out photos that show no view, with a note; return why if they were named, or the cameras are in doubt.
+
+    ``cause``: why photos and cameras do not fit each other. Without photos, cameras of another scene may see these
+    Gaussians as well, unless rows are their pixels.
+    """
+    bare = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
+    is_of_photos = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(files.images)
+    are_named = "images" in files.named or _is_named(files, cause)
+    if isinstance(bare, SceneError) or are_named or not (bare.scene.has_own_pixels or is_of_photos):
+        return cause
+    return _note_left_out(bare, files, [f"the photos in {files.images or files.ply.parent}"], cause)
+
+
+def _is_named(files: SceneFiles, cause: SceneError) -> bool:
+    """Return whether a picture at fault is in a folder that the caller named."""
+    folders = (getattr(files, name) for name in ("images", "masks", "protect") if name in files.named)
+    return any(folder is not None and Path(cause.path).is_relative_to(folder) for folder in folders)
 
 
 def _combine(
@@ -419,14 +429,13 @@ def _combine(
     notes += [camera_file.focal] if camera_file.focal else []
     without_bars, bar_notes = cut_bars(pictures, camera_file)
     limited, size_notes = limit_photo_size(without_bars, len(ply.gaussians), hints.max_side, unaligned=order == "none")
-    depths = cache(partial(read_depths, Path(camera_file.path)))
     if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians
         problem = "expected one Gaussian per pixel, found the Gaussians of a state"
         cameras = to_cameras(pinholes, photo_size(limited))
         result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
     else:
         frames = partial(read_dataparser, files.ply, files.cameras)
-        result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, depths=depths, frames=frames)
+        result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, frames=frames)
     notes += [*bar_notes, *size_notes, *result.notes]
     if result.pixel_ids is None:
         _check_hints(ply, hints)
@@ -439,9 +448,18 @@ def _combine(
         reason = "the photos have bars, which are cut off" if size else "there are no photos"
         notes.append(f"the pictures of {' and '.join(unused)} are not used, since {reason}")
     if had_bars:  # photos with bars have neither larger files nor masks
-        return _make_load(ply, files, hints, result, notes, absent=photos.absent, depths=depths)
-    large, masks, mask_notes = find_larger_and_masks(files, camera_file, photos, size, result.transform, result.cameras)
-    return _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent, depths)
+        return _make_load(ply, files, hints, result, notes, absent=photos.absent)
+    left_out, place = list[str](), (camera_file, photos, size, result.transform, result.cameras)
+    found = _answer(lambda: find_larger_and_masks(files, *place))
+    if isinstance(found, SceneError):
+        if "masks" in files.named or files.masks is None or not Path(found.path).is_relative_to(files.masks):
+            raise found
+        remedy = found.remedy or f"pass --masks FOLDER, or --masks {NONE}"
+        left_out = [f"the masks in {files.masks} are left out: {found.path}: {found.problem}; {remedy}"]
+        found = find_larger_and_masks(replace(files, masks=None), *place)
+    large, masks, mask_notes = found
+    load = _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
+    return load.with_left_out(left_out)
 
 
 def _choose_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
@@ -468,11 +486,9 @@ def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> 
 
 
 def _check_hints(ply: GaussianFile, hints: ReadHints) -> None:
-    """Raise SceneError for rows without pixels if a hint describes the pixels' order or rotations."""
-    given = [] if hints.order in ("auto", *MAY_BE_UNALIGNED) else [f"order={hints.order}"]
-    given += [f"quats={hints.quats}"] if hints.quats in ("camera", "xyzw-root") else []
-    if given:
-        problem = f"expected rows that are pixels of views, as --hint {given[0]} says, found rows without pixels"
+    """Raise SceneError for rows without pixels if a hint describes the order of pixels."""
+    if hints.order not in ("auto", "none"):
+        problem = f"expected rows that are pixels of views, as --hint order={hints.order} says, found others"
         raise SceneError(ply.info.path, problem, "leave the hint out, or name the cameras that fit with --cameras")
 
 
@@ -485,76 +501,50 @@ def _make_load(
     large: LargePhotos | None = None,
     masks: Masks = NO_MASKS,
     absent: Sequence[int] = (),
-    depths: Callable[[], np.ndarray | None] = lambda: None,
 ) -> Loaded:
     """Make the scene from rows, their pixels and the views, with notes on how it was read.
 
-    ``absent``: indices of the cameras without a photo. ``depths`` reads the depth maps beside the cameras.
+    ``absent``: indices of the cameras without a photo.
     """
-    camera_file, layout, views = result.camera_file, result.layout, list(result.views)
-    scene, more = _make_scene(ply, files, result, large, masks)
-    frame = None if result.recovery is None else result.recovery.best.frame
+    camera_file, recovery = result.camera_file, result.recovery
+    scene, more = _make_scene(ply, files, hints, result, large, masks)
+    if recovery is not None and result.given is not None:
+        scene = move_views(scene, result.given)
+        result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
     source = "" if camera_file is None else camera_file.source
-    exporters, alignment = choose_exporters(hints.exporter, ply.info, layout, frame, source), None
-    if layout is None or frame is None:
-        scene = read_rotations(scene, hints.quats)
-        if camera_file is not None and hints.exporter != "auto":
-            remedy = f"only those of the given exporter {hints.exporter} were tried; --hint exporter=auto tries all"
-            more.append(f"the rows are the pixels of no views in any known order: {remedy}")
-    else:
-        assert camera_file is not None, "pixels belong to cameras"
-        scene, depth_notes = use_depths(scene, depths, layout, frame.scale)
-        scene, rotation_notes = set_rotations(scene, hints, exporters, frame)
-        more += [*depth_notes, *rotation_notes]
-        if result.given is not None:
-            scene = move_views(scene, result.given[views])
-            result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
-        alignment = check_pixels(scene)
-        if layout.per_pixel == 1:
-            camera_file = select_views(camera_file, views)
-    load = Loaded(
-        scene=without_photo(scene, [view for view, camera in enumerate(views) if camera in absent]),
+    order = "none" if recovery is None else recovery.layout.order
+    return Loaded(
+        scene=without_photo(scene, absent),
         info=ply.info,
         files=files,
         cameras=camera_file,
-        views=SceneViews(result.cameras, result.images, _camera_names(result), tuple(views)),
-        exporters=exporters,
+        exporters=choose_exporters(hints.exporter, ply.info, order, source),
         notes=(*files.notes, *file_notes(ply.info), *notes, *more),
-        alignment=alignment,
-        recovery=result.recovery,
+        alignment=None if recovery is None else check_pixels(scene),
+        recovery=recovery,
         problem=result.problem,
         moves=result.moves,
     )
-    return load.with_left_out(result.left_out)
 
 
 def _make_scene(
-    ply: GaussianFile, files: SceneFiles, result: AlignmentResult, large: LargePhotos | None, masks: Masks
+    ply: GaussianFile,
+    files: SceneFiles,
+    hints: ReadHints,
+    result: AlignmentResult,
+    large: LargePhotos | None,
+    masks: Masks,
 ) -> tuple[Scene, list[str]]:
-    """Make the scene of the visible Gaussians and the views to which rows belong; also return notes.
-
-    ``large`` and ``masks`` belong to all views of the camera file.
-    """
-    views, camera_names = list(result.views), _camera_names(result)
+    """Make the scene of the visible Gaussians and all views, of which ``large`` and ``masks`` are; return notes too."""
     gaussians, pixels = take_gaussians(ply, result)
     num_faint = int(ply.valid.sum()) - len(gaussians)
     faint = "fainter than 1/255, which nothing draws, set aside"
     notes = [count_words(num_faint, "Gaussian", faint)] if num_faint else []
-    cameras, images = result.cameras, result.images
-    if views != list(range(len(cameras))):
-        cameras, images = cameras[views], images[views] if len(images) else images
-    gaussians = color_from_photos(gaussians, pixels, images, files)
-    large = None if large is None else large[views]
-    masks, mask_notes = check_masks(masks[views], files)
-    photos = images if len(images) else None
-    names = tuple(camera_names[view] for view in views)
-    scene = Scene(gaussians, cameras, photos, pixels, names, large, masks.counts, masks.importance)
-    return scene, [*notes, *mask_notes]
-
-
-def _camera_names(result: AlignmentResult) -> tuple[str, ...]:
-    """Return the names of all views of the camera file; empty without cameras."""
-    return () if result.camera_file is None else result.camera_file.names
+    masks, mask_notes = check_masks(masks, files)
+    photos = result.images if len(result.images) else None
+    names = () if result.camera_file is None else result.camera_file.names
+    scene = Scene(gaussians, result.cameras, photos, pixels, names, large, masks.counts, masks.importance)
+    return read_rotations(scene, hints.quats), [*notes, *mask_notes]
 
 
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
@@ -563,30 +553,33 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
     ``photos``: read photos, and raise SceneError if named ones cannot be read; False: leave photos out. SceneError if
     named cameras have no size.
     """
-    with suppress(SceneError):
-        camera_file = read_scene_cameras(ply, files)
-        if camera_file is None:
-            return _without_cameras(ply, files, hints)
+    camera_file = _answer(partial(read_scene_cameras, ply, files))
+    if camera_file is None:
+        return _without_cameras(ply, files, hints)
+    if isinstance(camera_file, CameraFile):
         for with_photos in [True] if photos else [True, False]:  # photos can show the frame even if they are not kept
-            with suppress(SceneError):
-                return _align(ply, files, camera_file, hints=hints, photos=with_photos)
-        return _keep_stored_cameras(ply, files, camera_file, hints=hints, photos=photos)
-    return align_scene(ply, files, hints=hints, photos=photos)  # leaves out unreadable files that were not named
+            load = _align(ply, files, camera_file, hints, photos=with_photos)
+            if isinstance(load, Loaded):
+                return load
+        kept = _answer(partial(_keep_stored_cameras, ply, files, camera_file, hints, photos=photos))
+        if isinstance(kept, Loaded):
+            return kept
+    return align_scene(ply, files, hints=hints, photos=photos)  # leaves out files that were not named
 
 
 def _keep_stored_cameras(
-    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, *, hints: ReadHints, photos: bool
-) -> Loaded:
+    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints, *, photos: bool
+) -> Loaded | None:
     """Return the scene with its cameras as their file stores them, with a note.
 
-    Cameras that were not named and do not see the Gaussians are left out.
+    None for cameras that were not named and do not see the Gaussians.
     """
     from gsmerge.alignment import check_cameras  # few scenes need it
 
     pictures = stored_photos(files, camera_file) if photos else ()
     cameras = to_cameras(camera_file, photo_size(pictures))
     if "cameras" not in files.named and not check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
-        return align_scene(ply, files, hints=hints, photos=photos)
+        return None
     note = "the cameras do not fit the Gaussians; they stay as stored in their file"
     as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
     return replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)

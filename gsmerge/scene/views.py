@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.frozen import dataclass
-from gsmerge.io.cameras.camera_file import CameraFile, drop_repeats, sizes_of, to_cameras, undistort_photos
+from gsmerge.io.cameras.camera_file import (
+    CameraFile,
+    drop_repeats,
+    missing_intrinsics,
+    sizes_of,
+    to_cameras,
+    undistort_photos,
+)
 from gsmerge.io.cameras.read import read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import (
@@ -26,7 +33,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.masks import NO_MASKS, Masks, read_masks
-from gsmerge.scene.photos import ScenePhotos, stored_photos
+from gsmerge.scene.photos import ScenePhotos
 from gsmerge.types import Cameras, LargePhotos
 
 _MAX_BYTES = 2 << 30  # size of all photos as floats, up to which photos are not resized unless rows have no pixels
@@ -38,27 +45,23 @@ _ROUNDING = 1e-6  # pixels
 def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
     """Read a scene's cameras from their file or the ``.ply``, or estimate them; None if there are none.
 
-    If a file has only poses, the focal length is estimated; SceneError if that fails. Repeated views are dropped,
-    unless the number of rows is a multiple of the number of views.
+    SceneError for a file of poses alone, without a focal length. Repeated views are dropped, unless the number of rows
+    is a multiple of the number of views.
     """
-    stored = None
     if files.cameras is not None:
         stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
-        if len(ply.gaussians) % len(stored):  # otherwise each view may have rows of its own
-            stored = drop_repeats(stored)
-        if stored.focal is not None:
-            return stored
-    if stored is None and files.is_state:
+        if stored.focal is None:
+            raise missing_intrinsics(stored.path)
+        # if the number is a multiple, each view may have rows of its own
+        return drop_repeats(stored) if len(ply.gaussians) % len(stored) else stored
+    if files.is_state:
         return None
-    sharp = read_sharp_camera(files.ply) if stored is None and "cameras" not in files.named else None
+    sharp = None if "cameras" in files.named else read_sharp_camera(files.ply)
     if sharp is not None:
         return sharp
-    from gsmerge.scene.estimate_cameras import estimate_cameras, estimate_focal  # few files need it
+    from gsmerge.alignment import estimate_cameras  # few files need it
 
-    if stored is not None:
-        return estimate_focal(ply, stored, stored_photos(files, stored))
-    folder = files.images if files.images is not None and files.images.is_dir() else None
-    return estimate_cameras(ply, files.ply, folder)
+    return estimate_cameras(files.ply, ply.gaussians.means, ply.valid)
 
 
 def find_larger_and_masks(

@@ -10,8 +10,8 @@ from gsmerge.settings.setting import Settings, setting
 
 OpacityChoice = Literal["auto", "logit", "raw"]
 ScaleChoice = Literal["auto", "log", "linear"]
-QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
-Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
+QuatChoice = Literal["wxyz", "xyzw"]
+Order = Literal["auto", "view-major", "view-fastest", "none"]
 
 SCENE_ARGUMENTS = ("cameras", "images", "masks", "protect", "opacity")  # of read_scene, besides hints
 NONE = "none"  # in place of a path: read the scene without cameras, photos or masks. Path(NONE) is a file of that name
@@ -22,13 +22,11 @@ class ReadHints(Settings):
     """Hints for reading files whose values do not show their encoding, or suggest a wrong one."""
 
     exporter: str = setting("auto", "Program that wrote the file, such as da3 or depthsplat; auto recognises it.")
-    quats: QuatChoice = setting("auto", "How the file stores rotations: wxyz, xyzw, xyzw-root (w last; the rotation "
-        "applied twice), or camera (relative to the camera of each view).",
-        "`auto`: as the exporter does. Where the pixels are known, this is checked against the surface.")  # fmt: skip
+    quats: QuatChoice = setting("wxyz", "How the file stores rotations: wxyz, or xyzw (w last).")
     scales: ScaleChoice = setting("auto", "How the file stores scales: log or linear; auto reads them as logarithms, "
         "unless the size of the scene shows that they are linear.")  # fmt: skip
-    order: Order = setting("auto", "Order of the rows; none: the Gaussians belong to no pixels.",
-        "`unordered`: each Gaussian may come from a pixel, but its row does not show which.")  # fmt: skip
+    order: Order = setting("auto", "Order of the rows: view-major (view by view, line by line), view-fastest (the "
+        "views of a pixel together), or none: the Gaussians belong to no pixels; auto tries all.")  # fmt: skip
     scene_scale: float | None = setting(None, "Scale of the Gaussians' world relative to that of the cameras; null: "
         "estimate it.", above=0, below=inf)  # fmt: skip
     max_side: int = setting(1200, "Longest side of a view, in pixels, if the Gaussians belong to no pixels; larger "

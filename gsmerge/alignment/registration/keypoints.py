@@ -21,7 +21,6 @@ KEYPOINTS = 4000  # most keypoints of a photo
 CONTRAST = 0.02  # least contrast of a keypoint; OpenCV's default finds too few on plain walls
 GREY = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
 RATIO = 0.8  # largest distance of the best match, divided by the distance of the second best (Lowe 2004)
-OPAQUE = 0.5  # the surface of a pixel is its nearest Gaussian with at least this share of its largest opacity
 SAME_DEPTH = 0.15  # largest relative difference of depths around a keypoint on one surface
 PIXEL_SPREAD = 0.003  # standard deviation of a keypoint, divided by the diagonal of the picture
 
@@ -69,24 +68,16 @@ class KeypointMatches:
 
 
 def find_keypoints(scene: Scene) -> list[Photo]:
-    """Find the keypoints in the photo of every camera of a scene of pixels; leave out those at edges of surfaces.
-
-    Views from the same camera are layers of one photo.
-    """
-    cameras = scene.cameras.numpy()
-    poses = cameras.viewmats.reshape(len(scene), -1)
-    keys = np.concatenate([poses, cameras.Ks.reshape(len(scene), -1)], 1)
-    firsts = [int((keys == key).all(1).argmax()) for key in keys]
-    photos = []
-    for view in sorted(set(firsts)):
-        layers = [i for i, first in enumerate(firsts) if first == view]
+    """Find the keypoints in the photo of every view of a scene of pixels; leave out those at edges of surfaces."""
+    cameras, photos = scene.cameras.numpy(), []
+    for view in range(len(scene)):
         K = cameras.Ks[view].astype(np.float64)
         viewmat = cameras.viewmats[view].astype(np.float64)
         picture, shown = _picture(scene, view, K)
         places, descriptors = _describe(picture, shown[1, 1] / shown[0, 0])
         zoom = K[0, 0] / shown[0, 0], K[1, 1] / shown[1, 1]
         pixels = (places - shown[:2, 2]) * zoom + K[:2, 2]
-        z, ok = _depths_at(_surface(scene, layers, viewmat), pixels)
+        z, ok = _depths_at(_surface(scene, view, viewmat), pixels)
         rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
         points = matmul(rays[ok] * z[ok, None] - viewmat[:3, 3], viewmat[:3, :3])
         photos.append(Photo(pixels[ok], points, descriptors[ok], viewmat, K))
@@ -140,17 +131,11 @@ def _any_processor() -> Iterator[None]:
         cv2.setUseOptimized(before)
 
 
-def _surface(scene: Scene, layers: Sequence[int], viewmat: np.ndarray) -> np.ndarray:
-    """Return the depth ``[h,w]`` of the nearest opaque Gaussian of each pixel of a camera; infinite without any.
-
-    ``layers`` are the views with the pose ``viewmat`` of that camera.
-    """
-    rows = scene.get_pixels().fronts[list(layers)]
-    means = scene.gaussians.means[rows].astype(np.float64)
-    opacities = scene.gaussians.opacities[rows] * (rows >= 0)
-    depths = camera_depths(means, viewmat)
-    seen = (depths > 0) & (opacities > 0) & (opacities >= OPAQUE * opacities.max(0))
-    return np.asarray(np.where(seen, depths, np.inf).min(0))
+def _surface(scene: Scene, view: int, viewmat: np.ndarray) -> np.ndarray:
+    """Return the depth ``[h,w]`` of the Gaussian in front of each pixel of a view; infinite without any."""
+    rows = scene.get_pixels().fronts[view]
+    depths = camera_depths(scene.gaussians.means[rows].astype(np.float64), viewmat)
+    return np.asarray(np.where((rows >= 0) & (depths > 0), depths, np.inf))
 
 
 def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,15 +1,11 @@
-"""Text files of poses, as KITTI, TUM, RealEstate10K, ScanNet and DA3-Streaming write them, and of intrinsics.
-
-Beside the poses, DA3-Streaming writes ``results_output/frame_N.npz`` with depth map, image and intrinsics of the view
-whose pose is in line N, counted from 0.
-"""
+"""Text files of poses, as KITTI, TUM, RealEstate10K, ScanNet and DA3-Streaming write them, and of intrinsics."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from itertools import islice, repeat
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +16,8 @@ from gsmerge.io.bounds import MAX_TEXT_BYTES, check_file, read_lines
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, StoredView, check_count, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.foreign import INTRINSICS, POSE_FOLDERS
-from gsmerge.io.cameras.npz_files import array_shape
-from gsmerge.io.formats.table import FRAMES, POSES
 from gsmerge.io.image_names import natural_order
 
-_FRAME = re.compile(r"frame_(\d{1,9})\.npz")
 _POSE_COLUMNS = (12, 16)  # numbers in a line that is a pose
 _ROW = 4  # numbers in a line that is a row of a matrix
 _TUM = 8  # a time, the camera's centre and a quaternion xyzw
@@ -48,9 +41,8 @@ def read_poses(source: CameraSource) -> StoredCameras:
 
     Poses have 12 or 16 numbers, row by row, or TUM's 8 numbers; they are camera-to-world with OpenCV axes. Only poses
     of RealEstate10K are world-to-camera, with intrinsics in the same line. Intrinsics of other poses may be in a file
-    beside them, see :data:`INTRINSICS`: fx, fy, cx, cy in pixels or a matrix, for all views or for each. The size is
-    that of DA3-Streaming's frames; without frames it is unknown. In a folder, views without a finite matrix are left
-    out. SceneError if a line has another count of numbers.
+    beside them, see :data:`INTRINSICS`: fx, fy, cx, cy in pixels or a matrix, for all views or for each. In a folder,
+    views without a finite matrix are left out. SceneError if a line has another count of numbers.
     """
     path = source.path
     columns = len(_words(next(filter(str.strip, _lines(path)), "")))
@@ -67,11 +59,9 @@ def read_poses(source: CameraSource) -> StoredCameras:
         names = [file.stem for file in _files(path)]
     if intrinsics is not None and len(Ks) not in (1, len(poses)):
         raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(Ks)}")
-    shape = array_shape(path.parent / FRAMES / "frame_0.npz", "depth")  # empty without frames
-    size = (shape[1], shape[0]) if len(shape) == 2 and Ks else (0, 0)
     Ks_by_view = repeat(Ks[0] if Ks else None) if len(Ks) < 2 else Ks
     triples = zip(names, poses, Ks_by_view, strict=False)
-    views = [StoredView(name, pose.reshape(-1, 4), K, size) for name, pose, K in triples]
+    views = [StoredView(name, pose.reshape(-1, 4), K, (0, 0)) for name, pose, K in triples]
     views = [view for view in views if not path.is_dir() or np.isfinite(view.pose).all()]
     return StoredCameras(views, convention=W2C_OPENCV if columns == _RE10K else None)
 
@@ -130,39 +120,10 @@ def _lines(path: Path) -> Iterator[str]:
             yield "" if has_no_pose else line
 
 
-def list_frames(folder: Path) -> list[Path]:
-    """List the frames of DA3-Streaming by number, in its folder or in ``results_output``; empty if there are no poses.
-
-    SceneError if a number is missing.
-    """
-    frames_folder = folder if folder.name == FRAMES else folder / FRAMES
-    with suppress(OSError):
-        if (frames_folder.parent / POSES).is_file():
-            matches = [(_FRAME.fullmatch(path.name), path) for path in frames_folder.iterdir()]
-            numbers = {int(match[1]): path for match, path in matches if match}
-            missing = next((number for number in range(len(numbers)) if number not in numbers), None)
-            if missing is not None:
-                problem = f"expected {len(numbers)} frames from frame_0.npz on, found none with number {missing}"
-                raise SceneError(frames_folder, problem, "add it, and one line of camera_poses.txt for each")
-            return [numbers[number] for number in range(len(numbers))]
-    return []
-
-
-def pose_of_frame(frame: Path) -> np.ndarray:
-    """Read the camera-to-world pose ``[3,4]`` or ``[4,4]`` of a frame of DA3-Streaming; SceneError if it has none."""
-    match, path = _FRAME.fullmatch(frame.name), frame.parent.parent / POSES
-    number = int(match[1]) if match else 0
-    lines = (line for line in read_lines(path) if line.strip())
-    poses = _parse(path, islice(lines, number, number + 1), _POSE_COLUMNS, number + 1)
-    if not poses:
-        raise SceneError(path, f"expected {number + 1} poses or more, one for each frame, found fewer")
-    return poses[0].reshape(-1, 4)
-
-
-def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...], first: int = 1) -> list[np.ndarray]:
-    """Parse the numbers of lines; SceneError with the line number, counted from ``first``, if one is wrong."""
+def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[np.ndarray]:
+    """Parse the numbers of lines; SceneError with the number of the line if one is wrong."""
     rows: list[np.ndarray] = []
-    for number, line in enumerate(lines, first):
+    for number, line in enumerate(lines, 1):
         words = _words(line)
         if words and len(words) not in lengths:
             counts = " or ".join(map(str, lengths))

@@ -30,7 +30,7 @@ from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.types import StrPath
 
 _lazy = lazy_functions(__package__)
-holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.read_depths")
+holds_images = _lazy("npz_files.holds_images")
 _holds_poses, _read_scenes = _lazy("npz_files.holds_poses"), _lazy("re10k.read_scenes")
 _MAX_CANDIDATES = 16  # files in a folder that are searched for cameras
 _CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt", LOG, ".csv")

@@ -16,17 +16,15 @@ from gsmerge.geometry import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.scale_units import LINEAR_NOTE, ScaleJudgement, judge_scales, log_of_scales
-from gsmerge.io.formats.table import DEPTHS, META, PLY, READ_ENDINGS, find_format
+from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.memory import free_pages, make_array
-from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.reading import OpacityChoice, ScaleChoice
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.words import count_words
 
-_READ_FRAMES = LazyFunction("gsmerge.io.formats.depth_maps", "read_frames")
 MIN_PADDING = 16  # number of equal rows at the origin that are padding; fewer may be Gaussians
 MIN_FINITE = 0.002  # least share of finite rows; a file with fewer is refused
 MAX_HARMONIC = 1e6  # larger harmonics are clipped, so that float32 can square and sum the rendered values
@@ -134,7 +132,7 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleCho
 
 
 def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto") -> GaussianFile:
-    """Read files as one, in the given order: a PLY file, PLY files with equal columns, or files of depth maps.
+    """Read files as one, in the given order: a PLY file or PLY files with equal columns.
 
     Errors are those of :func:`read_ply`.
     """
@@ -142,8 +140,7 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto", scales
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     if scales not in ("auto", "log", "linear"):
         raise ValueError(f"scales: expected 'auto', 'log' or 'linear', got {scales!r}")
-    is_depth = find_format(paths[0]) is DEPTHS
-    parts = _READ_FRAMES(paths) if is_depth else parallel_map(ply.read_rows, paths)
+    parts = parallel_map(ply.read_rows, paths)
     for path, part in zip(paths, parts, strict=True):
         if part.rows.dtype != parts[0].rows.dtype:
             problem = f"expected the same columns as in {paths[0].name}, found others, so these are no parts of a scene"
@@ -155,8 +152,8 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto", scales
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto") -> GaussianFile:
     """Read a file of Gaussians; the ending of its name tells the format.
 
-    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2), ``.glb``, and ``.npz`` of depth maps. The
-    finest level of a ``lod-meta.json`` is read. splat-transform reads ``.ksplat``, ``meta.json`` or its folder,
+    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``. The finest
+    level of a ``lod-meta.json`` is read. splat-transform reads ``.ksplat``, ``meta.json`` or its folder,
     ``.lcc`` and ``.lcc2``. Everything else is read by :func:`read_ply`; only this uses ``opacity``
     and ``scales``. SceneError if the file cannot be read, is damaged, or holds no finite Gaussian. ValueError for an
     unknown ``opacity`` or ``scales``.

@@ -23,7 +23,6 @@ from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath
 STATE_ENDING = ".gsm"  # of states, as gsmerge extend writes them
 INDEX = "lod-meta.json"  # name of a Streamed SOG, by which viewers recognise it
 MODEL_NAMES = POINTS, CAMERAS, IMAGES = "points3D.bin", "cameras.bin", "images.bin"
-FRAMES, POSES = "results_output", "camera_poses.txt"  # DA3-Streaming's folder of frames, and the poses beside it
 
 
 _lazy = lazy_functions(__package__)
@@ -161,10 +160,6 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
         kept_as=".ply",
     ),
 )  # fmt: skip
-DEPTHS = Format(
-    ".npz", "depth maps with images and cameras: a Gaussian for each pixel", _lazy("depth_maps.read_rows"), None, -1,
-    holds=_lazy("depth_maps.holds_depth_maps"), each=(6.0,),
-)  # fmt: skip
 STATE = Format(
     STATE_ENDING, "batches of views: Gaussians, cameras and pictures", _lazy("gsm.read_rows"), None, -1, each=(56.0,)
 )
@@ -179,16 +174,14 @@ BY_PROGRAM = (  # formats that splat-transform reads for gsmerge
     Format(".lcc2", "as `.lcc`", _READ_BY_PROGRAM, None, -1),
 )  # fmt: skip
 SEVERAL_USES = (".npz", ".glb")  # endings of files that often hold no Gaussians
-FORMATS = (*FILES, HTML, LEVELS, COLMAP, DEPTHS, STATE, *BY_PROGRAM)
+FORMATS = (*FILES, HTML, LEVELS, COLMAP, STATE, *BY_PROGRAM)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # results that a page shows
 FOLDERS = {row.folder: row for row in FORMATS if row.folder}  # by the name of an output folder
 READ_ENDINGS = tuple(row.ending for row in FORMATS if row.read is not None)
 SCENE_SUFFIXES = tuple(
     dict.fromkeys(
-        Path(f"_{row.ending}").suffix
-        for row in (*FILES, DEPTHS, *BY_PROGRAM)
-        if row.read is not None and row.ending[0] == "."
+        Path(f"_{row.ending}").suffix for row in (*FILES, *BY_PROGRAM) if row.read is not None and row.ending[0] == "."
     )
 )
 
@@ -229,11 +222,6 @@ def _by_bytes(path: Path) -> tuple[int, int]:
 def find_format(path: StrPath) -> Format:
     """Return the format that a path names; PLY for unknown endings."""
     return next((row for row in FORMATS if row.names(path)), PLY)
-
-
-def is_frame(path: Path) -> bool:
-    """Return whether a file is a frame of DA3-Streaming."""
-    return DEPTHS.names(path) and path.parent.name == FRAMES and (path.parent.parent / POSES).is_file()
 
 
 def may_hold_gaussians(path: Path) -> bool:

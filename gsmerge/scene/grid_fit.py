@@ -1,4 +1,4 @@
-"""Estimate cameras for rows that have none or only poses, and find how photos were resized to the rows' grid.
+"""Find how photos were resized to the grid of a file's rows, whose cameras were estimated.
 
 Models resize photos without their aspect ratio or crop them, and some cut a border off their output. Therefore photos
 of any size are compared with the pictures of a grid, which are the colours of its rows.
@@ -7,44 +7,18 @@ of any size are compared with the pictures of a grid, which are the colours of i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 
-from gsmerge import alignment
-from gsmerge.errors import SceneError
+from gsmerge.alignment import TRIMS
 from gsmerge.evidence.offsets import correlate_parts
 from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import stands_out
 from gsmerge.frozen import dataclass
-from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics
-from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.image_names import list_images
-from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, Size, image_size, resize_and_crop, resize_to
-
-
-def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: PhotoArrays) -> CameraFile:
-    """Estimate the focal length of cameras whose file has poses alone; SceneError if that fails."""
-    estimated = alignment.estimate_focal(ply, camera_file, photos)
-    if estimated is None:
-        reason = "no focal length fits the Gaussians" if len(photos) else "no photos to estimate them from"
-        raise missing_intrinsics(camera_file.path, f", and {reason}")
-    return estimated
-
-
-def estimate_cameras(ply: GaussianFile, path: Path, folder: Path | None) -> CameraFile | None:
-    """Estimate the cameras of the photos in a folder, or else of a grid of any size; None if the rows are no grid."""
-    cameras, paths = None, [] if folder is None else list_images(folder)
-    if folder is not None and paths:
-        names = [photo.relative_to(folder).as_posix() for photo in paths]
-        with suppress(SceneError):  # the first file may be no image
-            size = image_size(paths[0])
-            turned = size[::-1]  # by its orientation tag
-            cameras = alignment.estimate_cameras(path, ply.gaussians, ply.valid, names, size, turned)
-    return cameras or alignment.estimate_from_rows(path, ply.gaussians, ply.valid)
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.photo_files import PhotoTransform, Size, resize_and_crop, resize_to
 
 
 @dataclass(frozen=True)
@@ -73,21 +47,27 @@ class GridFit:
 
     def cameras(self, camera_file: CameraFile, size: Size) -> CameraFile:
         """Return the cameras of the grid with its borders; their ``photo_map`` is the transform of photos of a size."""
-        (x, y), Ks, pixel_ids = self.trim, camera_file.Ks.copy(), camera_file.pixel_ids
+        (left, top), (width, height), Ks = self.trim, self.size, camera_file.Ks.copy()
+        assert camera_file.pixel_ids is not None, "estimated cameras are those of pixels"
         Ks[:, :2, 2] += self.trim
-        if pixel_ids is not None:
-            layout = alignment.dropped_layout(pixel_ids, len(camera_file), *self.size)
-            wider = alignment.move_layout(layout, self.size[0] + 2 * x, self.size[1] + 2 * y, x, y)
-            pixel_ids = wider.pixel_ids(len(pixel_ids))
-        widths, heights = camera_file.widths + 2 * x, camera_file.heights + 2 * y
+        widths, heights = camera_file.widths + 2 * left, camera_file.heights + 2 * top
+        lines, x = np.divmod(camera_file.pixel_ids, width)
+        views, y = np.divmod(lines, height)
+        pixel_ids = (views * (height + 2 * top) + y + top) * (width + 2 * left) + x + left
+        pixel_ids = np.where(lines >= 0, pixel_ids, -1)
         photo_map = size, self.transform(size)
         return replace(camera_file, Ks=Ks, widths=widths, heights=heights, pixel_ids=pixel_ids, photo_map=photo_map)
 
 
+def _da3_borders(side: int) -> list[int]:
+    """List the numbers of pixels that Depth Anything 3 may have cut off at both ends if ``side`` pixels are left."""
+    return [border for border in range(side) if int(8 / 256 * (side + 2 * border)) == border]
+
+
 def list_fits(size: Size) -> list[GridFit]:
     """List how models resize and crop photos to a grid of a size, simple fits first."""
-    trims = [(trim, trim) for trim in (0, *alignment.TRIMS)]
-    trims += product(alignment.da3_borders(size[0]), alignment.da3_borders(size[1]))
+    trims = [(trim, trim) for trim in (0, *TRIMS)]
+    trims += product(_da3_borders(size[0]), _da3_borders(size[1]))
     return [GridFit(size, crops, trim) for crops in (False, True) for trim in dict.fromkeys(trims)]
 
 
