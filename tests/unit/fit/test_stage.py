@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import scenes
 
 from gsmerge import Gaussians
-from gsmerge.fit import FitJob, FitOptions, FitReport, fit, stage
+from gsmerge.fit import FitJob, FitOptions, fit
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import place_outside_views, score_fog
