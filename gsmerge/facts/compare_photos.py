@@ -1,14 +1,13 @@
 """Scene -> the scene with photos that look like its Gaussians, without photos that do not show it.
 
-Photos with red and blue in the wrong order are corrected. So are photos with another tone (linear light, exposure or
-gamma), by a curve for each channel. Photos that do not show their views are left out. If a pixel of a photo still
-differs from the Gaussians of this pixel, at any depth, something covers the scene there. Then the Gaussians' colours
-are used instead.
+Photos with another tone (linear light, exposure or gamma) are corrected by a curve for each channel. Photos that do not
+show their views are left out, and all photos if they have another look, such as red and blue in the wrong order. If a
+pixel of a photo still differs from the Gaussians of this pixel, at any depth, something covers the scene there. Then
+the Gaussians' colours are used instead.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -30,7 +29,7 @@ from gsmerge.evidence.colors import (
 )
 from gsmerge.evidence.pictures import SIDE, Pairs, ViewPictures, pair_photos, show_views
 from gsmerge.evidence.rays import find_on_rays
-from gsmerge.evidence.scores import MARGIN, signed_ranks, stands_out
+from gsmerge.evidence.scores import stands_out
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.facts.views import camera_kinds
@@ -64,22 +63,18 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     if look != "auto" or not photo_views:
         return scene, tuple(photo_views) if look != "scene" else ()
     pairs = pair_photos(scene, scene.images)
-    is_bgr = find_orders(pairs, photo_views)
-    pairs = pairs.with_photos(np.where(is_bgr[:, None, None, None], pairs.photos[..., ::-1], pairs.photos))
-    images = [photo[..., ::-1] if swapped else photo for photo, swapped in zip(scene.images, is_bgr, strict=True)]
-    matching = find_matching_views(scene, photo_views, images, pairs.shown)
-    if _has_other_look(scene, pairs, matching or photo_views, images):
+    matching = find_matching_views(scene, photo_views, list(scene.images), pairs.shown)
+    if _has_other_look(scene, pairs, matching or photo_views):
         problem = "the scene has another look than its photos, so it keeps its own colours"
         note(f"{problem}; --set look=photos gives it the look of the photos")
         return scene, ()
     stray = [view for view in photo_views if view not in matching]
     if stray and not _leave_out(scene, stray, photo_views):
         return scene, ()
-    _note_orders(scene, is_bgr, matching)
     tones = find_tones(pairs, matching)
-    if pairs.shown.drawn and not have_other_tones(scene, images, matching):
+    if pairs.shown.drawn and not have_other_tones(scene, matching):
         tones = [None] * len(pairs)
-    changes = [PhotoChange(bool(swapped), curve) for swapped, curve in zip(is_bgr, tones, strict=True)]
+    changes = [PhotoChange(curve) for curve in tones]
     _note_tones(scene, changes, matching)
     hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
     if scene.has_own_pixels:
@@ -89,29 +84,6 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     if changed:
         choose(photos_changed=[scene.names[view] for view in changed])
     return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching)
-
-
-def find_orders(pairs: Pairs, views: Sequence[int]) -> np.ndarray:
-    """Find the photos ``[v]`` bool of some views in which red and blue are exchanged, whatever their tones are.
-
-    The evidence comes from stored colours and from colours after tone curves. A change of tone may mislead the
-    comparison of stored colours. Colours after tone curves say little about covered photos, because curves fit them in
-    either order.
-    """
-    swapped, is_bgr = pairs.with_photos(np.ascontiguousarray(pairs.photos[..., ::-1])), np.zeros(len(pairs), bool)
-    changes = [(cut_blocks(pairs), cut_blocks(swapped))]
-    differing = [[view] for view in views if is_visible(changes[0][0].errors([view]))]
-    if differing:  # otherwise the order is right
-        changes += [(tone_blocks(pairs, differing), tone_blocks(swapped, differing))]
-
-    def score(ids: Sequence[int]) -> float:
-        scores = [signed_ranks(before.errors(ids) - after.errors(ids)) for before, after in changes]
-        return sum(scores) / math.sqrt(len(scores))  # Stouffer's sum, in standard deviations
-
-    scores = {view: score([view]) for view in views}
-    if max(score(views), *scores.values()) > MARGIN:
-        is_bgr[[view for view in views if scores[view] > 0]] = True
-    return is_bgr
 
 
 def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
@@ -136,16 +108,16 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
     return curves if is_clear else [None] * len(pairs)
 
 
-def have_other_tones(scene: PicturedScene, photos: Sequence[np.ndarray], views: Sequence[int]) -> bool:
-    """Return whether the base colours of all Gaussians have another tone than the ``photos`` of some views.
+def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
+    """Return whether the base colours of all Gaussians have another tone than the photos of some views.
 
     If depth is wrong, wrong Gaussians in front may set the tone of a drawing. The base colours of all Gaussians come
     from the photos, even if other Gaussians hide them in drawings. So they show whether the tone really differs.
     """
     solid = np.flatnonzero(scene.gaussians.opacities > FAINT)
     step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
-    counting = [np.full(photo.shape[:2], True) for photo in photos] if scene.masks is None else scene.masks
-    levels = np.concatenate([photos[view][counting[view]][::step] for view in views])
+    counting = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
+    levels = np.concatenate([scene.images[view][counting[view]][::step] for view in views])
     if not (len(solid) and len(levels)):
         return True
     rows = solid[np.linspace(0, len(solid) - 1, len(levels)).astype(np.int64)]
@@ -190,7 +162,7 @@ def find_matching_views(
     return [view for view in views if kinds[view] in matching]
 
 
-def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int], photos: Sequence[np.ndarray]) -> bool:
+def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> bool:
     """Return whether a linear map, but no tone curve, explains the difference between photos and Gaussians.
 
     It may map photos to Gaussians, or Gaussians to photos, which are grey then. Photos of another scene are excluded:
@@ -201,9 +173,11 @@ def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int], ph
         blocks = cut_blocks(view_pairs)
         solid = blocks.solid
         matrix = fit_map(blocks.photos[solid], blocks.pictures[solid], np.ones(solid.sum()))
-        mapped = [map_colors(matrix, photo).clip(0, 1) for photo in photos]
+        mapped = [map_colors(matrix, photo).clip(0, 1) for photo in scene.images]
         return bool(find_matching_views(scene, views, mapped, pairs.shown))
-    return _is_mapped(view_pairs.exchange()) and bool(find_matching_views(scene, views, photos, pairs.shown))
+    return _is_mapped(view_pairs.exchange()) and bool(
+        find_matching_views(scene, views, list(scene.images), pairs.shown)
+    )
 
 
 def _is_mapped(pairs: Pairs) -> bool:
@@ -226,15 +200,6 @@ def _leave_out(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence
         result = f", so no photo is used: {listed}; check their names and order"
     note(f"{len(stray)} of {len(photo_views)} {STRAY_PHOTOS}{result}")
     return are_few
-
-
-def _note_orders(scene: PicturedScene, is_bgr: np.ndarray, views: Sequence[int]) -> None:
-    """Note in which of some photos red and blue are exchanged."""
-    names = [scene.names[view] for view in views if is_bgr[view]]
-    if len(names) == len(views):
-        note("red and blue are in the wrong order in the photos (BGR) and are exchanged")
-    elif names:
-        note(f"red and blue are in the wrong order in {len(names)} of {len(views)} photos: {list_some(names)}")
 
 
 def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Sequence[int]) -> None:
