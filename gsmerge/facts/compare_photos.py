@@ -1,14 +1,13 @@
 """Scene -> the scene with photos that look like its Gaussians, without photos that do not show it.
 
-Photos with red and blue in the wrong order are corrected. So are photos with another tone (linear light, exposure or
-gamma), by a curve for each channel. Photos that do not show their views are left out. If a pixel of a photo still
-differs from the Gaussians of this pixel, at any depth, something covers the scene there. Then the Gaussians' colours
-are used instead.
+Photos with another tone (linear light, exposure or gamma) are corrected by a curve for each channel. Photos that do not
+show their views are left out, and all photos if they have another look, such as red and blue in the wrong order. If a
+pixel of a photo still differs from the Gaussians of this pixel, at any depth, something covers the scene there. Then
+the Gaussians' colours are used instead.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -30,7 +29,7 @@ from gsmerge.evidence.colors import (
 )
 from gsmerge.evidence.pictures import SIDE, Pairs, ViewPictures, pair_photos, show_views
 from gsmerge.evidence.rays import find_on_rays
-from gsmerge.evidence.scores import MARGIN, signed_ranks, stands_out
+from gsmerge.evidence.scores import stands_out
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.facts.views import camera_kinds
@@ -49,6 +48,7 @@ WINDOW = np.full(5, 1 / 5, np.float32)
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
 MIDDLE_GREY = 128  # level of 255 at which notes report the change of tone
+MOSTLY = 0.5  # share of a photo that differs from its Gaussians, above which none of it counts
 LEAST_PERCENT = 1  # of a photo; no note says that less of it differs
 STRAY_PHOTOS = "photos do not show what the Gaussians show"  # part of the note on photos that are not used
 
@@ -64,23 +64,20 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     if look != "auto" or not photo_views:
         return scene, tuple(photo_views) if look != "scene" else ()
     pairs = pair_photos(scene, scene.images)
-    is_bgr = find_orders(pairs, photo_views)
-    pairs = pairs.with_photos(np.where(is_bgr[:, None, None, None], pairs.photos[..., ::-1], pairs.photos))
-    images = [photo[..., ::-1] if swapped else photo for photo, swapped in zip(scene.images, is_bgr, strict=True)]
-    matching = find_matching_views(scene, photo_views, images, pairs.shown)
-    if _has_other_look(scene, pairs, matching or photo_views, images):
+    matching = find_matching_views(scene, photo_views, list(scene.images), pairs.shown)
+    if _has_other_look(scene, pairs, matching or photo_views):
         problem = "the scene has another look than its photos, so it keeps its own colours"
         note(f"{problem}; --set look=photos gives it the look of the photos")
         return scene, ()
     stray = [view for view in photo_views if view not in matching]
     if stray and not _leave_out(scene, stray, photo_views):
         return scene, ()
-    _note_orders(scene, is_bgr, matching)
-    tones = find_tones(pairs, matching)
-    if pairs.shown.drawn and not have_other_tones(scene, images, matching):
-        tones = [None] * len(pairs)
-    changes = [PhotoChange(bool(swapped), curve) for swapped, curve in zip(is_bgr, tones, strict=True)]
-    _note_tones(scene, changes, matching)
+    tone = find_tone(scene, pairs, matching)
+    changes = [PhotoChange(tone if view in matching else None) for view in range(len(scene))]
+    if tone is not None:
+        factor = float(tone[:, MIDDLE_GREY].mean()) / (MIDDLE_GREY / 255)
+        cause = "another tone than their Gaussians (exposure, gamma or linear light)"
+        note(f"the photos have {cause}, which is corrected; middle grey times {factor:.2f}")
     hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
     if scene.has_own_pixels:
         hidden, pictures = _find_hidden(scene, changes)
@@ -91,75 +88,40 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching)
 
 
-def find_orders(pairs: Pairs, views: Sequence[int]) -> np.ndarray:
-    """Find the photos ``[v]`` bool of some views in which red and blue are exchanged, whatever their tones are.
+def find_tone(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> np.ndarray | None:
+    """Find the tone curve ``[3,256]`` from the photos of some views to their Gaussians; None if they have one tone.
 
-    The evidence comes from stored colours and from colours after tone curves. A change of tone may mislead the
-    comparison of stored colours. Colours after tone curves say little about covered photos, because curves fit them in
-    either order.
+    A curve that changes photos by less than a step does not count, because models have a tone of their own. A curve
+    also has to work in the other direction, from Gaussians to photos. Otherwise the cause is noise, which flattens the
+    colours of the Gaussians. Single photos of another tone differ from their Gaussians in most pixels, see
+    :func:`_find_hidden`.
     """
-    swapped, is_bgr = pairs.with_photos(np.ascontiguousarray(pairs.photos[..., ::-1])), np.zeros(len(pairs), bool)
-    changes = [(cut_blocks(pairs), cut_blocks(swapped))]
-    differing = [[view] for view in views if is_visible(changes[0][0].errors([view]))]
-    if differing:  # otherwise the order is right
-        changes += [(tone_blocks(pairs, differing), tone_blocks(swapped, differing))]
-
-    def score(ids: Sequence[int]) -> float:
-        scores = [signed_ranks(before.errors(ids) - after.errors(ids)) for before, after in changes]
-        return sum(scores) / math.sqrt(len(scores))  # Stouffer's sum, in standard deviations
-
-    scores = {view: score([view]) for view in views}
-    if max(score(views), *scores.values()) > MARGIN:
-        is_bgr[[view for view in views if scores[view] > 0]] = True
-    return is_bgr
+    pairs = pairs[views]
+    stored, toned, back = cut_blocks(pairs), tone_blocks(pairs), tone_blocks(pairs.exchange())
+    before = stored.errors()
+    is_tone = explains(before, toned.errors()) and stands_out(before - back.errors())
+    if not is_tone or np.nanmedian(stored.distances(toned.photos)) <= STEP or not have_other_tones(scene, views):
+        return None
+    colors, targets = (images.reshape(-1, 3) for images in (pairs.photos, pairs.shown.pictures))
+    return fit_tones(colors, targets, pairs.shown.weights.reshape(-1))
 
 
-def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
-    """Find the tone curves ``[3,256]`` from photos to their Gaussians; None for a photo with the right tone.
-
-    Drawings have one curve for all photos. If no photo changes by at least a step, no curve counts, because models have
-    a tone of their own. A curve also has to work in the other direction, from Gaussians to photos. Otherwise the cause
-    is noise, which flattens the colours of the Gaussians.
-    """
-    curves, is_clear = list[np.ndarray | None]([None] * len(pairs)), False
-    stored, groups = cut_blocks(pairs), _group(pairs, views)
-    groups = [group for group in groups if is_visible(stored.errors(group))]
-    toned, back = tone_blocks(pairs, groups), tone_blocks(pairs.exchange(), groups)
-    for group in groups:
-        before = stored.errors(group)
-        if explains(before, toned.errors(group)) and stands_out(before - back.errors(group)):
-            is_clear |= bool(np.nanmedian(stored.distances(toned.photos, group)) > STEP)
-            colors, targets = (images[group].reshape(-1, 3) for images in (pairs.photos, pairs.shown.pictures))
-            curve = fit_tones(colors, targets, pairs.shown.weights[group].reshape(-1))
-            for view in group:
-                curves[view] = curve
-    return curves if is_clear else [None] * len(pairs)
-
-
-def have_other_tones(scene: PicturedScene, photos: Sequence[np.ndarray], views: Sequence[int]) -> bool:
-    """Return whether the base colours of all Gaussians have another tone than the ``photos`` of some views.
+def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
+    """Return whether the base colours of all Gaussians have another tone than the photos of some views.
 
     If depth is wrong, wrong Gaussians in front may set the tone of a drawing. The base colours of all Gaussians come
     from the photos, even if other Gaussians hide them in drawings. So they show whether the tone really differs.
     """
     solid = np.flatnonzero(scene.gaussians.opacities > FAINT)
     step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
-    counting = [np.full(photo.shape[:2], True) for photo in photos] if scene.masks is None else scene.masks
-    levels = np.concatenate([photos[view][counting[view]][::step] for view in views])
+    counting = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
+    levels = np.concatenate([scene.images[view][counting[view]][::step] for view in views])
     if not (len(solid) and len(levels)):
         return True
     rows = solid[np.linspace(0, len(solid) - 1, len(levels)).astype(np.int64)]
     colors = sh0_to_rgb(scene.gaussians.sh0[rows, 0]).clip(0, 1)
     curve = fit_tones(levels, colors, np.ones(len(levels), np.float32))
     return bool(np.median(np.abs(map_tones(curve, levels) - levels).mean(1)) > STEP)
-
-
-def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
-    """Group the views by tone curve: one group if their pictures are drawings, because these show tones less exactly.
-
-    Otherwise each view is a group of its own.
-    """
-    return [list(views)] if pairs.shown.drawn else [[view] for view in views]
 
 
 def find_matching_views(
@@ -190,7 +152,7 @@ def find_matching_views(
     return [view for view in views if kinds[view] in matching]
 
 
-def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int], photos: Sequence[np.ndarray]) -> bool:
+def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> bool:
     """Return whether a linear map, but no tone curve, explains the difference between photos and Gaussians.
 
     It may map photos to Gaussians, or Gaussians to photos, which are grey then. Photos of another scene are excluded:
@@ -201,9 +163,11 @@ def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int], ph
         blocks = cut_blocks(view_pairs)
         solid = blocks.solid
         matrix = fit_map(blocks.photos[solid], blocks.pictures[solid], np.ones(solid.sum()))
-        mapped = [map_colors(matrix, photo).clip(0, 1) for photo in photos]
+        mapped = [map_colors(matrix, photo).clip(0, 1) for photo in scene.images]
         return bool(find_matching_views(scene, views, mapped, pairs.shown))
-    return _is_mapped(view_pairs.exchange()) and bool(find_matching_views(scene, views, photos, pairs.shown))
+    return _is_mapped(view_pairs.exchange()) and bool(
+        find_matching_views(scene, views, list(scene.images), pairs.shown)
+    )
 
 
 def _is_mapped(pairs: Pairs) -> bool:
@@ -211,7 +175,7 @@ def _is_mapped(pairs: Pairs) -> bool:
     stored = cut_blocks(pairs)
     if not is_visible(stored.errors()):
         return False
-    toned, mapped = tone_blocks(pairs, _group(pairs, range(len(pairs)))), map_blocks(stored)
+    toned, mapped = tone_blocks(pairs), map_blocks(stored)
     simpler = toned, plain_blocks(stored)
     return is_visible(toned.errors()) and all(explains(blocks.errors(), mapped.errors()) for blocks in simpler)
 
@@ -226,31 +190,6 @@ def _leave_out(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence
         result = f", so no photo is used: {listed}; check their names and order"
     note(f"{len(stray)} of {len(photo_views)} {STRAY_PHOTOS}{result}")
     return are_few
-
-
-def _note_orders(scene: PicturedScene, is_bgr: np.ndarray, views: Sequence[int]) -> None:
-    """Note in which of some photos red and blue are exchanged."""
-    names = [scene.names[view] for view in views if is_bgr[view]]
-    if len(names) == len(views):
-        note("red and blue are in the wrong order in the photos (BGR) and are exchanged")
-    elif names:
-        note(f"red and blue are in the wrong order in {len(names)} of {len(views)} photos: {list_some(names)}")
-
-
-def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Sequence[int]) -> None:
-    """Note by which factors the tones of photos change."""
-    toned = {view: changes[view].tones for view in views if changes[view].tones is not None}
-    if not toned:
-        return
-    factors = [
-        float(curve[:, MIDDLE_GREY].mean()) / (MIDDLE_GREY / 255) for curve in toned.values() if curve is not None
-    ]
-    low, high = min(factors), max(factors)
-    factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
-    note(
-        f"{len(toned)} of {len(views)} photos have another tone than their Gaussians (exposure, gamma or linear"
-        f" light), which is corrected; middle grey times {factor}: {list_some([scene.names[view] for view in toned])}"
-    )
 
 
 def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int]) -> None:
@@ -293,6 +232,7 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     known = shown & (scene.gaussians.opacities[pixels.fronts] > FAINT) & inside
     hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
     picture_rows(scene, differ_drawn, np.asarray((hidden | ~inside).any((1, 2))))
+    hidden[hidden.mean((1, 2)) > MOSTLY] = True  # the photo has another tone
     return hidden, pictures
 
 

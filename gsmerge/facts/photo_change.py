@@ -19,19 +19,16 @@ CLIPPED = 0.985  # a pixel may be clipped from this level on
 class PhotoChange:
     """Changes of one photo, in this order."""
 
-    reversed: bool = False  # Exchange red and blue
     tones: np.ndarray | None = None  # [3,256] float32, new value of each level of each channel
     cover: np.ndarray | None = None  # [h,w] bool, pixels that get `colors`
     colors: np.ndarray | None = None  # [h,w,3] sRGB in [0, 1]
 
     def __bool__(self) -> bool:
         """Return whether the photo changes at all."""
-        return self.reversed or self.tones is not None or self.cover is not None
+        return self.tones is not None or self.cover is not None
 
     def __call__(self, photo: np.ndarray) -> np.ndarray:
         """Change a photo ``[h,w,3]`` in [0, 1], at the size of the cover or a larger one; float32."""
-        if self.reversed:
-            photo = photo[..., ::-1]
         if self.tones is not None:
             photo = map_tones(self.tones, photo)
         if self.cover is not None and self.colors is not None:

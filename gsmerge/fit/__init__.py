@@ -1,4 +1,4 @@
-"""Gaussians -> fitted Gaussians: all parameters, or colours alone, against the input photos."""
+"""Gaussians -> fitted Gaussians: all parameters, against the input photos."""
 
 from gsmerge.fit.photo_sizes import fit_photos, photo_scale
 from gsmerge.fit.report import FitReport, Fitted, record_fit, report_steps

@@ -8,7 +8,6 @@ large errors.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,8 +16,8 @@ from gsmerge.fit.averages import RecentMean, TailMean
 from gsmerge.fit.edges import cut_state
 from gsmerge.fit.fit_state import FitState, gaussians_of, start_state
 from gsmerge.fit.growth import FAINT, drop_faint, grow_to
-from gsmerge.fit.report import TIME_SPENT, FitReport, FitResult
-from gsmerge.fit.schedule import CLEARS, CUTS, GROWTH, PROBE, FitRun, Schedule, affordable_steps
+from gsmerge.fit.report import FitReport, FitResult
+from gsmerge.fit.schedule import CLEARS, CUTS, GROWTH, FitRun, Schedule
 from gsmerge.fit.steps import Optimiser, make_optimiser
 from gsmerge.fit.survey import Survey, score_state, survey_photos
 from gsmerge.kernels.elementary import log
@@ -53,7 +52,6 @@ def fit_full(
             break
         renew_state(fit)
         take_step(fit)
-        keep_to_time(fit)
         report_step(fit)
     score_fit(fit)
     return end_fit(fit, gaussians)
@@ -68,13 +66,12 @@ class FullFit:
     schedule: Schedule
     state: FitState
     before: float  # PSNR (dB) of the held-out patches at the start
-    steps: int  # Steps to take; a time budget may change their number
+    steps: int  # Steps to take
     after: float | None = None  # PSNR (dB) of the held-out patches after the first steps; None: not scored
     step: int = 0  # Steps taken
     last: float = -1.0  # Progress at which the last step was taken; -1 before the first step
     error: RecentMean = field(default_factory=RecentMean)  # Mean squared error, which progress shows
     tail: TailMean = field(default_factory=TailMean)  # Parameters over the last steps
-    started: float = field(default_factory=time.perf_counter)  # Time of the start, seconds
 
     @property
     def progress(self) -> float:
@@ -147,12 +144,6 @@ def take_step(fit: FullFit) -> None:
         fit.tail.add(fit.state.x)
 
 
-def keep_to_time(fit: FullFit) -> None:
-    """Choose the number of steps by the time that the first ``PROBE`` steps took, if there is a time budget."""
-    if fit.run.job.options.time_budget is not None and fit.step == PROBE:
-        fit.steps = affordable_steps(time.perf_counter() - fit.started, fit.run)
-
-
 def report_step(fit: FullFit) -> None:
     """Report progress after a step."""
     if fit.run.job.progress:
@@ -161,17 +152,15 @@ def report_step(fit: FullFit) -> None:
 
 def end_fit(fit: FullFit, start: Gaussians) -> FitResult:
     """Return the result of a fit and a report; the result is the ``start`` if held-out patches got no better."""
-    options, after = fit.run.job.options, fit.before if fit.after is None else fit.after
+    after = fit.before if fit.after is None else fit.after
     if fit.is_refused:
         why = f"held-out patches of the photos were no better after {fit.step} steps"
         rows = np.arange(len(start))
         return start, FitReport("none", False, fit.step, fit.before, after, why, origins=rows)
     state = fit.state
-    if options.grows and fit.run.job.fixed is None and fit.last < GROWTH:  # a time budget may end before the growth
-        state = grow_to(state, fit.half, fit.run.job.count, most_growth=fit.run.job.most_growth)
-    why = TIME_SPENT if options.time_budget is not None else "all steps done"
     fitted, viewmats = gaussians_of(fit.tail.of(state.x), state.splats.shN), fit.optimiser.viewmats
-    return fitted, FitReport("full", True, fit.step, fit.before, after, why, viewmats, origins=state.origins)
+    report = FitReport("full", True, fit.step, fit.before, after, "all steps done", viewmats, origins=state.origins)
+    return fitted, report
 
 
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:

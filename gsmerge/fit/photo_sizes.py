@@ -19,6 +19,7 @@ from gsmerge.types import PicturedScene, Scene
 AUTO_SCALE = 2.0  # largest scale of "auto": a step takes time by its pixels, and larger photos are rarely sharp
 MIN_AUTO_SCALE = 1.25  # least scale that "auto" uses; below it photos have the size of the views
 ALIKE = 0.01  # share of a scale that rounding of sizes may change
+MAX_GAIN = 2.0  # largest exposure factor that scores compensate
 PATCH = 32  # side of a held-out patch, pixels, at most
 HIDDEN = np.float32(1e-9)  # weight of pixels that neither count nor are held out
 
@@ -164,16 +165,12 @@ def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.
 
 
 def exposure_gains(
-    images: Sequence[np.ndarray],
-    photos: np.ndarray,
-    weights: Sequence[np.ndarray],
-    min_gain: float,
-    max_gain: float = 2.0,
+    images: Sequence[np.ndarray], photos: np.ndarray, weights: Sequence[np.ndarray], min_gain: float
 ) -> np.ndarray:
     """Return factors ``[v,3]`` float32 from renders to the photos' exposure, with geometric mean one.
 
     They are least-squares solutions on the weighted pixels, for each view and channel. They are clipped to the range
-    from ``1 / max_gain`` to ``max_gain`` and then divided by their geometric mean, so they may leave this range. If all
+    from ``1 / MAX_GAIN`` to ``MAX_GAIN`` and then divided by their geometric mean, so they may leave this range. If all
     factors are between ``1 / min_gain`` and ``min_gain``, they are set to 1.
     """
 
@@ -182,7 +179,7 @@ def exposure_gains(
         with_photo, with_image = (
             (weight * picture * image).sum((0, 1), dtype=np.float64) for picture in (photos[view], image)
         )
-        return np.clip(with_photo / np.maximum(with_image, 1e-9), 1 / max_gain, max_gain)
+        return np.clip(with_photo / np.maximum(with_image, 1e-9), 1 / MAX_GAIN, MAX_GAIN)
 
     gains = np.stack(parallel_map(one_view, range(len(photos))))
     gains /= exp(log(gains).mean(0))

@@ -13,7 +13,6 @@ from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
 
 SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, in units of one on all: .3 to .6 on two captures
-TIME_SPENT = "time budget spent"  # why a fit ended
 HAZE = 0.05  # far fog above which a result gets a note, because it is plain to see in a viewer
 
 
@@ -21,9 +20,9 @@ HAZE = 0.05  # far fog above which a result gets a note, because it is plain to 
 class FitReport:
     """Facts about a fit and its scores."""
 
-    method: str  # `"none"`, `"color"` or `"full"`: the fit from which the result comes
+    method: str  # `"none"` or `"full"`: the fit from which the result comes
     accepted: bool  # Whether the held-out patches got better; if not, nothing was changed
-    steps: int  # Steps of the full fit, or conjugate-gradient steps
+    steps: int  # Steps of the full fit
     holdout_before: float  # PSNR (dB) on the held-out patches before the fit
     holdout_after: float  # The same after it
     stopped: str  # Why it ended
@@ -51,11 +50,9 @@ class Fitted:
     outside: Outside | None = None  # Views from outside that kept it clear of fog; None: none
 
 
-def record_fit(report: FitReport, planned: int) -> None:
-    """Add the report of a fit of so many ``planned`` steps to the current record."""
+def record_fit(report: FitReport) -> None:
+    """Add the report of a fit to the current record."""
     choose(fit=report.to_dict())
-    if report.stopped == TIME_SPENT and report.steps < planned:
-        note(f"time_budget ended the fit after {report.steps} of {planned} steps")
     if report.fog is not None and report.fog > HAZE:
         seen = f"seen from outside, the result shows haze where the scene is empty: far fog {report.fog:.2f}"
         note(f"{seen}; --fit none makes less, and is farther from the photos" if report.accepted else seen)

@@ -34,9 +34,6 @@ LONG_ROUNDS = 30
 LARGE_CYCLE = 5  # of this many steps, the steps LARGE_STEPS draw larger photos; more would worsen the views' own size
 LARGE_STEPS = (0, 2)
 HALF_CYCLE = 3  # with larger photos, one of this many half-size steps remains
-WHOLE_COST = 3  # most time of a step on a whole photo, in units of the time of one of the first steps
-PROBE = 6  # steps that are timed to keep to a time budget
-MAX_STEPS = 2000
 LONG_RUN = 300  # in longer runs the last step sizes shrink in proportion to the number of steps
 # Draw modes of steps, one after the other. A mode is 1 for half size or 0 for full size, the low-pass as a share of the
 # viewers' own low-pass, and whether small Gaussians are made fainter to offset the low-pass, as some viewers do. In a
@@ -173,8 +170,7 @@ def _can_sample(job: FitJob) -> bool:
     """
     photos, options = job.photos[0], job.options
     pixels = len(photos) * (photos.width // STRIDE) * (photos.height // STRIDE)
-    is_long = options.steps >= SAMPLED_STEPS and options.time_budget is None  # a time budget may allow few steps
-    return is_long and not options.move_cameras and max(1, job.count) <= pixels
+    return options.steps >= SAMPLED_STEPS and not options.move_cameras and max(1, job.count) <= pixels
 
 
 def _weights_of(photos: Photos) -> list[np.ndarray]:
@@ -254,17 +250,3 @@ def first_decay(rates: Tuning, rounds: float) -> float:
     four rounds. Early gradients change from step to step; later gradients differ most between views.
     """
     return min(rates.beta1, 1 - 1 / (2 + rounds / 4))
-
-
-def affordable_steps(seconds: float, run: FitRun) -> int:
-    """Return how many steps fit into the time budget, given the ``seconds`` of the first PROBE steps.
-
-    A step on a whole photo takes up to three times as long as one of the first steps. A step on a larger photo takes
-    longer in proportion to its pixels.
-    """
-    budget, early_share = run.job.options.time_budget, run.half_part
-    assert budget is not None
-    pixels = [photos.height * photos.width for photos in run.job.photos]
-    late_cost = WHOLE_COST * (1 - early_share) * (1 + max(pixels) / pixels[0]) / 2
-    mean_step = seconds / PROBE * (early_share + late_cost)
-    return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))

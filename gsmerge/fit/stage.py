@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.fit.edges import find_edges
-from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.full import fit_full
-from gsmerge.fit.growth import MOST_GROWTH, grow_to
+from gsmerge.fit.growth import MOST_GROWTH
 from gsmerge.fit.outside import place_outside_views, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
@@ -24,7 +23,6 @@ from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
 CLOSE = 1.0  # gain of the held-out patches, dB, below which whole photos are compared as well
-ALWAYS = float("inf")  # the same bound after the full fit failed, because its start may be the end of another fit
 START = 0.57  # share of the final number of Gaussians at the start of a run that grows
 
 
@@ -58,7 +56,7 @@ def fit_scene(
         gaussians, report = fit(decoded.gaussians, job)
         if scene.region is not None:  # Gaussians that grew last took no step since
             gaussians = replace(gaussians, means=clamp_inside(scene.region, gaussians.means).astype(np.float32))
-        record_fit(report, options.steps)
+        record_fit(report)
     cameras = scene.cameras
     if report.viewmats is not None:
         viewmats = cameras.viewmats.astype(np.float64)
@@ -68,10 +66,7 @@ def fit_scene(
 
 
 def fit(gaussians: Gaussians, job: FitJob) -> FitResult:
-    """Drop Gaussians that no photo shows, and fit the rest to the photos.
-
-    If the full fit does not improve held-out patches of the photos, colours alone are fitted.
-    """
+    """Drop Gaussians that no photo shows, and fit the rest to the photos."""
     fitted, report = _choose_fit(gaussians, job)
     if job.outside is not None:
         report = replace(report, fog=score_fog(make_splats(fitted), job.outside))
@@ -86,40 +81,20 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
     keep = survey.visible(options.min_contribution)
     start, rows = gaussians[keep], np.flatnonzero(keep)
     fixed = None if job.fixed is None else job.fixed[rows]
-    fitted, report = _better_of(scored, start, *fit_full(start, run, survey[keep], fixed), CLOSE)
-    if report.accepted:
-        assert report.origins is not None
-        return fitted, replace(report, origins=rows[report.origins])
-    if not options.scored:
+    fitted, report = _better_of(scored, start, *fit_full(start, run, survey[keep], fixed))
+    if not report.accepted:
         return start, replace(report, origins=rows)
-    if options.grows:  # the stages before left room for a growth that did not happen
-        state = grow_to(start_state(start), job.photos[1], job.count, most_growth=job.most_growth)
-        fitted, report = _fit_colors(gaussians_of(state.x, state.splats.shN), job)
-        if report.accepted:
-            fitted, report = _better_of(scored, start, fitted, report, ALWAYS)
-        if report.accepted:
-            return fitted, replace(report, origins=rows[state.origins])
-        return start, replace(report, origins=rows)
-    fitted, report = _fit_colors(gaussians, job)
-    fitted, report = _better_of(scored, start, fitted[keep], report, ALWAYS)
-    return fitted, replace(report, origins=rows)
+    assert report.origins is not None
+    return fitted, replace(report, origins=rows[report.origins])
 
 
-def _fit_colors(gaussians: Gaussians, job: FitJob) -> FitResult:
-    """Fit base colours alone to the half-size photos."""
-    from gsmerge.fit.color import draw, fit_colors  # few fits need it
-
-    half = job.photos[1]
-    return fit_colors(gaussians, draw(gaussians, half), half, job.options, job.seed)
-
-
-def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport, close: float) -> FitResult:
+def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport) -> FitResult:
     """Return the fitted Gaussians, or their start if whole photos got worse.
 
-    Photos are compared only if held-out patches gained less than ``close`` dB. If Gaussians are fitted already, a
+    Photos are compared only if held-out patches gained less than ``CLOSE`` dB. If Gaussians are fitted already, a
     further fit with steps of the default size only scatters them.
     """
-    if not report.accepted or report.holdout_after - report.holdout_before >= close:
+    if not report.accepted or report.holdout_after - report.holdout_before >= CLOSE:
         return after, report
     moved = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats[: len(photos)])
     if photo_error(after, moved) <= photo_error(before, photos):

@@ -63,13 +63,9 @@ class Tuning:
     # Share of the steps before the first outside view, 1 for none. Early in a run, Gaussians in gaps help
     # the other Gaussians
     outside_from: float = 0.15
-    iterations: int = 6  # Conjugate-gradient steps of the colour fit
-    prior_weight: float = 0.03  # Weight of the colours before the colour fit, relative to visibility
-    huber: float = 0.2  # Colour error beyond which a pixel counts less in the colour fit
-    # Least exposure of a view, as a factor on the mean, that the colour fit compensates; smaller
-    # differences come from holes and highlights as often as from the camera
+    # Least exposure of a view, as a factor on the mean, that scores compensate; smaller differences come from holes and
+    # highlights as often as from the camera
     min_gain: float = 1.15
-    max_gain: float = 2.0  # Largest exposure factor that is compensated
 
     def scaled(self, factor: float) -> Tuning:
         """Return the constants with the step sizes of Gaussians multiplied by ``factor``."""
@@ -85,9 +81,6 @@ class FitOptions(Settings):
         "it.")  # fmt: skip
     fit_steps: int | None = setting(None, "Number of steps of the full fit; each step draws one view.",
         "By default 320, scaled by `effort` and by the numbers of views and Gaussians.", least=1)  # fmt: skip
-    time_budget: float | None = setting(None, "Seconds after which the full fit stops.",
-        "With a limit the result is no longer the same on every machine. By default there is no limit.", above=0,
-        unit="seconds", in_trial=None)  # fmt: skip
     photo_scale: float | Literal["auto"] = setting("auto", "Photo scale, relative to the view size, for two of every "
         "five later steps; at most the scale of the photos that are given.",
         "`auto`: up to 2 with effort `default` and `best`.", least=1, below=math.inf, in_trial=1.0)  # fmt: skip

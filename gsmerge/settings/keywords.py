@@ -32,7 +32,6 @@ class CompactKeywords(TypedDict, total=False):
     min_opacity: float
     fit: Literal["full", "none"]
     fit_steps: int | None
-    time_budget: float | None
     photo_scale: float | Literal["auto"]
     dropout: float | None
     half_res_share: float | None

@@ -70,18 +70,6 @@ def test_full_fit_beats_the_merge_alone(
     floor(full - none)
 
 
-@pytest.mark.slow
-def test_hardly_any_time_costs_little(
-    compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
-) -> None:
-    """A few steps, whatever the machine; against the merge alone."""
-    result, actual = compacted(superpixels=256, time_budget=1e-3)
-    assert result.report.choices["fit"]["stopped"] == "time budget spent"
-    assert "time_budget ended the fit after 7 of 320 steps" in result.report.notes
-    assert len(result.gaussians) <= NUM_VIEWS * 256
-    floor(actual - compacted(superpixels=256, fit="none", checkpoint="none", seed=0)[1])
-
-
 def test_plain_merging_without_photos(
     compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:

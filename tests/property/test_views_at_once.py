@@ -10,10 +10,7 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Scene, compact
-from gsmerge.fit import FitOptions
-from gsmerge.fit.color import draw, fit_colors
 from gsmerge.pooling import scene_members
-from gsmerge.raster.photos import scene_photos
 
 
 @pytest.fixture(scope="module")
@@ -35,17 +32,6 @@ def test_one_view_at_a_time_or_all(scene: Scene, monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr("gsmerge.runtime.threads.AT_ONCE", at_once)
         actual.append(scenes.compacted(scene, **settings).gaussians)
     assert scenes.identical(*actual)
-
-
-def test_colours_are_fitted_one_view_at_a_time_or_all(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    gaussians, photos = scenes.plain(scene), scene_photos(scene, 2)
-    drawn, actual = draw(gaussians, photos), []
-    for at_once in (1, 2, 100):
-        monkeypatch.setattr("gsmerge.runtime.threads.AT_ONCE", at_once)
-        actual.append(fit_colors(gaussians, drawn, photos, FitOptions())[0].sh0)
-    assert not np.array_equal(actual[0], gaussians.sh0)
-    assert np.array_equal(actual[0], actual[1])
-    assert np.array_equal(actual[0], actual[2])
 
 
 def test_higher_harmonics_are_not_copied() -> None:

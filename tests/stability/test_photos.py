@@ -14,10 +14,8 @@ from sweeps import sweep
 
 from gsmerge import Compactor, CompactResult, Gaussians, Scene, compact, render
 from gsmerge.facts.prepare import PrepareOptions, prepare
-from gsmerge.facts.views import subset
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels import elementary
-from gsmerge.runtime.record import record_run
 
 Photos = np.ndarray
 Change = Callable[[Photos], Photos]
@@ -96,16 +94,11 @@ def gamma(photos: Photos) -> Photos:
     return photos ** np.float32(1.8)
 
 
-def bgr(photos: Photos) -> Photos:
-    return photos[..., ::-1].copy()
-
-
 CASES = [
-    (band, 0.5, ("3 of 6", "part")), (linear, 0.5, ("6 of 6", "tone")),
+    (band, 0.5, ("look", "own colours")), (linear, 0.5, ("photos", "tone")),
     (masked, 0.5, ("6 of 6", "part")), (bars, 0.5, ("6 of 6", "part")),
     (letterbox, 1.5, ("6 of 6",)),  # half of the rows are gone: 1.4 dB over five seeds
-    (half, 0.5, ("6 of 6", "tone")), (gamma, 0.5, ("6 of 6", "tone")),
-    (bgr, 0.1, ("red", "blue")),
+    (half, 0.5, ("photos", "tone")), (gamma, 0.5, ("photos", "tone")),
 ]  # fmt: skip
 
 
@@ -115,40 +108,15 @@ def test_photos_are_mended(room: Scene, usual: float, change: Change, loss: floa
     result = compact(changed, **FIT)
     assert noted(result.report.notes, *note)
     assert over_seeds(changed) > usual - loss
-    assert {"photos_changed", "photos_left_out"} & result.report.choices.keys()
 
 
-@sweep("change", [bgr, half, linear])
+@sweep("change", [half, linear])
 def test_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Change) -> None:
     unaligned = Scene(room.gaussians, room.cameras, room.images, None, room.names)
     right, mended = (compact(replace(unaligned, images=images), **FIT) for images in (room.images, change(room.images)))
     assert novel_psnr(mended.gaussians) > novel_psnr(right.gaussians) - 1
     assert "photos_changed" in mended.report.choices
     assert "photos_changed" not in right.report.choices
-
-
-@pytest.mark.parametrize("aligned", [True, False])
-@pytest.mark.parametrize("odd", [[1], [0, 2]], ids=str)
-def test_some_photos_in_another_order_of_channels(room: Scene, odd: list[int], aligned: bool) -> None:
-    """A curve for each channel would bend them into something between."""
-    three = subset(room, range(3))
-    images = three.images.copy()
-    images[odd] = images[odd, ..., ::-1]
-    scene = replace(three, images=images, pixels=three.pixels if aligned else None)
-    with record_run() as record:
-        mended = prepare(scene).scene.images
-    np.testing.assert_array_equal(mended, three.images)
-    assert record.choices["photos_changed"] == [room.names[view] for view in odd]
-    assert noted(record.notes, "red", "blue", *(room.names[view] for view in odd))
-
-
-@sweep("aligned", [True, False])
-def test_a_photo_of_another_white_balance_keeps_its_channels(room: Scene, aligned: bool) -> None:
-    images = room.images.copy()
-    images[1] = (images[1] * np.float32([0.5, 1, 1.6])).clip(0, 1)
-    with record_run() as record:
-        prepare(replace(room, images=images, pixels=room.pixels if aligned else None))
-    assert not noted(record.notes, "red", "blue")
 
 
 def test_sound_photos_stay_as_they_are(room: Scene, sound: CompactResult) -> None:

@@ -59,8 +59,8 @@ def test_every_setting_is_documented(stage: str) -> None:
     [
         {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"superpixels": "0%"}, {"superpixels": "150%"},
         {"segmentation": "voronoi"}, {"effort": "slow"}, {"match": "iou"}, {"fit": "everything"},
-        {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"time_budget": 0.0}, {"holdout": 2.0},
-        {"time_budget": -1.0}, {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0},
+        {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"holdout": 2.0},
+        {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0},
         {"min_opacity": -1.0}, {"overlap": float("nan")}, {"compactness": 2.0}, {"iou": 1.1}, {"similarity": -1.1},
         {"blocks": 0}, {"blocks": "some"}, {"blocks": True},
     ],

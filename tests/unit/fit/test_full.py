@@ -14,17 +14,7 @@ from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full, limit_moves
 from gsmerge.fit.photo_sizes import training_weights
 from gsmerge.fit.report import SAMPLE_COST
-from gsmerge.fit.schedule import (
-    DROPOUT,
-    MAX_STEPS,
-    PROBE,
-    DrawMode,
-    Schedule,
-    Step,
-    affordable_steps,
-    prepare_fit,
-    step_sizes,
-)
+from gsmerge.fit.schedule import DROPOUT, DrawMode, Schedule, Step, prepare_fit, step_sizes
 from gsmerge.fit.steps import Optimiser, make_optimiser
 from gsmerge.fit.survey import score_state, survey_photos
 from gsmerge.kernels import elementary
@@ -301,36 +291,6 @@ def test_unseen_ones_stay_as_they_are(degree: int) -> None:
     assert report.accepted
     for name in scenes.FIELDS:
         np.testing.assert_allclose(getattr(result, name)[-4:], getattr(behind, name), rtol=1e-5, atol=1e-6)
-
-
-# views, harmonics
-
-
-# time
-
-
-def test_time_budget_ends_the_run(truth: Gaussians, photos: Pair) -> None:
-    """Hardly any: a few steps, and still judged."""
-    result, report = fit_full(scenes.spoil(truth), scenes.run_for(photos, replace(LONG, time_budget=1e-6)))
-    assert PROBE < report.steps <= PROBE + 1
-    assert report.accepted == (report.holdout_after > report.holdout_before)
-    if report.accepted:
-        assert report.stopped == "time budget spent"
-        assert len(result) == len(truth)
-
-
-def test_steps_follow_the_time_budget(photos: Pair) -> None:
-    def steps(budget: float, seconds: float) -> int:
-        return affordable_steps(seconds, prepare_fit(FitJob(photos, replace(LONG, time_budget=budget))))
-
-    probe, most = PROBE, MAX_STEPS
-    assert steps(1e-9, 1.0) == probe + 1
-    assert steps(1e9, 1.0) == most
-    actual = [steps(budget, 0.06) for budget in (0.5, 1, 2, 4)]
-    assert actual == sorted(actual)
-    assert actual[0] > probe + 1
-    # a step of 10 ms on a quarter of the pixels: 0.7 of the steps at that, the rest at three times it
-    assert steps(1.0, 0.06) == pytest.approx(probe + (1.0 - 0.06) / (0.01 * (0.7 + 3 * 0.3)), abs=1)
 
 
 # rates, report, progress

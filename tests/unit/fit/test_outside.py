@@ -168,5 +168,5 @@ def test_a_note_says_where_fog_is_left(truth: Gaussians, photos: Pair) -> None:
     _, report = fit(scenes.spoil(truth), FitJob(photos, OPTIONS))
     for fog, count in ((HAZE, 0), (HAZE + 0.01, 1), (None, 0)):
         with record_run(None) as record:
-            record_fit(replace(report, fog=fog), report.steps)
+            record_fit(replace(report, fog=fog))
         assert sum("haze" in note for note in record.notes) == count

@@ -16,7 +16,7 @@ from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions, fit, fit_photos
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale, training_weights
-from gsmerge.fit.schedule import DrawMode, affordable_steps, prepare_fit
+from gsmerge.fit.schedule import DrawMode, prepare_fit
 from gsmerge.geometry import project
 from gsmerge.raster.photos import EPS2D, MASKED, scene_photos, score_photos
 from gsmerge.runtime.record import record_run
@@ -171,17 +171,6 @@ def test_the_users_share_of_half_size_steps_stays(scene: Scene) -> None:
 def test_large_photos_count_in_every_pixel(scene: Scene) -> None:
     run = prepare_fit(FitJob(fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2)), LONG))
     assert all((weight == 1).all() for weight in run.step_weights[2])
-
-
-def test_time_budget_counts_larger_photos(scene: Scene) -> None:
-    options = replace(LONG, time_budget=1.0)
-    steps = [
-        affordable_steps(
-            0.06, prepare_fit(FitJob(fit_photos(with_large(scene, s), replace(options, photo_scale=s)), o))
-        )
-        for s, o in ((1, replace(options, half_res_share=0.6)), (2, options), (3, options))
-    ]
-    assert steps[0] > steps[1] > steps[2]
 
 
 def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> None:

@@ -17,7 +17,7 @@ def test_lists_are_those_of_the_declarations() -> None:
 def test_a_part_leaves_to_the_whole_what_the_whole_decides() -> None:
     """A block or a batch, and a trial, which also leaves out what only the result has."""
     part = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "new_views": False}
-    only = {"budget": None, "quality": None, "levels": 1, "crop": None, "drop": None, "time_budget": None}
+    only = {"budget": None, "quality": None, "levels": 1, "crop": None, "drop": None}
     assert piece_settings(CompactOptions) == part
     trial = part | only | {"photo_scale": 1.0, "recipe": None}
     assert piece_settings(CompactOptions, trial=True) == trial
