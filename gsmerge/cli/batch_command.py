@@ -10,8 +10,6 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import (
     RunEnd,
@@ -39,7 +37,7 @@ def parse_jobs(text: str) -> int:
     if text == "auto":
         return 0
     if not text.isdecimal() or int(text) < 1:
-        raise typer.BadParameter(f'expected a number from 1 or "auto", got {text!r}')
+        raise ValueError(f'expected a number from 1 or "auto", got {text!r}')
     return int(text)
 
 

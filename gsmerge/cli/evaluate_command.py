@@ -30,14 +30,13 @@ class MeasuringOptions(Settings):
     """Settings of the command besides those of :func:`gsmerge.evaluate`."""
 
     views: int | None = setting(None, "Number of input views to use as the context, at equal intervals; the "
-        "held-out views midway between them are the targets.", least=1, shown="all")  # fmt: skip
+        "held-out views midway between them are the targets.", least=1)  # fmt: skip
     masks: str | None = setting(None, "Folder of masks with the names of the photos, dark where a photo does not "
-        "count.",
-        shown="masks beside the photos")  # fmt: skip
+        "count.")  # fmt: skip
     speed: bool = setting(False, "Also measure the render time, at the sizes of `zoom` or at 1 and 2, and the "
         "Gaussians per pixel.")  # fmt: skip
     merge_seconds: tuple[float | str, ...] = setting((), "Seconds that it took to make each AFTER, or the JSON report "
-        "of its run; gives the number of frames after which this time is saved.", metavar="LIST")  # fmt: skip
+        "of its run; gives the number of frames after which this time is saved.")  # fmt: skip
 
 
 @opt.command(

@@ -37,8 +37,7 @@ from gsmerge.runtime.record import Record, add_seconds, begin_part, choose, expe
 from gsmerge.runtime.time_left import Part
 from gsmerge.runtime.work import start_work
 from gsmerge.settings.budget import parse_share, share_text
-from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.setting import piece_settings
+from gsmerge.settings.compact import PIECE, CompactOptions
 from gsmerge.settings.stages import AUTO_SHARE
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.stages.prune import split_unseen
@@ -230,7 +229,7 @@ def block_options(
     quarter of the pixels, so each view is fitted as often as in one piece. ``limit`` is the number of Gaussians of all
     blocks together; None: ``superpixels`` and K decide.
     """
-    settings: dict[str, Any] = {**piece_settings(CompactOptions), "budget": None}
+    settings: dict[str, Any] = {**PIECE, "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import Any
 from weakref import ReferenceType, ref
 
 import numpy as np
@@ -51,11 +51,6 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians, Scene, StrPath
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from gsmerge.settings.keywords import CompactKeywords
-
 # The requested count has to remain after clean-up. So the scene is built with SURPLUS times this count, at most
 # MAX_BUILDS times
 MAX_BUILDS, SURPLUS = 3, 1.05
@@ -63,11 +58,7 @@ MAX_BUILDS, SURPLUS = 3, 1.05
 
 @check_arguments
 def compact(
-    scene: Scene | StrPath,
-    options: CompactOptions | None = None,
-    *,
-    progress: Progress | None = None,
-    **settings: Unpack[CompactKeywords],
+    scene: Scene | StrPath, options: CompactOptions | None = None, *, progress: Progress | None = None, **settings: Any
 ) -> CompactResult:
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
 

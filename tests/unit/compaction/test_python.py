@@ -81,7 +81,7 @@ def test_a_notebook_shows_before_and_after(result: gsmerge.CompactResult) -> Non
     [
         ({"budgte": 60}, ValueError, "perhaps budget"),
         ({"nothing": 60}, ValueError, "known: "),
-        ({"k": "2"}, ValueError, "perhaps 2 without quotes"),
+        ({"k": "2"}, ValueError, "got '2'"),
     ],
 )
 def test_wrong_settings_say_what_is_meant(
