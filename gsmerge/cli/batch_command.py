@@ -172,8 +172,10 @@ def run_jobs(
             share = done / total if total > 0 else 1.0
             report = record["report"] or record  # a result that was done before has a record of its doubts alone
             worse = report.get("worse")
-            notes = report.get("notes", [doubt for doubt in (worse, report.get("left_out")) if doubt])
-            progress(RunEnd(record[name], record["status"], num_ended, failure, num_failed, share, worse, notes))
+            doubts = report.get("doubts", [doubt for doubt in (worse, report.get("left_out")) if doubt])
+            notes = report.get("notes", doubts)
+            end = record[name], record["status"], num_ended, failure, num_failed, share, worse, notes, doubts
+            progress(RunEnd(*end))
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
@@ -198,7 +200,6 @@ class Totals:
     num_output: int = 0  # Gaussians in their results
     unmet: int = 0  # results that miss their target
     rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results
-    unused: list[tuple[str, str]] = field(default_factory=list)  # scene, and its columns that are not used
     worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
     left_out: list[tuple[str, str]] = field(default_factory=list)  # scene, and a note on files of another scene
     lacking: list[tuple[str, str]] = field(default_factory=list)  # scene, and the cameras or photos that it lacks
@@ -206,8 +207,6 @@ class Totals:
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Count the record of one scene."""
-        from gsmerge.io.formats.columns import UNUSED
-
         self.counts[record["status"]] += 1
         report = record["report"]
         worse = report["worse"] if report else record.get("worse")
@@ -221,8 +220,6 @@ class Totals:
         if record["error"] is not None:
             self.failed.append((record["scene"], record["error"]))
         if report:
-            unused = [note for note in report["notes"] if note.startswith(UNUSED)]
-            self.unused += [(record["scene"], note.removeprefix(UNUSED)) for note in unused]
             self.num_input += report["input"]["num_gaussians"]
             self.num_output += report["output"]["num_gaussians"]
             self.unmet += bool(report["unmet"])
@@ -232,7 +229,6 @@ class Totals:
     def lines(self, columns: int | None = None) -> list[str]:
         """Format the end of a run: a table, ``columns`` wide, of the results, notes, failures, and a line of totals."""
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
-        from gsmerge.io.formats.columns import UNUSED
         from gsmerge.io.image_names import natural_key
         from gsmerge.report import text_table
         from gsmerge.runtime.memory import human_share
@@ -243,13 +239,7 @@ class Totals:
         lines = text_table(rows, columns=columns, least=omitted_first) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
-        kinds = (
-            (UNUSED[:-2], self.unused),
-            ("worse", self.worse),
-            ("note", self.left_out),
-            ("note", self.lacking),
-            (FAILED, self.failed),
-        )
+        kinds = (("worse", self.worse), ("note", self.left_out), ("note", self.lacking), (FAILED, self.failed))
         for status, reasons in kinds:
             grouped = _list_reasons(reasons)
             lines += [f"{status}: {line}" for line in grouped[:MAX_LISTED]]

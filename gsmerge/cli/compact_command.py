@@ -176,7 +176,8 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     from gsmerge.io.formats.table import VIEWED, find_format
 
     doubts = [document["worse"], document["input"]["left_out"] if args.strict else None]
-    say_notes([note for note in document["notes"] if note not in doubts], quiet=args.silent)
+    notes = [note for note in document["notes"] if note not in doubts]
+    say_notes(notes, document["doubts"], quiet=args.silent)
     lines = [summary_line(document), *level_lines(document), *curve_lines(document)]
     if sys.stdout.isatty():
         words = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []

@@ -8,7 +8,7 @@ import shutil
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -103,15 +103,10 @@ def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
         print("\n".join(wrap_line(text, terminal_columns(sys.stderr))), file=sys.stderr, flush=True)
 
 
-def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
-    """Print each note on stderr unless ``quiet``.
-
-    A note that a result is worse than the input, or that held-out views may show another scene, becomes a warning.
-    """
-    from gsmerge.raster.metrics import OTHER_SCENE, WORSE
-
+def say_notes(notes: Sequence[str], doubts: Collection[str] = (), *, quiet: bool = False) -> None:
+    """Print each note on stderr unless ``quiet``; those that are ``doubts`` become warnings."""
     for note in notes:
-        if WORSE in note or OTHER_SCENE in note:
+        if note in doubts:
             say_warning(note, quiet=quiet)
         else:
             say(note, kind="note", quiet=quiet)
@@ -304,6 +299,7 @@ class RunEnd(NamedTuple):
     share: float  # Part of the work done so far, 0 to 1
     worse: str | None = None  # The note that the result is worse than its input, one of ``notes``
     notes: Sequence[str] = ()  # Printed only as JSON
+    doubts: Collection[str] = ()  # Those of the notes that are warnings
 
     @property
     def text(self) -> str:
@@ -329,7 +325,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
         def print_event(end: RunEnd) -> None:
             seconds, share = time.monotonic() - start, end.share
             for note in end.notes:
-                say(f"{end.name}: {note}", kind="warning" if note == end.worse else "note")
+                say(f"{end.name}: {note}", kind="warning" if note in end.doubts else "note")
             stream.move(share, seconds * (1 - share) / share if share > 0 else None)
             event = {"scene": end.name, "status": end.status, "done": end.done, "total": total}
             stream.print({**event, "failed": end.num_failed, "worse": end.worse, "error": end.failure or None})

@@ -100,7 +100,7 @@ def evaluate(args: opt.Args) -> None:
         document["maps"] = [str(path) for path in _write_maps(args.maps, pair, context=options.context)]
         lines.append(f"maps: {len(document['maps'])} pictures in {args.maps}")
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
-    say_notes(evaluation.notes, quiet=args.silent)
+    say_notes(evaluation.notes, evaluation.doubts, quiet=args.silent)
 
 
 def _check_files(args: opt.Args, outputs: Sequence[Path], measuring: MeasuringOptions, inputs: Sequence[Path]) -> None:

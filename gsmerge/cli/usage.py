@@ -45,10 +45,15 @@ class _OneLine:
     """Mixin of commands and groups whose wrong usage is explained in one line."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words after a command's name; UsageError for the name of an option with one dash."""
+        """Parse the words after a command's name; UsageError for an option with one dash, or given again."""
         params = self.get_params(ctx)  # type: ignore[attr-defined]
         names = {name for param in params for name in param.opts}
-        for word in args[: args.index("--") if "--" in args else None]:
+        words = args[: args.index("--") if "--" in args else None]
+        typed = [word.partition("=")[0] for word in words]
+        for param in params:
+            if not (param.multiple or getattr(param, "is_flag", True)) and sum(map(typed.count, param.opts)) > 1:
+                raise UsageError(f"{param.opts[0]}: expected it once, got it again")
+        for word in words:
             if re.match("-[^-]", word) and f"-{word.partition('=')[0]}" in names:
                 raise UsageError(f"{word}: expected two dashes, -{word}")
         if isinstance(self, TyperGroup) or hasattr(self.callback, "kinds"):  # type: ignore[attr-defined]

@@ -33,7 +33,7 @@ from gsmerge.plan import WHOLE_GAUSSIANS, SceneChoices
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages
-from gsmerge.runtime.record import Record, add_seconds, begin_part, choose, expect_parts, note, stage
+from gsmerge.runtime.record import Record, add_seconds, begin_part, choose, current_record, expect_parts, note, stage
 from gsmerge.runtime.time_left import Part
 from gsmerge.runtime.work import start_work
 from gsmerge.settings.budget import parse_share, share_text
@@ -140,8 +140,10 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
     """Yield each value with the choices of its record; add the seconds and notes to the current record."""
     for value, record in outcomes:
         add_seconds(record.seconds)
-        for text in record.notes:
-            note(text)
+        for entry in record.entries:
+            note(entry.text, doubt=entry.doubt)
+        if stray := record.choices.get("photos_left_out"):
+            choose(photos_left_out=[*current_record().choices.get("photos_left_out", ()), *stray])
         yield value, record.choices
 
 

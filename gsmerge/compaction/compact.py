@@ -113,9 +113,7 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
 
 def _warn_of_doubts(report: CompactReport) -> None:
     """Warn the caller of :func:`compact` of everything that makes the result doubtful."""
-    agreement = report.choices.get("agreement") or {}
-    doubts = [report.worse, report.unmet, *(text for text in report.notes if text == agreement.get("doubt"))]
-    for text in dict.fromkeys(filter(None, doubts)):
+    for text in filter(None, [*report.doubts, report.unmet]):
         warnings.warn(text, DoubtWarning, stacklevel=4)  # the caller: above this function, compact and its decorator
 
 

@@ -26,7 +26,7 @@ from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents, find_format
 from gsmerge.io.formats.write import output_notes
 from gsmerge.runtime.memory import release_memory
-from gsmerge.runtime.record import Progress, record_part
+from gsmerge.runtime.record import Progress, list_some, record_part
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, result_cameras, scene_title
 from gsmerge.scene.read import Loaded, load_files
@@ -34,6 +34,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.clean import BOX_QUANTILES
 from gsmerge.types import Scene
+from gsmerge.words import count_words
 
 # Sum of opacity times area of a scene's Gaussians, for each view, as a share of the squared diagonal of their box. If
 # merging leaves only Gaussians that are too transparent to be kept, the sum is at most a tenth of this bound
@@ -104,8 +105,9 @@ def compact_files(
         written = format_.write(add, out, temporary, contents)
         if cameras_path is not None:
             add_views(add, cameras_path, cameras, names, overwrite=outputs.overwrite)
-        left_out = [load.left_out, *(note for note in result.report.notes if STRAY_PHOTOS in note)]
-        recognised = load.recognised | {"left_out": "; ".join(filter(None, left_out)) or None}
+        stray = result.report.choices.get("photos_left_out", ())
+        problem = f"{count_words(len(stray), 'photo')} {STRAY_PHOTOS}: {list_some(stray)}" if stray else None
+        recognised = load.recognised | {"left_out": "; ".join(filter(None, (load.left_out, problem))) or None}
         document = report_document(
             result.report, input_paths=files.plys, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},

@@ -73,6 +73,7 @@ class CompactReport:
             ``fidelity`` has the ``psnr`` (dB) against renders of the input and the number of ``views`` for it; these
             are ``held_out`` if they were placed because the scene has no cameras.
         notes: Warnings about the input and adaptations to it, one sentence each.
+        doubts: Those of the notes that make the result doubtful.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how near the result came; None if it is met.
@@ -107,6 +108,7 @@ class CompactReport:
     new_views: NewViews | None = None
     photo_files: PhotoFiles | None = None
     protected: Covered | None = None
+    doubts: Sequence[str] = ()
 
     def __repr__(self) -> str:
         return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"
@@ -207,6 +209,7 @@ def report_document(
         "psnr_protected": numbers["protected"],
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
+        "doubts": list(report.doubts),
         "unmet": numbers["unmet"],
         "worse": next((entry.worse for entry in (report, *(level for _, level in coarser)) if entry.worse), None),
     }

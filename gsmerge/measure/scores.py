@@ -55,6 +55,7 @@ def evaluation_document(
         "num_views": dict(evaluation.num_views),
         "results": [_result(result, evaluation, facts.get(result.name, {})) for result in evaluation.results],
         "notes": [*notes, *evaluation.notes],
+        "doubts": list(evaluation.doubts),
     }
 
 

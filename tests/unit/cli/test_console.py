@@ -22,7 +22,6 @@ from gsmerge.cli.console import (
     stage_progress,
     total_progress,
 )
-from gsmerge.raster.metrics import WORSE
 
 
 class Terminal(io.StringIO):
@@ -127,8 +126,8 @@ def test_runs_as_events_have_their_names_whole(capsys: pytest.CaptureFixture[str
 
 def test_a_run_that_is_worse_than_its_input_is_marked(capsys: pytest.CaptureFixture[str]) -> None:
     """Lines of JSON have all notes, and a warning even if the command is quiet."""
-    worse = f"the result shows its own photos {WORSE}: 20.00 dB, 30.00 dB before"
-    run = "room", "done", 1, "", 0, 1.0, worse, ["no masks", worse]
+    worse = "the result shows its own photos worse than the input does: 20.00 dB, 30.00 dB before"
+    run = "room", "done", 1, "", 0, 1.0, worse, ["no masks", worse], [worse]
     with total_progress(1, quiet=False) as progress:
         progress(RunEnd(*run))
     assert capsys.readouterr().err == "1/1 room done, worse than the input\n"

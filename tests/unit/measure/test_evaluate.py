@@ -109,8 +109,8 @@ def test_what_is_counted(actual: Evaluation, scene: Scene, half: Gaussians) -> N
 def test_held_out_views_of_another_scene_are_a_warning(scene: Scene, capsys: pytest.CaptureFixture[str]) -> None:
     views = held_out()
     away = replace(views.cameras, viewmats=np.diag([-1.0, 1, -1, 1]) @ views.cameras.viewmats)  # turned about
-    (note,) = evaluate(scene, {}, replace(views, cameras=away), PLAIN).notes
-    say_notes([note])
+    evaluation = evaluate(scene, {}, replace(views, cameras=away), PLAIN)
+    say_notes(evaluation.notes, evaluation.doubts)
     assert capsys.readouterr().err.startswith("gsmerge: warning: the input views have seen only 0 %")
 
 
@@ -188,7 +188,7 @@ def test_bad_arguments(scene: Scene, half: Gaussians, actual: Evaluation) -> Non
         (lambda: EvaluateOptions(photo_side=476.5), "photo_side", 476.5),  # type: ignore[arg-type]
         (lambda: evaluate(scene, {INPUT: half}, None, PLAIN), "results", "'input'"),
         (lambda: evaluate(empty, {}, None, PLAIN), "", "views", "none"),
-        (lambda: EvaluateOptions(lpips="vgg"), "lpips", "'vgg'", "('vgg',)"),  # type: ignore[arg-type]
+        (lambda: EvaluateOptions(lpips="vgg"), "lpips", "'vgg'"),  # type: ignore[arg-type]
         (lambda: actual.results[1].mean("input"), "split", "context", "target", "'input'"),
         (lambda: actual.results[1].mean_covered("x"), "split", "'x'"),
         (lambda: actual.results[1].mean("target", zoom=3), "zoom", "None", 3),
