@@ -11,15 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import (
-    RunEnd,
-    print_document,
-    say,
-    say_warning,
-    separate_stdout,
-    terminal_columns,
-    total_progress,
-)
+from gsmerge.cli.console import RunEnd, print_document, say, separate_stdout, terminal_columns, total_progress
 from gsmerge.errors import BatchError, TargetError, UsageError
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import Engine
@@ -130,7 +122,7 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
         worse = f"{len(totals.worse)} of {totals.total} results show their photos worse than the input"
         worse += _first_reason(totals.worse, listed=not args.silent)
     if worse and not args.strict:
-        say_warning(worse, quiet=args.silent)
+        say(worse, kind="warning", quiet=args.silent)
     check_failures(totals.failed, len(jobs), "scenes", listed=not args.silent)
     if totals.unmet:
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")

@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
 
 import typer
 
-from gsmerge.cli.console import opening_line
 from gsmerge.errors import UsageError
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.budget import parse_share
@@ -322,11 +321,10 @@ def command(*parameters: str | Declared) -> Callable[[Callable[[Args], None]], C
         @wraps(function)
         def run(**typed: Any) -> None:
             args = Args(**{name: listed[name].read(value, flags) for name, value in typed.items()})
-            with opening_line(quiet=args.silent):
-                from gsmerge.runtime.memory import keep_memory
+            from gsmerge.runtime.memory import keep_memory
 
-                keep_memory()
-                function(args)
+            keep_memory()
+            function(args)
 
         run.__signature__ = Signature([declared.parameter for declared in listed.values()])  # type: ignore[attr-defined]
         run.__annotations__ = {}

@@ -31,9 +31,9 @@ def test_compact_writes_beside_the_input_and_says_what_it_did(smallest_copy: Pat
     assert 0 < count <= 3 * 200 * 2
     line = outcome.out
     assert line.count("\n") == 1
-    assert f"1,152 -> {count:,} Gaussians" in line
+    assert f"Gaussians 1,152 -> {count:,} (" in line
     assert "dB" in line
-    assert re.search(r"dB; \d+\.\d s;", line)  # the time of each stage is in the report
+    assert re.search(r"; time \d+\.\d s \(", line)  # the time of each stage is in the report
 
 
 def test_json_report(smallest_copy: Path, run: Run) -> None:
