@@ -6,7 +6,6 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.io import file_notes
@@ -130,8 +129,6 @@ def _read(path: Path) -> FileCheck:
 def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileCheck:
     """Read the Gaussians of a scene, with the cameras and photos that belong to them."""
     load = load_files(find_scene_files(path), opacity=opacity, hints=hints)
-    if shows_nothing(load.scene):
-        raise nothing_left(load.files.ply)
     info, views = load.info, load.views
     notes, num_photos = (*load.notes, *degree_notes(info)), 0 if views.images is None else len(views.images)
     return FileCheck(

@@ -124,8 +124,6 @@ USAGE = {
     "evaluate room --lpips none --target-images room/images": "--target-images*--targets",
     "evaluate room --lpips none -o room/scene.ply": "room/scene.ply*.json, .csv, .md or .html",
     "evaluate room --lpips none -o room/transforms.json": "room/transforms.json*input",
-    "evaluate room --lpips none --set merge_seconds=1": "merge_seconds*0 AFTER*1",
-    "evaluate room alone.ply --lpips none --set merge_seconds=run.json -o run.json": "run.json*input",
     "evaluate room alone.ply --lpips none -o run.json": "run.json*exists already",
     "evaluate room --lpips none --set zoom=a,2": "--set zoom*0.0625 to 16*'a,2'",
     "evaluate room --lpips none --set photo_side=-1": "--set photo_side*0",
@@ -172,8 +170,6 @@ PLACES = {
     "render room --path room/scene.ply -o a.mp4": "room/scene.ply*cameras inside",
     "evaluate room --lpips none --targets nowhere.json": "nowhere.json*cameras*no such file",
     "evaluate room --lpips none --targets room/transforms.json": "room/transforms.json*held-out views*was made from",
-    "evaluate room alone.ply --lpips none --set merge_seconds=room/transforms.json": "room/transforms.json*report",
-    "evaluate room alone.ply --lpips none --set merge_seconds=alone.ply": "alone.ply*text*'utf-8'",
     "evaluate alone.ply --hint order=none --targets room/targets": "alone.ply*none*--cameras",
     "lab stress alone.ply --set targets=room/targets": "alone.ply*none*--cameras",
     "lab chart -o out nowhere": "nowhere*no such",
@@ -205,7 +201,7 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     targets = json.loads((folder / "room/targets/transforms.json").read_text())
     for frame in targets["frames"]:
         frame["file_path"] = str(folder / "room/targets" / frame["file_path"])
-    (folder / "run.json").write_text('{"total_seconds": 2}')
+    (folder / "run.json").write_text("{}")
     (folder / "occupied").mkdir()
     (folder / "occupied" / "mine.txt").write_text("precious")
     (folder / "heic").mkdir()
