@@ -22,7 +22,7 @@ from gsmerge.compaction.file_size import Rebuild, meet_bytes
 from gsmerge.compaction.forecast import RunForecast
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.methods import Method, choose_method
-from gsmerge.compaction.new_views import explain_no_trial, note_no_trial, trial_part, try_new_views
+from gsmerge.compaction.new_views import trial_part, try_new_views
 from gsmerge.compaction.report import CompactReport
 from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, meet, search_count
@@ -33,7 +33,7 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.frozen import dataclass
 from gsmerge.pipeline import Build
-from gsmerge.plan import Plan, choose_for_scene, note_engine, note_surplus
+from gsmerge.plan import Plan, choose_for_scene, note_surplus
 from gsmerge.runtime.record import (
     Progress,
     Record,
@@ -98,7 +98,6 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
     """Compact a scene: in blocks if its views are cut into several, otherwise in one piece."""
     size = measure_size(scene)
     choices = choose_for_scene(size, options)  # the decisions that need no computation
-    note_engine(size, options, choices.blocks)
     note_surplus(size, options.budget)
     if choices.blocks > 1:
         from gsmerge.compaction.blocks import compact_in_blocks, cut_views
@@ -136,8 +135,6 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
     forecast.expect_end(counts)
     levels = [build_scored(method.build, *fixed, count) for count in counts]
     trial = try_new_views(prepared, plan, method.build, len(best.gaussians))
-    if options.new_views and trial is None:
-        note_no_trial(explain_no_trial(prepared, len(best.gaussians)))
     begin_part()
     return make_result(best, levels, prepared, plan, search.facts(best), trial)
 

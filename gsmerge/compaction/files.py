@@ -25,7 +25,7 @@ from gsmerge.io.formats.table import Contents, find_format
 from gsmerge.io.formats.write import output_notes
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress, list_some
-from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.scene.files import SceneFiles, result_cameras, scene_title
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
@@ -52,7 +52,7 @@ def compact_files(
     outputs: Outputs,
     *,
     opacity: OpacityChoice = "auto",
-    hints: ReadHints = AUTO,
+    hints: ReadHints = NO_HINTS,
     progress: Progress | None = None,
     hashed: bool = False,
     seconds_before: Mapping[str, float] | None = None,
@@ -133,7 +133,7 @@ def _views_once(scene: Scene) -> list[int]:
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
 
 
-def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> Loaded:
+def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> Loaded:
     """Read a scene from its files, with notes on missing or unusual content; SceneError if it cannot be read."""
     loaded = load_files(files, opacity=opacity, hints=hints).without_photos()
     release_memory()

@@ -28,7 +28,7 @@ from gsmerge.io.formats.table import (
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
-from gsmerge.scene.exporters import AUTO
+from gsmerge.scene.exporters import NO_HINTS
 from gsmerge.scene.files import find_scene_files, list_plys
 from gsmerge.scene.read import load_files
 from gsmerge.settings.reading import OpacityChoice, ReadHints
@@ -65,7 +65,7 @@ class FileCheck:
         return f"ok     {self.path}: {self.count:,} {unit}{layout}{views}{size}"
 
 
-def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> FileCheck:
+def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> FileCheck:
     """Read a file completely: Gaussians with the cameras and photos beside them, cameras, networks or a ``.gsm``.
 
     The ending decides the kind of file. A scene is read as ``compact`` reads it. UsageError if a package is missing.

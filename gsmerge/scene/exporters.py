@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "other"]
 TURNED: tuple[FrameKind, ...] = ("first", "middle", "upright")  # frames into which exporters turn means and rotations
-AUTO = ReadHints()
+NO_HINTS = ReadHints()
 
 
 def make_hints(values: dict[str, Any]) -> ReadHints:

@@ -20,7 +20,6 @@ KRule = Literal["saliency", "distortion"]
 
 SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
 SHARE = "4.4%"  # superpixels per pixel by default
-AUTO_SHARE = "auto"
 MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # K differs between groups, and is one of these values
 USUAL_K = 1  # the K of "auto", except for a single camera without a long fit
@@ -73,7 +72,7 @@ class SegmentOptions(Settings):
         super().__post_init__()
         if self.per_view is not None and self.per_view < 1:
             raise ValueError(f"superpixels: expected at least 1, got {self.superpixels}")
-        if self.per_view is None and self.superpixels != AUTO_SHARE:
+        if self.per_view is None and self.superpixels != AUTO:
             try:
                 parse_share(str(self.superpixels))
             except ValueError as error:
@@ -88,7 +87,7 @@ class SegmentOptions(Settings):
     @property
     def share(self) -> float:
         """Superpixels per pixel; the default share where the option gives a number or "auto"."""
-        is_share = self.per_view is None and self.superpixels != AUTO_SHARE
+        is_share = self.per_view is None and self.superpixels != AUTO
         return parse_share(str(self.superpixels) if is_share else SHARE)
 
     @property
