@@ -10,20 +10,15 @@ import os
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import typer.main
 from api_page import api_page
-from keywords_module import keywords_module
-
-from gsmerge.cli.parameters import METAVARS
 
 REFERENCE = Path(__file__).parent / "reference"
 COMMANDS, SETTINGS, API = "commands.md", "settings.md", "api.md"
-KEYWORDS = "../../gsmerge/settings/keywords.py"
 EXPORTERS, FORMATS = "exporters.md", "formats.md"  # whose prose is written by hand, and whose tables are made
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
-KINDS = {int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH"}
 COMMANDS_HEAD = """# Commands
 
 `gsmerge COMMAND --help` prints the same; what is in brackets is the default. `gsmerge SCENE` takes the options of
@@ -56,7 +51,6 @@ def make_pages() -> dict[str, str]:
         COMMANDS: _commands_page(),
         SETTINGS: _settings_page(),
         API: f"{NOTICE}\n\n{api_page()}",
-        KEYWORDS: keywords_module(),
         EXPORTERS: _exporters_page((REFERENCE / EXPORTERS).read_text(encoding="utf-8")),
         FORMATS: _formats_page((REFERENCE / FORMATS).read_text(encoding="utf-8")),
     }
@@ -119,18 +113,14 @@ def _entry(param: Any) -> str:
 
 def _value(param: Any) -> str:
     """What an option takes, as a word in capitals or a list of words."""
-    if param.metavar and param.metavar not in METAVARS.values():
-        return _line(param.metavar)
-    kind = param.type_descriptor.annotation
-    kind = next((k for k in get_args(kind) if k is not type(None)), kind)  # of a list, or of an optional one
-    return KINDS.get(kind, "TEXT")
+    return _line(param.metavar)
 
 
 def _default(param: Any) -> str:
     """The default as help words it; empty where there is none, or where it says nothing, as of a switch."""
     if isinstance(param.show_default, str):
         return str(param.show_default)
-    value = getattr(param.default, "value", param.default)
+    value = param.default
     if not param.show_default or param.required or value is None or value is False or callable(value):
         return ""
     return "on" if value is True else str(value)
@@ -226,7 +216,7 @@ def _list(settings: Iterable[Any]) -> list[str]:
     lines = []
     for one in settings:
         default = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
-        facts = "; ".join(filter(None, (default, _line(one.values(null=False)) if one.words else "")))
+        facts = "; ".join(filter(None, (default, _line(one.values()) if one.words else "")))
         text = _line(one.text)
         lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {text}")
     return lines

@@ -36,10 +36,10 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     Raises:
         SceneError: If a field is missing, or it holds several scenes.
     """
-    gaussians = _field("prediction", prediction, "gaussians")
+    gaussians = _get("prediction", prediction, "gaussians")
     rotations = _unbatch("rotations", gaussians.rotations, 2)
-    photos = as_array(_field("prediction", prediction, "processed_images"))
-    viewmats = as_array(_field("prediction", prediction, "extrinsics")).astype(np.float64)
+    photos = as_array(_get("prediction", prediction, "processed_images"))
+    viewmats = as_array(_get("prediction", prediction, "extrinsics")).astype(np.float64)
     scale = getattr(prediction, "scale_factor", None)
     if scale is not None and getattr(prediction, "is_metric", False):
         viewmats[..., :3, 3] /= float(scale)
@@ -50,7 +50,7 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
         "quats": rotations * (1 - 2 * (rotations[:, :1] < 0)),
         "images": _as_floats(photos),
         "viewmats": viewmats,
-        "Ks": _in_pixels_of(photos, as_array(_field("prediction", prediction, "intrinsics"))),
+        "Ks": _in_pixels_of(photos, as_array(_get("prediction", prediction, "intrinsics"))),
     }
 
 
@@ -96,7 +96,7 @@ def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0)
         SceneError: If a field is missing, or it holds several scenes.
     """
     gaussians = output["gaussians"] if isinstance(output, Mapping) else output
-    covariances = _unbatch("covariances", _field("gaussians", gaussians, "covariances"), 3)
+    covariances = _unbatch("covariances", _get("gaussians", gaussians, "covariances"), 3)
     scales, quats = _axes(as_array(covariances).astype(np.float64))
     return {
         **_gaussians(gaussians, sh_degree),
@@ -120,13 +120,11 @@ def ffgs(output: Any, images: Array | None = None, cameras: Any = None, *, sh_de
     Raises:
         SceneError: If a field is missing, or it holds several scenes.
     """
-    gaussians = _field("output", output, "gaussians")
+    gaussians = _get("output", output, "gaussians")
     cameras = getattr(output, "cameras", None) if cameras is None else cameras
-    opacities = _unbatch("opacities", _field("gaussians", gaussians, "opacities"), 1)
+    opacities = _unbatch("opacities", _get("gaussians", gaussians, "opacities"), 1)
     used = opacities != 0  # rows with an opacity of 0 only pad the batch
-    rows = {
-        name: _unbatch(name, _field("gaussians", gaussians, name), 2)[used] for name in ("means", "scales", "quats")
-    }
+    rows = {name: _unbatch(name, _get("gaussians", gaussians, name), 2)[used] for name in ("means", "scales", "quats")}
     if gaussians.sh_degree is None:
         colors = {"colors": _unbatch("colors", gaussians.colors, 2)[used]}
     else:
@@ -153,11 +151,11 @@ def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]
     Raises:
         SceneError: If an entry is missing, or it holds several scenes.
     """
-    splats: Any = _item("predictions", predictions, "splats")
+    splats: Any = _get("predictions", predictions, "splats")
     shapes = {"means": (-1, 3), "scales": (-1, 3), "quats": (-1, 4), "opacities": (-1,), "sh": (-1, 1, 3)}
-    columns = {name: _only(name, _item("splats", splats, name)).reshape(shape) for name, shape in shapes.items()}
-    c2w = as_array(_unbatch("camera_poses", _item("predictions", predictions, "camera_poses"), 3)).astype(np.float64)
-    Ks = as_array(_unbatch("camera_intrs", _item("predictions", predictions, "camera_intrs"), 3)).astype(np.float64)
+    columns = {name: _only(name, _get("splats", splats, name)).reshape(shape) for name, shape in shapes.items()}
+    c2w = as_array(_unbatch("camera_poses", _get("predictions", predictions, "camera_poses"), 3)).astype(np.float64)
+    Ks = as_array(_unbatch("camera_intrs", _get("predictions", predictions, "camera_intrs"), 3)).astype(np.float64)
     photos = as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1)
     columns["sh0"] = columns.pop("sh")
     return {**columns, "images": _as_floats(photos), "viewmats": invert(c2w), "Ks": Ks, "order": "none"}
@@ -175,12 +173,12 @@ def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) 
     Raises:
         SceneError: If an entry is missing, such as ``sh0`` if colours depend on the photo, or if photos differ in size.
     """
-    columns = {name: as_array(_item("splats", splats, name)) for name in ("means", "quats", "scales", "opacities")}
-    columns |= {name: as_array(_item("splats", splats, name)) for name in ("sh0", "shN")}
+    columns = {name: as_array(_get("splats", splats, name)) for name in ("means", "quats", "scales", "opacities")}
+    columns |= {name: as_array(_get("splats", splats, name)) for name in ("sh0", "shN")}
     columns["quats"] = normalize(columns["quats"].astype(np.float64)).astype(np.float32)
     columns["scales"], columns["opacities"] = exp(columns["scales"]), 1 / (1 + exp(-columns["opacities"]))
     names = ("camtoworld", "K", "image")
-    views = [[as_array(_item("dataset", view, name)) for name in names] for view in dataset]
+    views = [[as_array(_get("dataset", view, name)) for name in names] for view in dataset]
     num_sizes = len({image.shape[:2] for _, _, image in views})
     if num_sizes > 1:
         problem = f"expected photos of one size, found {num_sizes} sizes"
@@ -200,20 +198,13 @@ def _only(name: str, values: Any) -> Any:
     return values[0]
 
 
-def _field(owner_name: str, owner: Any, name: str) -> Any:
-    """Return a field of an object; SceneError if it is missing or None."""
-    field = getattr(owner, name, None)
-    if field is None:
+def _get(owner_name: str, owner: Any, name: str) -> Any:
+    """Return a field of an object, or an entry of a mapping; SceneError if it is missing or None."""
+    value = owner.get(name) if isinstance(owner, Mapping) else getattr(owner, name, None)
+    if value is None:
         remedy = "run the model with infer_gs=True" if name == "gaussians" else ""
-        raise SceneError(owner_name, f"expected a field {name}, found none", remedy)
-    return field
-
-
-def _item(mapping_name: str, values: Mapping[str, Array], name: str) -> Array:
-    """Return an entry of a mapping; SceneError if it is missing."""
-    if name not in values:
-        raise SceneError(mapping_name, f"expected an entry {name!r}, found {', '.join(map(repr, values.keys()))}")
-    return values[name]
+        raise SceneError(owner_name, f"expected {name!r}, found none", remedy)
+    return value
 
 
 def _unbatch(name: str, values: Array, num_axes: int) -> Array:
@@ -227,19 +218,19 @@ def _unbatch(name: str, values: Array, num_axes: int) -> Array:
 
 def _gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
     """Return means, opacities and harmonics, which these models store channel-major."""
-    harmonics = _unbatch("harmonics", _field("gaussians", gaussians, "harmonics"), 3)
+    harmonics = _unbatch("harmonics", _get("gaussians", gaussians, "harmonics"), 3)
     rows = harmonics.swapaxes(1, 2)[:, : (sh_degree + 1) ** 2]
-    opacities = _field("gaussians", gaussians, "opacities")
-    means = _unbatch("means", _field("gaussians", gaussians, "means"), 2)
+    opacities = _get("gaussians", gaussians, "opacities")
+    means = _unbatch("means", _get("gaussians", gaussians, "means"), 2)
     return {"means": means, "opacities": opacities, "sh0": rows[:, :1], "shN": rows[:, 1:]}
 
 
 def _family_views(poses: Mapping[str, Array], extrinsics: str, intrinsics: str, images: Array) -> dict[str, np.ndarray]:
     """Convert views of the pixelSplat family: camera to world, intrinsics relative to image size, channels first."""
-    c2w = as_array(_unbatch(extrinsics, _item("poses", poses, extrinsics), 3)).astype(np.float64)
+    c2w = as_array(_unbatch(extrinsics, _get("poses", poses, extrinsics), 3)).astype(np.float64)
     photos = as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1)
     sizes = np.array([photos.shape[2], photos.shape[1], 1.0])
-    Ks = as_array(_unbatch(intrinsics, _item("poses", poses, intrinsics), 3)).astype(np.float64) * sizes[:, None]
+    Ks = as_array(_unbatch(intrinsics, _get("poses", poses, intrinsics), 3)).astype(np.float64) * sizes[:, None]
     return {"images": _as_floats(photos), "viewmats": invert(c2w), "Ks": Ks}
 
 

@@ -27,7 +27,6 @@ from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, STEPS, USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
-    AUTO_SHARE,
     SHARE,
     USUAL_K,
     CleanOptions,
@@ -289,7 +288,7 @@ def choose_for_scene(
         # a fit needs placed views, which are not worth it for few steps, or for the many counts of a search
         options = replace(options, fit=replace(options.fit, fit="none"))
     segment, decode = options.segment, resolve_decode(options, scene)
-    if segment.superpixels == AUTO_SHARE:  # only computation on the scene could decide it
+    if segment.superpixels == AUTO:  # only computation on the scene could decide it
         segment = replace(segment, superpixels=SHARE)
     limits = count_limits(scene, segment, decode, options.budget, num_input=num_input, num_reserved=num_reserved)
     fit = resolve_fit(options)
@@ -332,14 +331,6 @@ def note_surplus(size: SceneSize, budget: BudgetOptions) -> None:
     """Note that a budget is larger than the number of Gaussians, if it is."""
     if budget.number is not None and budget.number > size.num_gaussians:
         note(f"budget {budget.budget}: the input has only {size.num_gaussians:,} Gaussians, so the result has no more")
-
-
-def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
-    """Note that a cluster is not used for a scene that is compacted in one piece, if the options ask for one."""
-    if blocks == 1 and options.blocks.engine.engine != "local":
-        problems = blocks_problems(scene, options)
-        reason = f"{problems[0]} needs that" if problems else "--set blocks=NUMBER makes several"
-        note(f"engine ray: the scene is compacted in one piece, on this machine; {reason}")
 
 
 def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
@@ -474,7 +465,7 @@ def describe_share(agreement: Agreement | None) -> tuple[str, str]:
 
 def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, effort: Effort) -> SegmentOptions:
     """Fill in the settings of superpixels that depend on effort and scene; a note gives the reason."""
-    if options.superpixels == AUTO_SHARE:
+    if options.superpixels == AUTO:
         text, why = describe_share(agreement)
         note(f"superpixels: {text} of the pixels, because {why}")
         options = replace(options, superpixels=text)

@@ -11,13 +11,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import lru_cache
 from importlib import import_module
+from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gsmerge.cli import INTERRUPTED, stop_at_once
 from gsmerge.cli.console import JsonLines, json_progress, plain_warnings, say
-from gsmerge.cli.usage import LAB, LOOK, PROGRAM, Command, Group, UsageErrors, expand_home, usage_message
+from gsmerge.cli.usage import LAB, LOOK, PROGRAM, Command, Group, UsageErrors, usage_message
 from gsmerge.errors import (
     DAMAGED_OPENCV,
     NO_TORCH,
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 DEBUG = "--debug"
-PROGRESS, STYLES = "--progress", ("bar", "json")
 
 # Panel of the help -> commands. A command NAME is the function NAME of the module NAME_command; others are plugins
 COMMANDS = {
@@ -48,20 +48,6 @@ COMMANDS = {
 }
 OWN_COMMANDS = {name for names in COMMANDS.values() for name in names}
 PLUGIN_PANEL = "Added by other packages"
-# Printed by gsmerge without arguments; 40 columns wide
-OVERVIEW = """\
-gsmerge scene.ply   compact it and look
-gsmerge COMMAND -h  what a command takes
-
-compact   1 to 10 % of the Gaussians
-convert   other formats and frames
-batch     many scenes
-extend    views that arrive in batches
-inspect   what files hold
-view      a page to compare on
-render    pictures and clips
-evaluate  scores against photos
-lab       research: charts, training"""
 
 
 def make_app(only: str | None = None) -> typer.Typer:
@@ -83,7 +69,7 @@ def make_app(only: str | None = None) -> typer.Typer:
     lab = typer.Typer(
         cls=Group, help="Research: charts of many runs, synthetic scenes, bad conditions, training of networks."
     )
-    lab.callback(invoke_without_command=True)(_lab_root)
+    lab.callback(invoke_without_command=True)(print_help)
     for name, entry in find_plugins(PLUGINS).items():
         in_lab = _is_research(entry)
         if only in (None, LAB if in_lab else name) and name not in OWN_COMMANDS:
@@ -113,7 +99,8 @@ def make_command(only: str | None = None) -> Any:
     return command
 
 
-def _lab_root(context: typer.Context) -> None:
+def print_help(context: typer.Context) -> None:
+    """Print the help of a group that is called without a command."""
     if context.invoked_subcommand is None:
         print(context.get_help())
 
@@ -163,18 +150,9 @@ def root(
     __: Annotated[
         bool, typer.Option(DEBUG, help="Print tracebacks of errors; also after the name of a command.")
     ] = False,
-    ___: Annotated[
-        str,
-        typer.Option(
-            PROGRESS,
-            metavar="|".join(STYLES),
-            help="json: print a line for each step on stderr, with the seconds left; also after the name of a command.",
-        ),
-    ] = STYLES[0],
 ) -> None:
     """Compact per-pixel 3D Gaussian scenes: 1 to 10 % of the Gaussians, seconds on a CPU."""
-    if context.invoked_subcommand is None:
-        print(OVERVIEW)
+    print_help(context)
 
 
 _RETRY_SECONDS = 0.02  # delay before a signal is raised again, if no caller could handle it
@@ -230,36 +208,11 @@ def _check_working_directory() -> None:
         raise SceneError(os.curdir, reason, "change to another one") from error
 
 
-def _take_progress(words: list[str]) -> tuple[list[str], list[str]]:
-    """Remove ``--progress`` from the words before ``--``; return the remaining words, and its values."""
-    end = words.index("--") if "--" in words else len(words)
-    remaining, values, i = [], [], 0
-    while i < end:
-        name, equals, value = words[i].partition("=")
-        if name != PROGRESS:
-            remaining.append(words[i])
-        elif equals:
-            values.append(value)
-        else:
-            i += 1
-            values.append("".join(words[i : min(i + 1, end)]))
-        i += 1
-    return [*remaining, *words[end:]], values
-
-
-def _check_style(values: Sequence[str]) -> None:
-    """Raise UsageError if ``--progress`` has several values, or an unknown one."""
-    if len(values) > 1:
-        raise UsageError(f"{PROGRESS}: expected once, got it {len(values)} times")
-    style = values[0] if values else STYLES[0]
-    if style not in STYLES:
-        raise UsageError(f"{PROGRESS}: expected {' or '.join(STYLES)}, got {style!r}")
-
-
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application and return its exit code; print an error as one line on stderr."""
     arguments = list(sys.argv[1:] if args is None else args)
-    words, styles = _take_progress([expand_home(word) for word in arguments if word != DEBUG])
+    words = [word for word in arguments if word != DEBUG]
+    as_json = "--progress=json" in words or ("--progress", "json") in pairwise(words)
 
     def fail(message: str, code: int) -> int:
         cause = getattr(sys.exc_info()[1], "__cause__", None)
@@ -274,7 +227,7 @@ def run(args: Sequence[str] | None = None) -> int:
     lines = JsonLines()
 
     def in_style() -> AbstractContextManager[None]:
-        return json_progress(lines) if styles == [STYLES[1]] else nullcontext()
+        return json_progress(lines) if as_json else nullcontext()
 
     signals: list[signal.Signals] = []
 
@@ -282,7 +235,6 @@ def run(args: Sequence[str] | None = None) -> int:
         return fail(f"ended by {signals[0].name}", 128 + signals[0]) if signals else fail("interrupted", INTERRUPTED)
 
     try:
-        _check_style(styles)
         with plain_warnings(), _orderly_stop(signals), in_style():
             _check_working_directory()
             words = [LOOK, *words] if words and _is_scene(words[0]) else words
@@ -302,7 +254,7 @@ def run(args: Sequence[str] | None = None) -> int:
         return 1
     except Exception as error:
         if isinstance(error, UsageErrors):
-            return fail(usage_message(error, make_command), UsageError.exit_code)
+            return fail(usage_message(error), UsageError.exit_code)
         if is_out_of_memory(error) or file_problem(error) is not None:
             return fail(error_line(error, "what was printed"), SceneError.exit_code)
         if is_opencv_damaged(error):

@@ -10,18 +10,8 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import (
-    RunEnd,
-    print_document,
-    say,
-    say_warning,
-    separate_stdout,
-    terminal_columns,
-    total_progress,
-)
+from gsmerge.cli.console import RunEnd, print_document, say, separate_stdout, terminal_columns, total_progress
 from gsmerge.errors import BatchError, TargetError, UsageError
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import Engine
@@ -39,7 +29,7 @@ def parse_jobs(text: str) -> int:
     if text == "auto":
         return 0
     if not text.isdecimal() or int(text) < 1:
-        raise typer.BadParameter(f'expected a number from 1 or "auto", got {text!r}')
+        raise ValueError(f'expected a number from 1 or "auto", got {text!r}')
     return int(text)
 
 
@@ -132,7 +122,7 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
         worse = f"{len(totals.worse)} of {totals.total} results show their photos worse than the input"
         worse += _first_reason(totals.worse, listed=not args.silent)
     if worse and not args.strict:
-        say_warning(worse, quiet=args.silent)
+        say(worse, kind="warning", quiet=args.silent)
     check_failures(totals.failed, len(jobs), "scenes", listed=not args.silent)
     if totals.unmet:
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
@@ -174,8 +164,10 @@ def run_jobs(
             share = done / total if total > 0 else 1.0
             report = record["report"] or record  # a result that was done before has a record of its doubts alone
             worse = report.get("worse")
-            notes = report.get("notes", [doubt for doubt in (worse, report.get("left_out")) if doubt])
-            progress(RunEnd(record[name], record["status"], num_ended, failure, num_failed, share, worse, notes))
+            doubts = report.get("doubts", [doubt for doubt in (worse, report.get("left_out")) if doubt])
+            notes = report.get("notes", doubts)
+            end = record[name], record["status"], num_ended, failure, num_failed, share, worse, notes, doubts
+            progress(RunEnd(*end))
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
@@ -200,7 +192,6 @@ class Totals:
     num_output: int = 0  # Gaussians in their results
     unmet: int = 0  # results that miss their target
     rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results
-    unused: list[tuple[str, str]] = field(default_factory=list)  # scene, and its columns that are not used
     worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
     left_out: list[tuple[str, str]] = field(default_factory=list)  # scene, and a note on files of another scene
     lacking: list[tuple[str, str]] = field(default_factory=list)  # scene, and the cameras or photos that it lacks
@@ -208,8 +199,6 @@ class Totals:
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Count the record of one scene."""
-        from gsmerge.io.formats.columns import UNUSED
-
         self.counts[record["status"]] += 1
         report = record["report"]
         worse = report["worse"] if report else record.get("worse")
@@ -223,8 +212,6 @@ class Totals:
         if record["error"] is not None:
             self.failed.append((record["scene"], record["error"]))
         if report:
-            unused = [note for note in report["notes"] if note.startswith(UNUSED)]
-            self.unused += [(record["scene"], note.removeprefix(UNUSED)) for note in unused]
             self.num_input += report["input"]["num_gaussians"]
             self.num_output += report["output"]["num_gaussians"]
             self.unmet += bool(report["unmet"])
@@ -234,7 +221,6 @@ class Totals:
     def lines(self, columns: int | None = None) -> list[str]:
         """Format the end of a run: a table, ``columns`` wide, of the results, notes, failures, and a line of totals."""
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
-        from gsmerge.io.formats.columns import UNUSED
         from gsmerge.io.image_names import natural_key
         from gsmerge.report import text_table
         from gsmerge.runtime.memory import human_share
@@ -245,13 +231,7 @@ class Totals:
         lines = text_table(rows, columns=columns, least=omitted_first) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
-        kinds = (
-            (UNUSED[:-2], self.unused),
-            ("worse", self.worse),
-            ("note", self.left_out),
-            ("note", self.lacking),
-            (FAILED, self.failed),
-        )
+        kinds = (("worse", self.worse), ("note", self.left_out), ("note", self.lacking), (FAILED, self.failed))
         for status, reasons in kinds:
             grouped = _list_reasons(reasons)
             lines += [f"{status}: {line}" for line in grouped[:MAX_LISTED]]

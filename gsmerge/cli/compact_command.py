@@ -12,15 +12,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import (
-    print_document,
-    say,
-    say_notes,
-    say_warning,
-    separate_stdout,
-    stage_progress,
-    terminal_columns,
-)
+from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
 from gsmerge.cli.paths import (
     FileOptions,
     check_format,
@@ -176,7 +168,8 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     from gsmerge.io.formats.table import VIEWED, find_format
 
     doubts = [document["worse"], document["input"]["left_out"] if args.strict else None]
-    say_notes([note for note in document["notes"] if note not in doubts], quiet=args.silent)
+    notes = [note for note in document["notes"] if note not in doubts]
+    say_notes(notes, document["doubts"], quiet=args.silent)
     lines = [summary_line(document), *level_lines(document), *curve_lines(document)]
     if sys.stdout.isatty():
         words = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
@@ -192,7 +185,7 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     if document["worse"] and not args.strict:
         psnr = document["psnr_input_views"]
         has_loss = "fidelity" in document["choices"] or (psnr["after"] is not None and psnr["after"] < psnr["before"])
-        say_warning(f"{document['worse']}; {REMEDY}" if has_loss else document["worse"], quiet=args.silent)
+        say(f"{document['worse']}; {REMEDY}" if has_loss else document["worse"], kind="warning", quiet=args.silent)
     if any(problems):
         raise TargetError("; ".join(filter(None, problems)))
 

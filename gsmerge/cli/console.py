@@ -8,7 +8,7 @@ import shutil
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -21,9 +21,6 @@ PREFIXES: Mapping[Kind, str] = {
     "info": "", "note": "note: ", "warning": "gsmerge: warning: ", "error": "gsmerge: error: ",
 }  # fmt: skip
 MAX_LINE = 5000  # characters
-LEAST_SHOWN = 5  # seconds; a shorter remaining time is not shown
-NARROW = 60  # columns; narrower terminals get shorter bars with less text
-OPENING = "start ..."  # shown on a terminal until a command prints its first line or bar
 
 
 @dataclass
@@ -36,7 +33,6 @@ class JsonLines:
 
     def print(self, event: Mapping[str, Any]) -> None:
         """Print an event with the seconds since the start, the share that is done and the seconds left."""
-        _erase_opening()
         share, left = self.share, self.left
         numbers = {"share": None if share is None else round(share, 3), "seconds": round(self.seconds, 2)}
         numbers["seconds_left"] = None if left is None else round(left, 1)
@@ -55,33 +51,12 @@ class JsonLines:
 
 
 _stream: ContextVar[JsonLines | None] = ContextVar("stream", default=None)  # None: progress is not shown as JSON
-_opening: list[str] = []  # text on the terminal's last line that has to be erased
 
 
 def one_line(text: str) -> str:
     """Escape text from files or names for a terminal, and shorten it to one line."""
     clean = text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
     return clean if len(clean) <= MAX_LINE else f"{clean[: MAX_LINE // 2]} ... {clean[-MAX_LINE // 2 :]}"
-
-
-@contextmanager
-def opening_line(*, quiet: bool) -> Iterator[None]:
-    """Show that a command has started, since imports may take a second; only on a terminal and unless ``quiet``."""
-    with suppress(OSError):
-        if not quiet and sys.stderr.isatty():
-            _opening.append(f"{OPENING:>16}")
-            print(_opening[0], end="", file=sys.stderr, flush=True)
-    try:
-        yield
-    finally:
-        _erase_opening()
-
-
-def _erase_opening() -> None:
-    """Erase the text of :func:`opening_line` from the terminal."""
-    while _opening:
-        with suppress(OSError):
-            print("\r" + " " * len(_opening.pop()), end="\r", file=sys.stderr, flush=True)
 
 
 def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
@@ -97,37 +72,15 @@ def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
         return
     from gsmerge.report import wrap_line
 
-    _erase_opening()
     text = one_line(PREFIXES[kind] + message)
     with suppress(OSError):
         print("\n".join(wrap_line(text, terminal_columns(sys.stderr))), file=sys.stderr, flush=True)
 
 
-def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
-    """Print each note on stderr unless ``quiet``.
-
-    A note that a result is worse than the input, or that held-out views may show another scene, becomes a warning.
-    """
-    from gsmerge.raster.metrics import OTHER_SCENE, WORSE
-
+def say_notes(notes: Sequence[str], doubts: Collection[str] = (), *, quiet: bool = False) -> None:
+    """Print each note on stderr unless ``quiet``; those that are ``doubts`` become warnings."""
     for note in notes:
-        if WORSE in note or OTHER_SCENE in note:
-            say_warning(note, quiet=quiet)
-        else:
-            say(note, kind="note", quiet=quiet)
-
-
-def say_warning(text: str, *, quiet: bool = False) -> None:
-    """Print a warning on stderr unless ``quiet``, in red on terminals.
-
-    ``FORCE_COLOR`` colours it elsewhere too, and ``NO_COLOR`` prevents colours.
-    """
-    has_colors = sys.stderr.isatty() or os.environ.get("FORCE_COLOR")
-    colored = not (quiet or _stream.get()) and bool(has_colors) and not os.environ.get("NO_COLOR")
-    with suppress(OSError):
-        print("\033[31m" * colored, end="", file=sys.stderr)
-        say(text, kind="warning", quiet=quiet)
-        print("\033[0m" * colored, end="", file=sys.stderr, flush=True)
+        say(note, kind="warning" if note in doubts else "note", quiet=quiet)
 
 
 def terminal_columns(stream: Any) -> int | None:
@@ -141,7 +94,6 @@ def print_document(
     """Print a result on stdout as JSON or, unless ``quiet``, as lines; ``wrap``: break long lines in a terminal."""
     from gsmerge.report import to_json, wrap_line
 
-    _erase_opening()
     if as_json:
         sys.stdout.write(to_json(document))
     elif not quiet:
@@ -174,18 +126,10 @@ def _terminal(*, quiet: bool) -> Any:
         return None
     from rich.console import Console
 
-    _erase_opening()
     console = Console(stderr=True)
     # The terminal prints ^C after the bar on Ctrl-C, which must not wrap to a new line
     console.width = max(20, console.width - len("^C") - 1)
     return console if console.is_terminal else None
-
-
-def _bar(console: Any) -> Any:
-    """Make the column of progress bars, shorter in a narrow terminal."""
-    from rich.progress import BarColumn
-
-    return BarColumn(16 if console.width >= NARROW else 8)
 
 
 @contextmanager
@@ -215,26 +159,6 @@ def _print_stages(stream: JsonLines) -> Progress:
     return move
 
 
-def _stage_columns(console: Any) -> list[Any]:
-    """Make the columns of a stage's bar: name, bar and count; on wide terminals also times and detail."""
-    from rich import progress as rich
-    from rich.table import Column
-
-    class TimeLeft(rich.ProgressColumn):
-        max_refresh = 0.5
-
-        def render(self, task: rich.Task) -> str:
-            seconds = task.time_remaining
-            return "" if task.finished or not seconds or seconds < LEAST_SHOWN else f"{duration(seconds)} left"
-
-    count, detail = (rich.TextColumn(f"{{task.fields[{field}]}}", markup=False) for field in ("count", "detail"))
-    name_column = Column(max_width=max(18, console.width // 3), no_wrap=True, overflow="ellipsis")
-    name = rich.TextColumn("{task.description:>12}", markup=False, table_column=name_column)
-    if console.width < NARROW:
-        return [name, _bar(console), count]
-    return [name, _bar(console), rich.TimeElapsedColumn(), count, TimeLeft(), detail]
-
-
 @contextmanager
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     """Show a progress bar per stage on stderr, if it is a terminal (or ``FORCE_COLOR`` is set) and not ``quiet``.
@@ -253,7 +177,12 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
 
     from gsmerge.runtime.time_left import STAGES
 
-    with rich.Progress(*_stage_columns(console), console=console, transient=True, refresh_per_second=5) as bars:
+    columns = (
+        rich.TextColumn("{task.description:>12}", markup=False), rich.BarColumn(16), rich.TimeElapsedColumn(),
+        rich.TextColumn("{task.fields[count]}"), rich.TimeRemainingColumn(compact=True),
+        rich.TextColumn("{task.fields[detail]}", markup=False),
+    )  # fmt: skip
+    with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
         tasks: dict[str, Any] = {}
         totals: dict[str, int] = {}
         running: list[str] = []
@@ -304,6 +233,7 @@ class RunEnd(NamedTuple):
     share: float  # Part of the work done so far, 0 to 1
     worse: str | None = None  # The note that the result is worse than its input, one of ``notes``
     notes: Sequence[str] = ()  # Printed only as JSON
+    doubts: Collection[str] = ()  # Those of the notes that are warnings
 
     @property
     def text(self) -> str:
@@ -329,7 +259,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
         def print_event(end: RunEnd) -> None:
             seconds, share = time.monotonic() - start, end.share
             for note in end.notes:
-                say(f"{end.name}: {note}", kind="warning" if note == end.worse else "note")
+                say(f"{end.name}: {note}", kind="warning" if note in end.doubts else "note")
             stream.move(share, seconds * (1 - share) / share if share > 0 else None)
             event = {"scene": end.name, "status": end.status, "done": end.done, "total": total}
             stream.print({**event, "failed": end.num_failed, "worse": end.worse, "error": end.failure or None})
@@ -346,28 +276,17 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
         yield print_run
         return
     from rich import progress as rich
-    from rich.console import Group
-    from rich.live import Live
-    from rich.text import Text
 
     columns = (
-        _bar(console), rich.MofNCompleteColumn(), *[rich.TimeElapsedColumn()] * (console.width >= NARROW),
-        rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}", markup=False),
+        rich.BarColumn(16), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"),
+        rich.TimeRemainingColumn(), rich.TextColumn("{task.description}", markup=False),
     )  # fmt: skip
-    bars, last_failure = rich.Progress(*columns), Text(no_wrap=True, overflow="ellipsis")
-    with Live(Group(bars, last_failure), console=console, transient=True, refresh_per_second=5):
+    with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
         task = bars.add_task("", total=total)
 
         def move(end: RunEnd) -> None:
             bars.update(task, completed=end.done, description=one_line(end.text))
             if end.failure:
-                last_failure.plain = one_line(f"last failure: {end.failure}")
+                bars.console.print(one_line(f"{end.name}: {end.failure}"), markup=False, highlight=False)
 
         yield move
-
-
-def duration(seconds: float) -> str:
-    """Format seconds for people: ``95`` -> ``95 s``, ``600`` -> ``10 min``, ``9000`` -> ``2.5 h``."""
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

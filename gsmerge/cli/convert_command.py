@@ -19,8 +19,7 @@ class PhotoOptions(Settings):
     """Photos that a conversion reads."""
 
     images: str | None = setting(None, "Folder of the photos of the cameras. `--drop sky` needs it, and a COLMAP model "
-        "links it. For a model, a folder `images` beside the cameras is found without this setting.",
-        metavar="PATH")  # fmt: skip
+        "links it. For a model, a folder `images` beside the cameras is found without this setting.")  # fmt: skip
 
 
 @opt.command(

@@ -11,7 +11,7 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import BeforeAfter, lpips_networks, read_before_after
 from gsmerge.cli.console import print_document, say_notes, stage_progress, terminal_columns
 from gsmerge.cli.paths import check_folder, check_outputs, check_replaced, input_files, write_texts
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import UsageError
 from gsmerge.frozen import dataclass
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.setting import Settings, setting
@@ -30,14 +30,11 @@ class MeasuringOptions(Settings):
     """Settings of the command besides those of :func:`gsmerge.evaluate`."""
 
     views: int | None = setting(None, "Number of input views to use as the context, at equal intervals; the "
-        "held-out views midway between them are the targets.", least=1, shown="all")  # fmt: skip
+        "held-out views midway between them are the targets.", least=1)  # fmt: skip
     masks: str | None = setting(None, "Folder of masks with the names of the photos, dark where a photo does not "
-        "count.",
-        shown="masks beside the photos")  # fmt: skip
+        "count.")  # fmt: skip
     speed: bool = setting(False, "Also measure the render time, at the sizes of `zoom` or at 1 and 2, and the "
         "Gaussians per pixel.")  # fmt: skip
-    merge_seconds: tuple[float | str, ...] = setting((), "Seconds that it took to make each AFTER, or the JSON report "
-        "of its run; gives the number of frames after which this time is saved.", metavar="LIST")  # fmt: skip
 
 
 @opt.command(
@@ -65,10 +62,9 @@ def evaluate(args: opt.Args) -> None:
     files, outputs = args.files(args.before), args.output or []
     if args.quiet and not (outputs or args.json or args.maps):
         raise UsageError("--quiet: expected -o, --maps or --json with it, since otherwise nothing is shown or written")
-    _check_files(args, outputs, measuring, input_files(files))
+    _check_files(args, outputs, input_files(files))
     if args.maps is not None:
         check_folder(args.maps, tuple(input_files(files)), overwrite=True)
-    seconds = [_read_seconds(value) for value in measuring.merge_seconds]
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
     from gsmerge.measure.scores import evaluation_document, evaluation_lines
     from gsmerge.pages.data import still_keeper
@@ -92,7 +88,7 @@ def evaluate(args: opt.Args) -> None:
         evaluation = evaluate_scene(
             pair.scene, pair.gaussians, pair.held_out, options, cameras=pair.cameras, progress=progress, **hooks
         )
-        facts = _facts(pair, options, measuring, dict(zip(pair.plys, seconds, strict=False)))
+        facts = _facts(pair, options, measuring)
     document = evaluation_document(evaluation, facts, notes)
     _write(outputs, document, pair, evaluation, stills)
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
@@ -101,26 +97,19 @@ def evaluate(args: opt.Args) -> None:
         document["maps"] = [str(path) for path in _write_maps(args.maps, pair, context=options.context)]
         lines.append(f"maps: {len(document['maps'])} pictures in {args.maps}")
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
-    say_notes(evaluation.notes, quiet=args.silent)
+    say_notes(evaluation.notes, evaluation.doubts, quiet=args.silent)
 
 
-def _check_files(args: opt.Args, outputs: Sequence[Path], measuring: MeasuringOptions, inputs: Sequence[Path]) -> None:
-    """Raise UsageError if an output cannot be written, or if ``merge_seconds`` has not one value per result."""
+def _check_files(args: opt.Args, outputs: Sequence[Path], inputs: Sequence[Path]) -> None:
+    """Raise UsageError if an output cannot be written."""
     for path in outputs:
         if path.suffix not in SUFFIXES:
             raise UsageError(f"{path}: expected a name ending in {opt.join_words(SUFFIXES)}")
-    reports = [Path(value) for value in measuring.merge_seconds if isinstance(value, str)]
-    check_outputs(outputs, (*inputs, *args.after, args.targets, args.target_images, *reports), overwrite=True)
+    check_outputs(outputs, (*inputs, *args.after, args.targets, args.target_images), overwrite=True)
     check_replaced(outputs)
-    if measuring.merge_seconds and len(measuring.merge_seconds) != len(args.after):
-        raise UsageError(
-            f"merge_seconds: expected one value for each of {len(args.after)} AFTER, got {len(measuring.merge_seconds)}"
-        )
 
 
-def _facts(
-    pair: BeforeAfter, options: EvaluateOptions, measuring: MeasuringOptions, seconds: Mapping[str, float]
-) -> dict[str, dict[str, Any]]:
+def _facts(pair: BeforeAfter, options: EvaluateOptions, measuring: MeasuringOptions) -> dict[str, dict[str, Any]]:
     """Collect facts about each file by name, with the cost of rendering if requested."""
     from gsmerge.measure.evaluate import INPUT, near_plane
     from gsmerge.measure.sizes import shrink_cameras
@@ -131,29 +120,14 @@ def _facts(
         name: {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
         for name, info in infos.items()
     }
-    if measuring.speed or measuring.merge_seconds:
+    if measuring.speed:
         scenes = {INPUT: pair.scene.file_gaussians, **pair.gaussians}
         cameras = shrink_cameras(pair.scene.cameras, options.photo_side)
         zooms = SPEED_ZOOMS if options.zoom == EvaluateOptions().zoom else options.zoom
         near = near_plane(pair.scene)
-        costs = measure_costs(scenes, cameras, zooms, near, merge_seconds=seconds, threads=options.threads)
+        costs = measure_costs(scenes, cameras, zooms, near, threads=options.threads)
         facts = {name: facts[name] | costs[name] for name in facts}
     return facts
-
-
-def _read_seconds(value: float | str) -> float:
-    """Return a number of seconds, or read it from the report of a run if ``value`` is a path."""
-    seconds: Any = value
-    if isinstance(value, str):
-        from gsmerge.io import read_json
-
-        document = read_json(Path(value))
-        seconds = document.get("total_seconds") if isinstance(document, dict) else None
-    if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < 1e9:
-        raise SceneError(
-            Path(str(value)), "expected seconds or the report of a compact run (total_seconds), found neither"
-        )
-    return float(seconds)
 
 
 def _write(

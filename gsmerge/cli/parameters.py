@@ -15,17 +15,15 @@ import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from copy import copy
-from dataclasses import replace
-from enum import Enum
-from functools import wraps
+from dataclasses import dataclass, replace
+from functools import partial, wraps
 from inspect import Parameter, Signature
 from pathlib import Path
-from types import NoneType, SimpleNamespace
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from types import NoneType, SimpleNamespace, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
 
 import typer
 
-from gsmerge.cli.console import opening_line
 from gsmerge.errors import UsageError
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.budget import parse_share
@@ -33,7 +31,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, FileHints, OpacityChoice, ReadHints
-from gsmerge.settings.setting import Setting, change_settings, find_near_names, flat_settings, join_words, suggest_name
+from gsmerge.settings.setting import Setting, change_settings, flat_settings, join_words, suggest_name
 from gsmerge.settings.stages import CROP_FILES, Engine
 
 if TYPE_CHECKING:
@@ -45,10 +43,10 @@ INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
 )  # fmt: skip
 # Forms of plain values in the help
 METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH", list[Path]: "PATH"}
+STYLES = ("bar", "json")  # of progress
 REQUIRED = Parameter.empty
 LIST_SETTINGS = "help"  # value for which --set prints all settings
 SEED = "GSMERGE_SEED"  # environment variable: the seed of commands that are given none
-MAX_DIGITS = 1000  # of the seed in this variable; Python's own limit is far higher
 
 SETTINGS = {
     setting.name: setting for kind in (EvaluateOptions, Engine, PlacementOptions, CompactOptions)
@@ -96,8 +94,8 @@ class Args(SimpleNamespace):
         for name in options.keys() & pairs.keys():
             raise UsageError(f"--set {name}: expected this setting once, got --{name.replace('_', '-')} too")
         values = options | pairs
-        if "seed" in settings:
-            values |= {"seed": values["seed"]} if "seed" in values else _environment_seed()
+        if "seed" in settings and "seed" not in values and os.environ.get(SEED):  # an empty one counts as not set
+            values["seed"] = parse_value(SEED, os.environ[SEED], settings["seed"])
         if Path(str(values.get("crop"))).suffix.lower() in CROP_FILES:
             from gsmerge.io.crop_file import read_crop
 
@@ -154,7 +152,7 @@ class Args(SimpleNamespace):
 
 
 def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]) -> dict[str, Any]:
-    """Parse NAME=VALUE pairs of ``--set`` or ``--hint``, values as JSON where possible; UsageError if one is wrong."""
+    """Parse NAME=VALUE pairs of ``--set`` or ``--hint``; UsageError if one is wrong."""
     values: dict[str, Any] = {}
     for pair in pairs:
         name, sign, text = pair.partition("=")
@@ -162,45 +160,32 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
         if not sign:
             raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}")
         if name not in settings:
-            similar = join_words(find_near_names(name, settings, 3))
-            hint = f"; perhaps {similar}" if similar else ""
             remedy = f"{flag} {LIST_SETTINGS} lists all" if flag == "--set" else f"expected {join_words(settings)}"
-            raise UsageError(f"{flag} {name}: unknown{hint}; {remedy}")
+            raise UsageError(f"{flag} {name}: unknown{suggest_name(name, settings)}; {remedy}")
         if name in values:
             raise UsageError(f"{flag} {name}: expected it once, got it twice")
-        values[name] = _parse_setting(f"{flag} {name}", text, settings[name])
+        values[name] = parse_value(f"{flag} {name}", text, settings[name])
     return values
 
 
-def _parse_setting(label: str, text: str, declared: Setting) -> Any:
-    """Parse the value of a setting; UsageError that begins with ``label`` if it has the wrong type."""
-    candidates = _parse_value(text)
+def parse_value(label: str, text: str, declared: Setting) -> Any:
+    """Parse the value of a setting or an option; UsageError that begins with ``label`` if it is not allowed."""
+    candidates = _list_meanings(text)
     if declared.is_list:
-        candidates.append([_parse_value(element.strip())[0] for element in text.split(",")])
-    for value in candidates:
-        if declared.fits(value):
-            return value
-    expected, hint = declared.expected(candidates[0], null=True), suggest_name(text, declared.words)
-    raise UsageError(f"{label}: expected {expected}, got {text!r}{hint}")
+        candidates.append([_list_meanings(element.strip())[0] for element in text.split(",")])
+    value = next(filter(declared.fits, candidates), text)
+    with usage_errors():
+        replace(declared, name=label).check(value)
+    return value
 
 
-def _parse_value(text: str) -> list[Any]:
+def _list_meanings(text: str) -> list[Any]:
     """List the possible values of a text, the best first: as JSON, as a number, and as text."""
     candidates: list[Any] = [text]
     for parse in (float, json.loads):
         with suppress(ValueError, RecursionError):
             candidates.insert(0, parse(text))
     return candidates
-
-
-def _environment_seed() -> dict[str, int]:
-    """Return the seed of the environment variable, if it is set; UsageError if it is not a seed."""
-    text = os.environ.get(SEED)
-    if not text:  # an empty variable counts as not set
-        return {}
-    if not (text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS):
-        raise UsageError(f"{SEED}: expected a whole number from 0, of at most {MAX_DIGITS} digits, got {text!r:.40}")
-    return {"seed": int(text)}
 
 
 @contextmanager
@@ -212,65 +197,111 @@ def usage_errors() -> Iterator[None]:
         raise UsageError(str(error)) from error
 
 
-def argument(name: str, kind: Any, metavar: str, help: str, default: Any = REQUIRED) -> Parameter:
+@dataclass(frozen=True)
+class Declared:
+    """An argument or an option of a command."""
+
+    name: str
+    kind: Any  # As Typer sees it: bool for a switch, a text for one word, a list of texts for several
+    info: Any  # Typer's description
+    parse: Callable[[str], Any]  # Word -> value; raises ValueError
+    default: Any
+    flags: tuple[str, ...] = ()  # Names of an option; empty for an argument
+
+    @property
+    def parameter(self) -> Parameter:
+        """The parameter of a function that Typer calls."""
+        return Parameter(
+            self.name, Parameter.KEYWORD_ONLY, default=self.default, annotation=Annotated[self.kind, self.info]
+        )
+
+    def read(self, typed: Any, flags: Collection[str]) -> Any:
+        """Parse the words that were typed; UsageError for a wrong one, or for one of the command's ``flags``."""
+        if not isinstance(typed, str | list | tuple):  # a switch, or a default
+            return typed
+        label, values = self.flags[0] if self.flags else self.info.metavar.strip("[]."), list[Any]()
+        for word in [typed] if isinstance(typed, str) else typed:
+            if not word or (self.flags and (word == "-" or word.startswith("--") or word in flags)):
+                raise UsageError(f"{label}: expected a value, got {word or 'an empty one'}")
+            try:
+                values.append(self.parse(word))
+            except UsageError:
+                raise
+            except ValueError as error:
+                raise UsageError(f"{label}: {error}") from error
+        return values[0] if isinstance(typed, str) else values
+
+
+def _declare(
+    name: str, kind: Any, info: Any, parse: Callable[[str], Any] | None, default: Any, flags: tuple[str, ...] = ()
+) -> Declared:
+    """Declare an argument or option; ``kind`` is the type of its values, ``list[...]`` if it takes several."""
+    kinds = [one for one in get_args(kind) if one is not NoneType] if isinstance(kind, UnionType) else [kind]
+    single = get_args(kinds[0])[0] if get_origin(kinds[0]) is list else kinds[0]
+    shape = single if single is bool else list[str] if single is not kinds[0] else str
+    parse = parse or (parse_path if single is Path else str)
+    return Declared(name, shape, info, parse, default, flags)
+
+
+def argument(name: str, kind: Any, metavar: str, help: str, default: Any = REQUIRED) -> Declared:
     """Declare a positional argument of a command."""
-    info = typer.Argument(metavar=metavar, help=_escape(help))
-    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
+    return _declare(name, kind, typer.Argument(metavar=metavar, help=_escape(help)), None, default)
 
 
 def option(
-    name: str, kind: Any, help: str, *flags: str, default: Any = None, wording: str | None = None, **more: Any,
-) -> Parameter:  # fmt: skip
+    name: str, kind: Any, help: str, *flags: str, default: Any = None, wording: str | None = None,
+    metavar: str | None = None, parser: Callable[[str], Any] | None = None, min: float | None = None,
+    max: float | None = None, **more: Any,
+) -> Declared:  # fmt: skip
     """Declare an option of a command; ``kind`` bool makes a switch, a tuple lists the possible values.
 
     By default ``flags`` are derived from the name. ``wording`` is the default in words, if the library decides it.
     ``more`` is passed to Typer.
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
-    if more.get("metavar") is None:
-        more["metavar"] = "|".join(kind) if isinstance(kind, tuple) else METAVARS.get(kind)
     if isinstance(kind, tuple):
-        choice: Any = Enum  # mypy accepts Enum only with literal names
-        kind = choice(f"{name}_choice", {value: value for value in kind}, type=str)
-        default = kind(default) if isinstance(default, str) else default
-    kind = kind | None if default is None else kind
-    info = typer.Option(*flags, help=_escape(help), show_default=wording or default is not False, **more)
-    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
+        choices = list(kind)
+        more["autocompletion"] = lambda: choices
+        parser = partial(parse_value, flags[0], declared=Setting(help, choices=kind, kind=str))
+        metavar, kind = "|".join(kind), str
+    elif kind is int:
+        parser = partial(parse_value, flags[0], declared=Setting(help, kind=int, least=min, most=max))
+    shown = wording or default is not False
+    metavar = METAVARS.get(kind) if metavar is None else metavar
+    info = typer.Option(*flags, help=_escape(help), metavar=metavar, show_default=shown, **more)
+    return _declare(name, kind, info, parser, default, flags)
 
 
-def setting_option(name: str, *flags: str, **more: Any) -> Parameter:
+def setting_option(
+    name: str, *flags: str, metavar: str | None = None, wording: str | None = None, **more: Any
+) -> Declared:
     """Declare an option for a setting of the library, with its help and values; ``more`` goes to :func:`option`."""
     declared = SETTINGS[name]
+    flags = flags or (f"--{name.replace('_', '-')}",)
     kinds = [kind for kind in declared.kinds if kind is not NoneType]
-    kind: Any = str if len(kinds) > 1 or (kinds and declared.words) else kinds[0] if kinds else declared.words
-    if kind is bool:
-        return switch(name, declared.help, *flags, **more)
-    if kind in (int, float):
-        more = {"min": declared.least, "max": declared.most} | more
-    shown = declared.shown or (None if declared.default is None else str(declared.default))
-    more = {"wording": shown, "metavar": declared.metavar} | more
-    return option(name, kind, more.pop("help", declared.help), *flags, **more)
+    metavar = metavar or (METAVARS[kinds[0]] if kinds else "|".join(declared.words))
+    wording = wording or (None if declared.default is None else str(declared.default))
+    parse = partial(parse_value, flags[0], declared=declared)
+    return option(name, str, declared.help, *flags, metavar=metavar, wording=wording, parser=parse, **more)
 
 
-def switch(name: str, help: str, *short: str, **more: Any) -> Parameter:
+def switch(name: str, help: str, *short: str, **more: Any) -> Declared:
     """Declare a switch: an option without a value, off by default."""
     return option(name, bool, help, f"--{name.replace('_', '-')}", *short, default=False, **more)
 
 
-def panel(title: str, *parameters: Parameter) -> tuple[Parameter, ...]:
+def panel(title: str, *parameters: Declared) -> tuple[Declared, ...]:
     """Group options under a title in the help."""
     for parameter in parameters:
-        get_args(parameter.annotation)[1].rich_help_panel = title
+        parameter.info.rich_help_panel = title
     return parameters
 
 
-def changed(name: str, default: Any = None, **changes: Any) -> Parameter:
-    """Copy a declared option and change it for one command: its default, ``help``, ``show_default``, ``hidden``, ..."""
-    kind, info = get_args(OPTIONS[name].annotation)
-    info = copy(info)
-    for attribute, value in changes.items():
-        setattr(info, attribute, value)
-    return OPTIONS[name].replace(default=default, annotation=Annotated[kind, info])
+def changed(name: str, default: Any = None, **changes: Any) -> Declared:
+    """Copy a declared option and change it for one command: its default, ``help``, ``show_default``, ..."""
+    info = copy(OPTIONS[name].info)
+    vars(info).update(changes)
+    return replace(OPTIONS[name], info=info, default=default)
 
 
 def _escape(help: str) -> str:
@@ -278,27 +309,26 @@ def _escape(help: str) -> str:
     return re.sub(r"\[(?=[a-z])", r"\\[", help.replace("`", ""))
 
 
-def command(*parameters: str | Parameter) -> Callable[[Callable[[Args], None]], Callable[..., None]]:
+def command(*parameters: str | Declared) -> Callable[[Callable[[Args], None]], Callable[..., None]]:
     """Decorate a command with its parameters, in the order of the help; a text lists names of declared options."""
-    listed: dict[str, Parameter] = {}
-    for parameter in (*parameters, "json quiet"):
+    listed: dict[str, Declared] = {}
+    for parameter in (*parameters, "progress json quiet"):
         for name in parameter.split() if isinstance(parameter, str) else [parameter.name]:
             listed.setdefault(name, OPTIONS[name] if isinstance(parameter, str) else parameter)
+    flags = {flag for declared in listed.values() for flag in declared.flags}
 
     def decorate(function: Callable[[Args], None]) -> Callable[..., None]:
         @wraps(function)
-        def run(**values: Any) -> None:
-            plain = {name: value.value if isinstance(value, Enum) else value for name, value in values.items()}
-            args = Args(**plain)
-            with opening_line(quiet=args.silent):
-                from gsmerge.runtime.memory import keep_memory
+        def run(**typed: Any) -> None:
+            args = Args(**{name: listed[name].read(value, flags) for name, value in typed.items()})
+            from gsmerge.runtime.memory import keep_memory
 
-                keep_memory()
-                function(args)
+            keep_memory()
+            function(args)
 
-        run.__signature__ = Signature(list(listed.values()))  # type: ignore[attr-defined]
+        run.__signature__ = Signature([declared.parameter for declared in listed.values()])  # type: ignore[attr-defined]
         run.__annotations__ = {}
-        run.kinds = getattr(get_args(listed["set"].annotation)[1], "kinds", ()) if "set" in listed else ()  # type: ignore[attr-defined]
+        run.kinds = getattr(listed["set"].info, "kinds", ()) if "set" in listed else ()  # type: ignore[attr-defined]
         return run
 
     return decorate
@@ -306,12 +336,12 @@ def command(*parameters: str | Parameter) -> Callable[[Callable[[Args], None]], 
 
 def call(function: Callable[..., None], **values: Any) -> None:
     """Run another command with parameters ``values``; its other parameters have their defaults."""
-    declared: Signature = function.__signature__  # type: ignore[attr-defined]
-    function(**{name: parameter.default for name, parameter in declared.parameters.items()} | values)
+    parameters = function.__signature__.parameters.items()  # type: ignore[attr-defined]
+    function.__wrapped__(Args(**{name: one.default for name, one in parameters} | values))  # type: ignore[attr-defined]
 
 
 def settings_option(*kinds: type | LazyFunction, help: str = "Any other setting, such as {}; may be repeated. --set "
-                    "help lists all.", example: str = "match=aabb") -> Parameter:  # fmt: skip
+                    "help lists all.", example: str = "match=aabb") -> Declared:  # fmt: skip
     """Declare ``--set`` for the settings of ``kinds``; a class that takes long to import is given as a LazyFunction."""
 
     def show(values: list[str] | None) -> list[str] | None:
@@ -335,33 +365,27 @@ def _settings_lines(settings: Mapping[str, Setting]) -> list[str]:
     for name, declared in settings.items():
         default = declared.default
         shown = default if isinstance(default, str) else json.dumps(default, default=str)
-        if isinstance(default, tuple):
-            shown = ",".join(map(str, default))
         lines += [f"{name}={shown}", *textwrap.wrap(declared.help, width, initial_indent="    ",
                   subsequent_indent="    ")]  # fmt: skip
     return lines
 
 
+def parse_path(word: str) -> Path:
+    """Parse a path; a leading ~ is the home folder, also after a = where the shell does not expand it."""
+    return Path(word).expanduser()
+
+
 def share_list(text: str) -> list[str]:
     """Parse shares that are separated by commas: "1,4.4%" -> ["1%", "4.4%"]."""
     shares = [f"{number.strip().removesuffix('%')}%" for number in text.split(",")]
-    try:
-        numbers = [parse_share(share) for share in shares]
-    except ValueError:
-        numbers = []
-    if len(set(numbers)) < len(shares):
-        raise typer.BadParameter(f"expected different shares in %, such as 1,2,4.4,10, got {text!r}")
+    if len({parse_share(share) for share in shares}) < len(shares):
+        raise ValueError(f"expected different shares in %, such as 1,2,4.4,10, got {text!r}")
     return shares
 
 
 def named_or_none(text: str) -> Path | str:
     """Parse ``--cameras``, ``--images`` and ``--masks``: a path, or the word none; ./none is a path."""
-    return text if text == NONE else Path(text)
-
-
-def number_or_text(text: str) -> int | str:
-    """Parse ``--k``: a number, or a word such as "auto"."""
-    return int(text) if text.isdecimal() else text
+    return text if text == NONE else parse_path(text)
 
 
 BEFORE = argument("before", Path, "BEFORE", "The scene: a .ply, or the folder that holds it.")
@@ -397,9 +421,9 @@ _TABLE = (
     ),
     panel(
         COUNT,
-        setting_option("k", parser=number_or_text),
-        setting_option("budget"),
-        setting_option("quality"),
+        setting_option("k", metavar="1-8|mixed|auto"),
+        setting_option("budget", metavar="40000|2%|5MB|DEVICE|auto"),
+        setting_option("quality", metavar="30dB|-0.2dB"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),
     ),
     panel(
@@ -413,9 +437,11 @@ _TABLE = (
     ),
     panel(
         OUTPUT,
-        setting_option("crop"),
-        setting_option("drop"),
-        *map(setting_option, ("up", "scale", "rotate", "translate", "sh_degree")),
+        setting_option("crop", metavar="SHAPE"),
+        setting_option("drop", metavar="floaters,sky,..."),
+        *map(setting_option, ("up", "scale", "sh_degree")),
+        setting_option("rotate", metavar="X,Y,Z"),
+        setting_option("translate", metavar="X,Y,Z"),
         option("output", Path, "", "--output", "-o"),
         switch("overwrite", "Replace the output if it exists."),
         switch("strict", "Exit with code 4, after writing everything, if a result shows the scene's photos more "
@@ -426,18 +452,20 @@ _TABLE = (
     ),
     panel(
         "Running",
-        setting_option("engine", default="local", wording=None),
+        setting_option("engine", default="local"),
     ),
     panel(
         GENERAL,
         setting_option("seed"),
-        setting_option("threads"),
+        setting_option("threads", wording="all processors"),
+        option("progress", STYLES, "json: print a line for each step on stderr, with the seconds left.",
+               default=STYLES[0]),
         switch("quiet", "Print errors only.", "-q"),
     ),
 )  # fmt: skip
 OPTIONS = {parameter.name: parameter for parameters in _TABLE for parameter in parameters}
 
 
-def output(help: str, wording: str | None = None, default: Any = None) -> Parameter:
+def output(help: str, wording: str | None = None, default: Any = None) -> Declared:
     """Declare ``-o/--output`` of a command, a file or a folder; ``default`` may be REQUIRED."""
     return changed("output", default, help=help, show_default=wording or default is not REQUIRED)

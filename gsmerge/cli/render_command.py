@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import typer
-
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_folder, check_outputs, input_files
@@ -27,7 +25,7 @@ def parse_size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(SIDES[0] <= side <= SIDES[1] for side in size):
-        raise typer.BadParameter(f"expected WIDTHxHEIGHT, such as 1920x1080, {SIDES[0]} to {SIDES[1]} pixels each")
+        raise ValueError(f"expected WIDTHxHEIGHT, such as 1920x1080, {SIDES[0]} to {SIDES[1]} pixels each")
     return size
 
 
@@ -37,7 +35,7 @@ def parse_views(text: str) -> int | str:
         return text
     count = int(text[:MAX_DIGITS]) if text.isdecimal() else 0
     if count < 1:
-        raise typer.BadParameter(f"expected a number from 1 or the name of a view, got {text}")
+        raise ValueError(f"expected a number from 1 or the name of a view, got {text}")
     return count
 
 
@@ -50,7 +48,7 @@ def parse_background(text: str) -> float | str:
     except ValueError:
         level = -1
     if not 0 <= level <= 1:
-        raise typer.BadParameter("expected a grey level, 0 to 1, or none")
+        raise ValueError("expected a grey level, 0 to 1, or none")
     return level
 
 

@@ -60,7 +60,7 @@ def view(args: opt.Args) -> None:
         )  # fmt: skip
     page = view_page(data)
     write_texts({output: page}, overwrite=True)
-    say_notes(data.notes, quiet=args.silent)
+    say_notes(data.notes, data.doubts, quiet=args.silent)
     summary = headline(data) + speed_words(speed(data)).replace("\u00a0", " ")
     notes = [*pair.notes, *data.notes]
     document = {**document_head(), "output": str(output), "notes": notes, "bytes": len(page), "headline": summary}

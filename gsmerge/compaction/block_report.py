@@ -52,11 +52,11 @@ def join_reports(
     worse = None
     if pictures is not None:
         worse = describe_loss("the result", *compared_psnr(parts.covered, before, after), pictures)
-    notes = list(dict.fromkeys(run.notes))
     return CompactReport(
         num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
         psnr_after=after, choices=run.choices | {"scored_views": num_scored},
-        notes=notes if worse is None else [*notes, worse], options=options.to_dict(),
+        notes=[*run.notes, *filter(None, [worse])], doubts=[*run.doubts, *filter(None, [worse])],
+        options=options.to_dict(),
         peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference, **vars(parts),
     )  # fmt: skip
 

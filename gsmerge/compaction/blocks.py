@@ -13,7 +13,6 @@ from gsmerge.compaction.block_report import BlockScores, join_reports
 from gsmerge.compaction.block_start import BlockStart, start_block
 from gsmerge.compaction.file_size import drop_to_bytes, measure_rest
 from gsmerge.compaction.forecast import AFTER, BEFORE, fit_cost
-from gsmerge.compaction.new_views import note_no_trial
 from gsmerge.compaction.partition import (
     Block,
     Covisibility,
@@ -33,13 +32,11 @@ from gsmerge.plan import WHOLE_GAUSSIANS, SceneChoices
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages
-from gsmerge.runtime.record import Record, add_seconds, begin_part, choose, expect_parts, note, stage
+from gsmerge.runtime.record import Record, add_seconds, begin_part, choose, current_record, expect_parts, note, stage
 from gsmerge.runtime.time_left import Part
 from gsmerge.runtime.work import start_work
-from gsmerge.settings.budget import parse_share, share_text
-from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.setting import piece_settings
-from gsmerge.settings.stages import AUTO_SHARE
+from gsmerge.settings.budget import AUTO, parse_share, share_text
+from gsmerge.settings.compact import PIECE, CompactOptions
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.stages.prune import split_unseen
 from gsmerge.types import Cameras, Decoded, Gaussians, Scene
@@ -77,8 +74,6 @@ def compact_in_blocks(
     count, limit = len(blocks), choices.limits.count
     if scene.images is not None:
         note(f"compacted in {count} blocks of views: photos keep their exposures, and new views are not estimated")
-    elif options.new_views:
-        note_no_trial("the scene is compacted in blocks")
     with stage("partition"):
         factors = count_factors(blocks, covisibility).tolist()
         frame, options = scene_frame(scene), with_choices(options, choices)
@@ -141,8 +136,10 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
     """Yield each value with the choices of its record; add the seconds and notes to the current record."""
     for value, record in outcomes:
         add_seconds(record.seconds)
-        for text in record.notes:
-            note(text)
+        for entry in record.entries:
+            note(entry.text, doubt=entry.doubt)
+        if stray := record.choices.get("photos_left_out"):
+            choose(photos_left_out=[*current_record().choices.get("photos_left_out", ()), *stray])
         yield value, record.choices
 
 
@@ -230,7 +227,7 @@ def block_options(
     quarter of the pixels, so each view is fitted as often as in one piece. ``limit`` is the number of Gaussians of all
     blocks together; None: ``superpixels`` and K decide.
     """
-    settings: dict[str, Any] = {**piece_settings(CompactOptions), "budget": None}
+    settings: dict[str, Any] = {**PIECE, "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part
@@ -240,6 +237,6 @@ def block_options(
     elif isinstance(superpixels, str) and superpixels.endswith("%"):
         share = min(1.0, min(factor, MOST_DENSITY) * parse_share(superpixels))
         settings["superpixels"] = share_text(round(share, 6))
-    elif superpixels != AUTO_SHARE:
+    elif superpixels != AUTO:
         settings["superpixels"] = round(min(factor, MOST_DENSITY) * int(superpixels))
     return options.with_settings(settings)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import Any
 from weakref import ReferenceType, ref
 
 import numpy as np
@@ -22,7 +22,7 @@ from gsmerge.compaction.file_size import Rebuild, meet_bytes
 from gsmerge.compaction.forecast import RunForecast
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.methods import Method, choose_method
-from gsmerge.compaction.new_views import explain_no_trial, note_no_trial, trial_part, try_new_views
+from gsmerge.compaction.new_views import trial_part, try_new_views
 from gsmerge.compaction.report import CompactReport
 from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, meet, search_count
@@ -33,7 +33,7 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.frozen import dataclass
 from gsmerge.pipeline import Build
-from gsmerge.plan import Plan, choose_for_scene, note_engine, note_surplus
+from gsmerge.plan import Plan, choose_for_scene, note_surplus
 from gsmerge.runtime.record import (
     Progress,
     Record,
@@ -51,11 +51,6 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians, Scene, StrPath
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from gsmerge.settings.keywords import CompactKeywords
-
 # The requested count has to remain after clean-up. So the scene is built with SURPLUS times this count, at most
 # MAX_BUILDS times
 MAX_BUILDS, SURPLUS = 3, 1.05
@@ -63,11 +58,7 @@ MAX_BUILDS, SURPLUS = 3, 1.05
 
 @check_arguments
 def compact(
-    scene: Scene | StrPath,
-    options: CompactOptions | None = None,
-    *,
-    progress: Progress | None = None,
-    **settings: Unpack[CompactKeywords],
+    scene: Scene | StrPath, options: CompactOptions | None = None, *, progress: Progress | None = None, **settings: Any
 ) -> CompactResult:
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
 
@@ -107,7 +98,6 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
     """Compact a scene: in blocks if its views are cut into several, otherwise in one piece."""
     size = measure_size(scene)
     choices = choose_for_scene(size, options)  # the decisions that need no computation
-    note_engine(size, options, choices.blocks)
     note_surplus(size, options.budget)
     if choices.blocks > 1:
         from gsmerge.compaction.blocks import compact_in_blocks, cut_views
@@ -122,9 +112,7 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
 
 def _warn_of_doubts(report: CompactReport) -> None:
     """Warn the caller of :func:`compact` of everything that makes the result doubtful."""
-    agreement = report.choices.get("agreement") or {}
-    doubts = [report.worse, report.unmet, *(text for text in report.notes if text == agreement.get("doubt"))]
-    for text in dict.fromkeys(filter(None, doubts)):
+    for text in filter(None, [*report.doubts, report.unmet]):
         warnings.warn(text, DoubtWarning, stacklevel=4)  # the caller: above this function, compact and its decorator
 
 
@@ -147,8 +135,6 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
     forecast.expect_end(counts)
     levels = [build_scored(method.build, *fixed, count) for count in counts]
     trial = try_new_views(prepared, plan, method.build, len(best.gaussians))
-    if options.new_views and trial is None:
-        note_no_trial(explain_no_trial(prepared, len(best.gaussians)))
     begin_part()
     return make_result(best, levels, prepared, plan, search.facts(best), trial)
 

@@ -9,8 +9,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import numpy as np
-
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.outputs import add_views, name_photos, named_cameras, other_cameras
 from gsmerge.compaction.report import report_document
@@ -26,19 +24,14 @@ from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents, find_format
 from gsmerge.io.formats.write import output_notes
 from gsmerge.runtime.memory import release_memory
-from gsmerge.runtime.record import Progress, record_part
-from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.runtime.record import Progress, list_some
+from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.scene.files import SceneFiles, result_cameras, scene_title
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.stages.clean import BOX_QUANTILES
 from gsmerge.types import Scene
-
-# Sum of opacity times area of a scene's Gaussians, for each view, as a share of the squared diagonal of their box. If
-# merging leaves only Gaussians that are too transparent to be kept, the sum is at most a tenth of this bound
-COVERED = 0.006
-SAMPLE_GAUSSIANS = 200_000  # this sum is estimated from at least this many Gaussians, if there are as many
+from gsmerge.words import count_words
 
 
 @dataclass(frozen=True)
@@ -59,7 +52,7 @@ def compact_files(
     outputs: Outputs,
     *,
     opacity: OpacityChoice = "auto",
-    hints: ReadHints = AUTO,
+    hints: ReadHints = NO_HINTS,
     progress: Progress | None = None,
     hashed: bool = False,
     seconds_before: Mapping[str, float] | None = None,
@@ -91,7 +84,8 @@ def compact_files(
             warnings.simplefilter("ignore", DoubtWarning)  # the report has them
             result = compact(load.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
-            raise nothing_left(files.ply)
+            nothing = "expected Gaussians that show something, found none that remains after merging"
+            raise SceneError(files.ply, nothing, "check its scales and opacities")
         result = _padded(result) if outputs.full_columns else result
         compacted, results = perf_counter(), (result, *result.coarser)
         comments, expected = [RESULT_COMMENT, *load.comments], result.report.new_views
@@ -104,8 +98,9 @@ def compact_files(
         written = format_.write(add, out, temporary, contents)
         if cameras_path is not None:
             add_views(add, cameras_path, cameras, names, overwrite=outputs.overwrite)
-        left_out = [load.left_out, *(note for note in result.report.notes if STRAY_PHOTOS in note)]
-        recognised = load.recognised | {"left_out": "; ".join(filter(None, left_out)) or None}
+        stray = result.report.choices.get("photos_left_out", ())
+        problem = f"{count_words(len(stray), 'photo')} {STRAY_PHOTOS}: {list_some(stray)}" if stray else None
+        recognised = load.recognised | {"left_out": "; ".join(filter(None, (load.left_out, problem))) or None}
         document = report_document(
             result.report, input_paths=files.plys, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
@@ -116,30 +111,6 @@ def compact_files(
         )  # fmt: skip
     format_.finish(out)
     return document
-
-
-def nothing_left(path: Path) -> SceneError:
-    """Return the error for a scene whose Gaussians are all too small or too transparent to show anything."""
-    problem = "expected Gaussians that show something, found none that remains after merging"
-    return SceneError(path, problem, "check its scales and opacities")
-
-
-def shows_nothing(scene: Scene) -> bool:
-    """Return whether a run would end with :func:`nothing_left`; a scene that covers little is compacted to find out."""
-    gaussians = scene.gaussians
-    sample = gaussians[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
-    if len(sample) == 0:
-        return False
-    low, high = np.percentile(sample.means.astype(np.float64), BOX_QUANTILES, axis=0)
-    areas = np.sort(sample.scales.astype(np.float64), axis=1)[:, 1:].prod(1)
-    covered = len(gaussians) * float((sample.opacities * areas).mean())
-    num_views = len(scene) if scene.has_own_pixels else 1
-    if covered > COVERED * num_views * float(np.square(high - low).sum()):
-        return False
-    settings = CompactOptions().with_settings({"effort": "draft", "fit": "none"})
-    with record_part(silent=True), warnings.catch_warnings():
-        warnings.simplefilter("ignore", DoubtWarning)
-        return len(compact(scene, settings).gaussians) == 0
 
 
 def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
@@ -162,7 +133,7 @@ def _views_once(scene: Scene) -> list[int]:
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
 
 
-def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> Loaded:
+def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> Loaded:
     """Read a scene from its files, with notes on missing or unusual content; SceneError if it cannot be read."""
     loaded = load_files(files, opacity=opacity, hints=hints).without_photos()
     release_memory()

@@ -16,8 +16,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
-from gsmerge.settings.compact import OURS, CompactOptions
-from gsmerge.settings.setting import piece_settings
+from gsmerge.settings.compact import OURS, TRIAL, CompactOptions
 from gsmerge.types import Gaussians, PicturedScene
 
 LEAST_VIEWS = 4  # fewest views with photos; of fewer views, too little would remain
@@ -58,7 +57,7 @@ class LeftOut:
 
         ``settings`` replace some of them. Others, which only the whole scene can decide, get the values of a trial.
         """
-        settings = plan.settings | piece_settings(CompactOptions, trial=True) | settings
+        settings = plan.settings | TRIAL | settings
         settings |= {"method": OURS, "checkpoint": "none"} if plan.checkpoint is None else {}
         return make_plan(self.rest, CompactOptions().with_settings(settings), plan.checkpoint)
 

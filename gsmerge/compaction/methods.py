@@ -17,13 +17,13 @@ from gsmerge.pipeline import build
 from gsmerge.plan import Plan, stands_alone
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
-from gsmerge.settings.compact import OURS, CompactOptions, changed_settings, decided_settings
-from gsmerge.settings.setting import names_of
-from gsmerge.settings.stages import PrepareOptions
+from gsmerge.settings.compact import COUNTS, OURS, CompactOptions
+from gsmerge.settings.setting import flat_settings
+from gsmerge.settings.stages import DecodeOptions, MatchOptions, PrepareOptions, SegmentOptions
 from gsmerge.types import Gaussians, Scene
 
 Need = Literal["photos", "pixels"]
-COUNTS = names_of(CompactOptions, lambda setting: setting.counts)  # settings that decide the number of Gaussians
+COMMON = ("method", "seed", "threads", "crop", "drop")  # settings that all methods use
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,10 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
     Raises UsageError if the scene lacks what the method needs, or if a program that it runs is missing.
     """
     if stands_alone(scene, options):
-        return replace(SUPERPIXELS, prepare=prepare_alone), _unused_alone(options)
+        kinds = (PrepareOptions, SegmentOptions, MatchOptions, DecodeOptions)  # settings that act on views
+        unused = options.changed(name for kind in kinds for name in flat_settings(kind) if name not in COUNTS)
+        notes = [f"these settings have no effect without cameras: {', '.join(unused)}"] if unused else []
+        return replace(SUPERPIXELS, prepare=prepare_alone), notes
     method = find_method(options)
     if method is SUPERPIXELS:
         return method, []
@@ -89,14 +92,8 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
         raise UsageError(f"{place}: expected photos, found none; give --images, or another method")
     if "pixels" in method.needs and not scene.has_own_pixels:
         raise UsageError(f"{place}: expected one Gaussian per pixel of every view; give another method")
-    unused = [name for name in changed_settings(options, lambda one: not one.common) if name not in method.uses]
+    unused = options.changed(name for name in options.to_dict() if name not in (*COMMON, *method.uses))
     return method, [f"{place} does not use {', '.join(unused)}"] if unused else []
-
-
-def _unused_alone(options: CompactOptions) -> list[str]:
-    """Return a note on changed settings that have no effect on a scene without views, if there are any."""
-    unused = decided_settings(options, lambda one: one.acts_on and not one.counts)
-    return [f"these settings have no effect without cameras: {', '.join(unused)}"] if unused else []
 
 
 def choose_method(options: CompactOptions, scene: Scene) -> Method:

@@ -13,7 +13,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from gsmerge.compaction.forecast import AFTER, BEFORE, fit_cost
-from gsmerge.compaction.left_out import LEAST_SEEN, LEAST_VIEWS, can_leave_out, choose_views, leave_out, mean_seen
+from gsmerge.compaction.left_out import LEAST_SEEN, can_leave_out, choose_views, leave_out, mean_seen
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import subset
 from gsmerge.frozen import dataclass
@@ -23,7 +23,7 @@ from gsmerge.kernels.elementary import power
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import shrink_pictures
-from gsmerge.runtime.record import add_seconds, begin_part, note, record_part
+from gsmerge.runtime.record import add_seconds, begin_part, record_part
 from gsmerge.runtime.time_left import Part
 from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
@@ -86,7 +86,7 @@ class Trial:
 
 def trial_part(prepared: Prepared, plan: Plan) -> Part | None:
     """Return the cost of the trial on views that are left out; None if there is no trial."""
-    if not _has_trial(prepared, plan):
+    if not (plan.new_views and can_try(prepared)):
         return None
     scene, num_rounds = prepared.scene, len(choose_views(prepared.reference.score_views))
     pixels = scene.pixels_per_view / _reduction(scene) ** 2
@@ -96,24 +96,10 @@ def trial_part(prepared: Prepared, plan: Plan) -> Part | None:
     return Part(before, num_rounds * fits, after, num_rounds)
 
 
-def _has_trial(prepared: Prepared, plan: Plan) -> bool:
-    return plan.new_views and explain_no_trial(prepared) is None
-
-
-def explain_no_trial(prepared: Prepared, count: int = 0) -> str | None:
-    """Return why there is no trial for a result of ``count`` Gaussians; None if there can be one."""
-    if prepared.agreement is None:
-        return "the scene does not have one Gaussian per pixel of several views"
-    if not can_leave_out(prepared):
-        return f"fewer than {LEAST_VIEWS} views have photos"
+def can_try(prepared: Prepared, count: int = 0) -> bool:
+    """Return whether there can be a trial for a result of ``count`` Gaussians."""
     pixels = prepared.scene.pixels_per_view * len(prepared.scene)
-    share = f"{100 * MOST_SHARE:.0f} % of the Gaussians"
-    return f"the result has more than {share}" if count > MOST_SHARE * pixels else None
-
-
-def note_no_trial(reason: str | None) -> None:
-    """Note that the user has asked for an estimate of new views that there is not, and why."""
-    note(f"new_views=true: new views are not estimated, because {reason or 'views show different parts of the scene'}")
+    return prepared.agreement is not None and can_leave_out(prepared) and count <= MOST_SHARE * pixels
 
 
 def _reduction(scene: PicturedScene) -> int:
@@ -128,7 +114,7 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     their own. Then the Gaussians still contain the left-out photos, so the error is 2 dB instead of 1.2, and the trial
     takes a quarter of a run's time.
     """
-    if not plan.new_views or explain_no_trial(prepared, count) is not None:
+    if not plan.new_views or not can_try(prepared, count):
         return None
     pixels = prepared.scene.pixels_per_view * len(prepared.scene)
     begin_part()

@@ -73,6 +73,7 @@ class CompactReport:
             ``fidelity`` has the ``psnr`` (dB) against renders of the input and the number of ``views`` for it; these
             are ``held_out`` if they were placed because the scene has no cameras.
         notes: Warnings about the input and adaptations to it, one sentence each.
+        doubts: Those of the notes that make the result doubtful.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how near the result came; None if it is met.
@@ -107,6 +108,7 @@ class CompactReport:
     new_views: NewViews | None = None
     photo_files: PhotoFiles | None = None
     protected: Covered | None = None
+    doubts: Sequence[str] = ()
 
     def __repr__(self) -> str:
         return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"
@@ -207,6 +209,7 @@ def report_document(
         "psnr_protected": numbers["protected"],
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
+        "doubts": list(report.doubts),
         "unmet": numbers["unmet"],
         "worse": next((entry.worse for entry in (report, *(level for _, level in coarser)) if entry.worse), None),
     }
@@ -217,48 +220,57 @@ def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Sequence[Pa
     return {"path": os.fspath(path), "bytes": num_bytes, "num_gaussians": report.num_output}
 
 
-def result_table(document: Mapping[str, Any], next_step: str | None = None, *, columns: int | None = None) -> list[str]:
-    """Return the closing table of ``compact`` in a terminal of ``columns`` characters, with a ``next_step`` if any.
-
-    Paths and the next step are never broken into lines, because people copy them.
-    """
-    before, after, psnr = document["input"], document["output"], document["psnr_input_views"]
-    ratio = human_share(document["ratio"])
-    rows = [
-        ("Gaussians", f"{before['num_gaussians']:,}", f"{after['num_gaussians']:,}", ratio),
-        ("file", human_bytes(before["bytes"]), human_bytes(after["bytes"]), ""),
-    ]
+def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+    """List what a result is: name of a figure, its value before and after, and words about it."""
+    files, psnr = (document["input"], document["output"]), document["psnr_input_views"]
+    counts, sizes = [f"{file['num_gaussians']:,}" for file in files], [human_bytes(file["bytes"]) for file in files]
+    rows = [("Gaussians", counts[0], counts[1], human_share(document["ratio"])), ("file", sizes[0], sizes[1], "")]
     if new := document["new_views"]:
-        gain = f"{new['low']:+.1f} to {new['high']:+.1f} dB"
-        source = f"{gain} expected, from {new['views']} photos left out"
-        rows += [("new views", f"{new['before']:.1f} dB", f"{new['after']:.1f} dB", source)]
-    if psnr["before"] is not None and psnr["after"] is not None:
-        views = f"a sample, of {document['choices']['scored_views']} of its views"
-        rows += [(_own(document), f"{psnr['before']:.2f} dB", f"{psnr['after']:.2f} dB", views)]
-    if covered := document["psnr_covered"]:
-        share = f"on the {100 * covered['share']:.0f} % that the input covers"
-        rows += [("", f"{covered['before']:.2f} dB", f"{covered['after']:.2f} dB", share)]
-    if files := _scores_on_files(document):
-        rows += [
-            ("", f"{files['before']:.2f} dB", f"{files['after']:.2f} dB", "on its photos as their files have them")
-        ]
-    if protected := document.get("psnr_protected"):
-        share = f"on the {100 * protected['share']:.1f} % that are protected"
-        rows += [("", f"{protected['before']:.2f} dB", f"{protected['after']:.2f} dB", share)]
+        gain = f"{new['low']:+.1f} to {new['high']:+.1f} dB expected, from {new['views']} photos left out"
+        rows += [("new views", f"{new['before']:.1f} dB", f"{new['after']:.1f} dB", gain)]
+    scores = {
+        f"a sample, of {document['choices'].get('scored_views')} of its views": None if None in psnr.values() else psnr,
+        "on the {:.0f} % that the input covers": document["psnr_covered"],
+        "on its photos as their files have them": _scores_on_files(document),
+        "on the {:.1f} % that are protected": document.get("psnr_protected"),
+    }
+    for words, score in scores.items():
+        if score:
+            name = _own(document) if score is psnr else ""
+            about = words.format(100 * score.get("share", 0))
+            rows += [(name, f"{score['before']:.2f} dB", f"{score['after']:.2f} dB", about)]
     if fidelity := document["choices"].get("fidelity"):
         rows += [("PSNR", "", psnr_words(fidelity["psnr"]), _describe_views(fidelity))]
     if pruned := document["choices"].get("pruned"):
         rows += [("left out", "", f"{pruned:,}", "Gaussians that no view shows")]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
-    rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]
+    return [*rows, ("time", "", seconds_line(document), f"most in {stages}")]
+
+
+def result_table(document: Mapping[str, Any], next_step: str | None = None, *, columns: int | None = None) -> list[str]:
+    """Return the closing table of ``compact`` in a terminal of ``columns`` characters, with a ``next_step`` if any.
+
+    Paths and the next step are never broken into lines, because people copy them.
+    """
+    rows = result_facts(document)
     figures = text_table([row[:3] for row in rows], "  ")
     hang = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
     lines = [(f"{left}  {row[3]}".rstrip(), hang) for left, row in zip(figures, rows, strict=True)]
     lines += [(line, 0) for line in (*level_lines(document), *curve_lines(document))]
     wrapped = [part for line, hang in lines for part in wrap_line(line, columns, hang)]
     last = {"cameras": document.get("viewer_cameras"), "next": next_step}
-    return [after["path"], *wrapped, *(f"  {name:9}  {text}" for name, text in last.items() if text is not None)]
+    shown = [f"  {name:9}  {text}" for name, text in last.items() if text is not None]
+    return [document["output"]["path"], *wrapped, *shown]
+
+
+def summary_line(document: Mapping[str, Any]) -> str:
+    """Describe the result in one line: the figures of the table."""
+    parts = []
+    for name, before, after, about in result_facts(document):
+        change = f"{before} -> {after}" if before else after
+        parts.append(" ".join(filter(None, (name, change, about and f"({about})"))))
+    return f"{document['output']['path']}: {'; '.join(parts)}"
 
 
 def _describe_views(fidelity: Mapping[str, Any]) -> str:
@@ -296,33 +308,6 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
     num_photos = document["choices"].get("curve_left_out")
     scored_on = count_words(num_photos, "photo") if num_photos else "patches of the photos"
     return [f"short fits of half the size compare counts, on {scored_on} that they left out:", head, *rows]
-
-
-def summary_line(document: Mapping[str, Any]) -> str:
-    """Describe the result in one line: counts, ratio, bytes, PSNR, seconds per stage, the cameras beside it."""
-    before, after = document["input"], document["output"]
-    psnr, path = document["psnr_input_views"], document.get("viewer_cameras")
-    cameras = f"; cameras for viewers in {os.path.basename(path)}" if path else ""
-    fidelity = document["choices"].get("fidelity")
-    quality = f"; {psnr_words(fidelity['psnr'])} {_describe_views(fidelity)}" if fidelity else ""
-    if psnr["before"] is not None and psnr["after"] is not None:
-        quality = f"; a sample of {_own(document)} {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
-    if new := document["new_views"]:
-        quality = f"; new views {new['low']:+.1f} to {new['high']:+.1f} dB expected{quality}"
-    if covered := document["psnr_covered"]:
-        share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
-        quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
-    if files := _scores_on_files(document):
-        quality += f", {files['before']:.2f} -> {files['after']:.2f} dB on the photos as their files have them"
-    if protected := document.get("psnr_protected"):
-        quality += f", {protected['before']:.2f} -> {protected['after']:.2f} dB where they are protected"
-    ratio, pruned = human_share(document["ratio"]), document["choices"].get("pruned")
-    share = f"{ratio}; {pruned:,} that no view shows are left out" if pruned else ratio
-    return (
-        f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
-        f" ({share}), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
-        f"{quality}; {seconds_line(document)}{cameras}"
-    )
 
 
 def _scores_on_files(document: Mapping[str, Any]) -> Mapping[str, float] | None:

@@ -166,11 +166,12 @@ def make_result(
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
     main = _report(best, prepared, plan, before, part_scores[0], seconds, 0)
-    choices, notes = run.choices | main.choices | search.choices, [*run.notes, *search.notes, *main.notes]
     new_views, worse = _expect_new_views(main, prepared, trial)
-    if worse is not None:
-        main, notes = replace(main, worse=worse), [*notes, worse]
-    main = replace(main, choices=choices, notes=notes, unmet=search.unmet, new_views=new_views)
+    main = main if worse is None else with_worse(main, worse)
+    main = replace(
+        main, choices=run.choices | main.choices | search.choices, notes=[*run.notes, *search.notes, *main.notes],
+        doubts=[*run.doubts, *main.doubts], unmet=search.unmet, new_views=new_views,
+    )  # fmt: skip
     coarser = tuple(
         CompactResult(
             candidate.gaussians,
@@ -198,12 +199,12 @@ def _report(
     report = CompactReport(
         prepared.input_scene.num_gaussians, len(candidate.gaussians), dict(seconds), before, after, record.choices,
         record.notes, plan.settings, peak_memory(), psnr_reference=None if before is None else reference.name,
-        **vars(parts),
+        doubts=record.doubts, **vars(parts),
     )  # fmt: skip
     if prepared.doubt is not None:  # no score says anything, so the report has none
         choices = {key: value for key, value in record.choices.items() if key != "fidelity"}
         report = replace(report, psnr_before=None, psnr_after=None, **vars(PartScores()), choices=choices)
-        return replace(report, notes=[*report.notes, prepared.doubt], worse=prepared.doubt)
+        return with_worse(report, prepared.doubt)
     worse = None
     if rendered and level == 0 and not plan.clean.visible_drops:  # coarser levels are meant to differ
         worse = describe_distance(candidate.psnr)
@@ -211,7 +212,12 @@ def _report(
         name, pictures = f"level {level}" if level else "the result", reference.name
         compared = compared_psnr(parts.covered, before, after)
         worse = describe_loss(name, *compared, OWN_PHOTOS if pictures == PHOTOS else pictures)
-    return report if worse is None else replace(report, notes=[*report.notes, worse], worse=worse)
+    return report if worse is None else with_worse(report, worse)
+
+
+def with_worse(report: CompactReport, worse: str) -> CompactReport:
+    """Add the doubt that a result is worse than its input."""
+    return replace(report, notes=[*report.notes, worse], doubts=[*report.doubts, worse], worse=worse)
 
 
 def _expect_new_views(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -39,11 +39,6 @@ from gsmerge.scene.input import TOLERANCE, check_cameras, check_numbers, check_v
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
 from gsmerge.words import count_words
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from gsmerge.settings.keywords import CompactKeywords
-
 ORDERS = ("view-major", "none")
 _NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may exceed it
 _EXACT = 1e-5  # the same difference from which on quaternions are normalised
@@ -73,7 +68,7 @@ def compact_tensors(
     names: Sequence[str] | None = None,
     order: str = "view-major",
     progress: Progress | None = None,
-    **settings: Unpack[CompactKeywords],
+    **settings: Any,
 ) -> CompactResult:
     """Compact Gaussians given as arrays or tensors, as :func:`gsmerge.compact` compacts a scene.
 

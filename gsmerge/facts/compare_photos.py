@@ -50,7 +50,7 @@ FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
 MIDDLE_GREY = 128  # level of 255 at which notes report the change of tone
 MOSTLY = 0.5  # share of a photo that differs from its Gaussians, above which none of it counts
 LEAST_PERCENT = 1  # of a photo; no note says that less of it differs
-STRAY_PHOTOS = "photos do not show what the Gaussians show"  # part of the note on photos that are not used
+STRAY_PHOTOS = "do not show what the Gaussians show"  # said of photos that are not used
 
 
 def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedScene, tuple[int, ...]]:
@@ -188,7 +188,7 @@ def _leave_out(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence
     result = f" and are not used: {listed}"
     if not are_few:
         result = f", so no photo is used: {listed}; check their names and order"
-    note(f"{len(stray)} of {len(photo_views)} {STRAY_PHOTOS}{result}")
+    note(f"{len(stray)} of {len(photo_views)} photos {STRAY_PHOTOS}{result}")
     return are_few
 
 

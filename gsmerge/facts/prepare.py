@@ -144,7 +144,7 @@ def prepare(
     if agreement is not None:
         choose(agreement=agreement.to_dict())
         if agreement.doubt:
-            note(agreement.doubt)
+            note(agreement.doubt, doubt=True)
         prepared = replace(prepared, agreement=agreement)
     return _without_holes(prepared, options) if fill and prepared.reference.of_views else prepared
 

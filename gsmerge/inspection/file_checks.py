@@ -6,7 +6,6 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.io import file_notes
@@ -28,7 +27,7 @@ from gsmerge.io.formats.table import (
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
-from gsmerge.scene.exporters import AUTO
+from gsmerge.scene.exporters import NO_HINTS
 from gsmerge.scene.files import find_scene_files, list_plys
 from gsmerge.scene.read import load_files
 from gsmerge.settings.reading import OpacityChoice, ReadHints
@@ -65,7 +64,7 @@ class FileCheck:
         return f"ok     {self.path}: {self.count:,} {unit}{layout}{views}{size}"
 
 
-def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> FileCheck:
+def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> FileCheck:
     """Read a file completely: Gaussians with the cameras and photos beside them, cameras, networks or a ``.gsm``.
 
     The ending decides the kind of file. A scene is read as ``compact`` reads it. UsageError if a package is missing.
@@ -129,8 +128,6 @@ def _read(path: Path) -> FileCheck:
 def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileCheck:
     """Read the Gaussians of a scene, with the cameras and photos that belong to them."""
     load = load_files(find_scene_files(path), opacity=opacity, hints=hints)
-    if shows_nothing(load.scene):
-        raise nothing_left(load.files.ply)
     info, images = load.info, load.scene.images
     notes, num_photos = (*load.notes, *degree_notes(info)), 0 if images is None else len(images)
     return FileCheck(

@@ -12,7 +12,6 @@ import numpy as np
 from gsmerge.alignment import check_cameras
 from gsmerge.arguments import check_arguments
 from gsmerge.compaction.estimate import estimate, estimate_lines
-from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
@@ -173,8 +172,6 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         return facts | {"alignment_problem": str(error)}
     facts |= {name: (path := getattr(load.files, name)) and str(path) for name in ("cameras", "images")}
     facts |= _describe_scene(load, is_result=is_result)
-    if shows_nothing(load.scene):
-        return facts | {"alignment_problem": str(nothing_left(files.ply)), "compact": None, "auto": None}
     if load.recovery is None or load.alignment is None:
         return facts | {"alignment_problem": load.problem}
     return facts | {

@@ -40,7 +40,7 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import read_into_frame
 from gsmerge.scene.read import Loaded, move_cameras_to_scene, read_gaussian_file
@@ -70,7 +70,7 @@ class DrawOptions:
     framing: SceneFiles  # Of the scene into whose frame the cameras are moved
     output: Path  # A picture, a video, or a folder for pictures
     opacity: OpacityChoice = "auto"
-    hints: ReadHints = AUTO
+    hints: ReadHints = NO_HINTS
     views: int | str | None = None  # Largest number of views, or the name of one view; None: all, in a panel four
     path: str | None = None  # See :func:`gsmerge.measure.camera_path.parse_path`, or a file of cameras
     frames: int | None = None  # Along the path; None: by SECONDS, for a spline at least VIEW_FRAMES for each view
@@ -334,7 +334,7 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     first_ply = read_gaussian_file(files, opacity=options.opacity, hints=options.hints)
     plys = [read_gaussians(path, opacity=options.opacity, scales=options.hints.scales) for path in paths[1:]]
     same_file = framing.ply == files.ply
-    framing_ply = first_ply if same_file else read_gaussian_file(framing, opacity="auto", hints=AUTO)
+    framing_ply = first_ply if same_file else read_gaussian_file(framing, opacity="auto", hints=NO_HINTS)
     framing_load = move_cameras_to_scene(framing_ply, framing, hints=options.hints, photos=photos)
     load = _with_views(framing_load, inside=photos)
     if options.overlay is not None and load is not framing_load:

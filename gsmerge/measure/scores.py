@@ -26,7 +26,7 @@ OUTSIDE = {
     "spikes": "spikes", "strokes": "strokes",
 }  # fields of Fog  # fmt: skip
 # Columns that a narrow terminal omits, in this order
-OMITTED_FIRST = ("bytes each", "overdraw", "smaller by", "threads", "earned back after", "ms/view", "kept")
+OMITTED_FIRST = ("bytes each", "overdraw", "smaller by", "threads", "ms/view", "kept")
 MASKED = "_visible"  # suffix of measures over the pixels that the input views have seen
 COVERED = "_covered"  # suffix of measures over the pixels that the input covers
 CSV_COLUMNS = (
@@ -55,6 +55,7 @@ def evaluation_document(
         "num_views": dict(evaluation.num_views),
         "results": [_result(result, evaluation, facts.get(result.name, {})) for result in evaluation.results],
         "notes": [*notes, *evaluation.notes],
+        "doubts": list(evaluation.doubts),
     }
 
 
@@ -155,7 +156,7 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     yield heading, ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
     yield (
         "Render time",
-        ("", "threads", "pixels", "ms/frame", "faster by", "earned back after"),
+        ("", "threads", "pixels", "ms/frame", "faster by"),
         [_speed_row(result, speed) for result in results for speed in result.get("speeds", ())],
     )
 
@@ -214,10 +215,8 @@ def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
 def _speed_row(result: Mapping[str, Any], speed: Mapping[str, Any]) -> Row:
     """Return a row of the table of render times."""
     faster = f"{speed['speedup']:.1f} x" if "speedup" in speed else ""
-    frames, merge = speed.get("break_even_frames"), result.get("merge_seconds")
-    earned = "" if merge is None else "never" if frames is None else f"{frames:,.0f} frames ({merge:.1f} s of merging)"
     size = f"{speed['width']} x {speed['height']}"
-    return result["name"], str(speed["threads"]), size, f"{1000 * speed['seconds']:.1f}", faster, earned
+    return result["name"], str(speed["threads"]), size, f"{1000 * speed['seconds']:.1f}", faster
 
 
 def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED) -> Iterator[str]:

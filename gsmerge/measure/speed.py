@@ -25,18 +25,16 @@ def measure_costs(
     zooms: Sequence[float],
     near: float,
     *,
-    merge_seconds: Mapping[str, float] | None = None,
     threads: int | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Measure the costs of drawing each scene.
 
     A few of the ``cameras`` are drawn at ``zooms`` times their own size. The scenes are drawn in turns, so that a
-    machine that slows down slows all of them. ``near``: near plane, in world units. ``merge_seconds``: time that it
-    took to make a scene, by name, if known. ``threads`` None: all processors.
+    machine that slows down slows all of them. ``near``: near plane, in world units. ``threads`` None: all
+    processors.
 
     Returns plain JSON types by name: ``overdraw``, the Gaussians blended per pixel, and ``speeds``, for each zoom the
-    seconds per view. All scenes but the first also have ``merge_seconds``, and in ``speeds`` the ``speedup`` against
-    the first scene and ``break_even_frames``.
+    seconds per view. All scenes but the first also have in ``speeds`` the ``speedup`` against the first scene.
     """
     sampled = cameras[pick_views(len(cameras), NUM_VIEWS)]
     costs: dict[str, dict[str, Any]] = {
@@ -51,12 +49,8 @@ def measure_costs(
                 costs[name]["speeds"].append({**head, "seconds": round(seconds, 6)})
     baseline, *results = scenes
     for name in results:
-        costs[name]["merge_seconds"] = merge = (merge_seconds or {}).get(name)
         for base_speed, speed in zip(costs[baseline]["speeds"], costs[name]["speeds"], strict=True):
-            before, after = base_speed["seconds"], speed["seconds"]
-            speed["speedup"] = before / after
-            # Frames after which merging has saved its own time (paper, supplement: timing)
-            speed["break_even_frames"] = None if merge is None or after >= before else merge / (before - after)
+            speed["speedup"] = base_speed["seconds"] / speed["seconds"]
     return costs
 
 

@@ -102,6 +102,7 @@ class ViewData:
     num_superpixels: tuple[int, int] | None = None  # least and largest number in a photo; None without outlines
     lacks_pixels: bool = False  # if True, the scene itself does not cover all pixels of the input views
     agreement: Agreement | None = None  # share of the depth that other views confirm; None: not known
+    doubts: tuple[str, ...] = ()  # those of the notes that are warnings
 
     @property
     def shown(self) -> tuple[PageView, ...]:
@@ -237,7 +238,7 @@ def page_data(
     agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
     return ViewData(
         title, tuple(sides), tuple(marked), replace(outside, faded=faded), len(views), evaluation.reference, notes,
-        num_superpixels, lacks_pixels, agreement,
+        num_superpixels, lacks_pixels, agreement, doubts=evaluation.doubts,
     )  # fmt: skip
 
 

@@ -14,8 +14,6 @@ WINDOW, SIGMA = 11, 1.5  # side of the windows of SSIM and their standard deviat
 INNER = (slice(WINDOW // 2, -(WINDOW // 2)), slice(WINDOW // 2, -(WINDOW // 2)))  # centres of windows in the image
 C1, C2 = 0.01**2, 0.03**2  # stabilisers of SSIM (K1 = .01, K2 = .03) for a data range of 1
 MAX_LOSS = 0.5  # dB of PSNR that a result may lose against its input without a warning
-WORSE = "worse than the input does"  # commands recognise the warnings among the notes by these words
-OTHER_SCENE = "which may be of another scene or in another world"
 MAX_PSNR = 120.0  # dB that replace the infinite PSNR of equal pictures
 POOR = 30.0  # dB of PSNR between a result and its input; below it their views look different
 
@@ -84,7 +82,7 @@ def describe_loss(name: str, before: float | None, after: float | None, pictures
     if before is None or after is None or not is_worse(before, after):
         return None
     loss = f"{after:.2f} dB, {before:.2f} dB before"
-    return f"{name} shows {pictures} {WORSE}: {loss}"
+    return f"{name} shows {pictures} worse than the input does: {loss}"
 
 
 def describe_distance(psnr: float | None) -> str | None:

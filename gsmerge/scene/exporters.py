@@ -20,7 +20,7 @@ from gsmerge.settings.setting import join_words, suggest_name
 if TYPE_CHECKING:
     from gsmerge.io.formats.read import FileInfo
 
-AUTO = ReadHints()
+NO_HINTS = ReadHints()
 
 
 def make_hints(values: dict[str, Any]) -> ReadHints:

@@ -15,7 +15,7 @@ from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.image_names import find_image
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.kernels.elementary import arccos
-from gsmerge.scene.exporters import AUTO
+from gsmerge.scene.exporters import NO_HINTS
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
 from gsmerge.scene.photos import stored_photos
 from gsmerge.scene.read import Loaded
@@ -65,7 +65,7 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
             path, f"expected photos of its views, found none for {missing}", f"name their folder with {_OPTION}"
         )
     pinholes, photos, _ = as_pinholes(held_out, photos)
-    photos, notes = limit_photo_size(photos, 0, AUTO.max_side, unaligned=False)
+    photos, notes = limit_photo_size(photos, 0, NO_HINTS.max_side, unaligned=False)
     place_of_view = {view: place for place, view in shared.items()}
     has_all = 0 < len(place_of_view) == len(load.scene)
     return HeldOutViews(

@@ -24,7 +24,7 @@ from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import (
-    AUTO,
+    NO_HINTS,
     Exporter,
     ReadHints,
     choose_exporters,
@@ -186,7 +186,7 @@ def load_scene(
     return load_files(replace(first, more=tuple(others)), opacity=opacity, hints=read_hints)
 
 
-def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> Loaded:
+def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> Loaded:
     """Read a scene as :func:`load_scene` does, from the files that :func:`find_scene_files` found."""
     with use_threads():
         scenes = (replace(files, more=()), *files.more)
@@ -231,7 +231,7 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
     return read_parts(files.parts, **encodings) if files.parts else read_gaussians(files.ply, **encodings)
 
 
-def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True) -> Loaded:
+def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_HINTS, photos: bool = True) -> Loaded:
     """Combine Gaussians, cameras and photos to a scene, with the pixel of every row if rows have pixels.
 
     Cameras and photos that were found beside the scene and do not belong to it are left out, with a note. SceneError as

@@ -30,8 +30,7 @@ class BudgetOptions(Settings):
         "exactly. Upper limits are a share of the input such as 2%, a file size such as 5MB, or a device that draws "
         "them fluidly: quest3, mobile or desktop. auto: as many as the scene needs.",
         "The file size is that of the output, in Python that of a `.ply`, and is never exceeded. A limit is used only "
-        "as far as new views gain from more Gaussians, unless `fill` is true.", metavar="40000|2%|5MB|DEVICE|auto",
-        counts=True, neutral=(AUTO, *DEVICES), uncut=(AUTO,), in_trial=None)  # fmt: skip
+        "as far as new views gain from more Gaussians, unless `fill` is true.")  # fmt: skip
     fill: bool = setting(False, "Use all of a share, file size or device, even if fewer Gaussians suffice.")
     most: int | None = setting(None, "Number of Gaussians beyond which new views gain nothing, if known.",
         internal=True)  # fmt: skip
@@ -39,15 +38,13 @@ class BudgetOptions(Settings):
         "most so far below the best number, such as -0.2dB, judged by PSNR + 40 SSIM.",
         "The photos are held out if there are four or more, otherwise they are those of the input. If the rows belong "
         "to no pixels and no number is asked for, the result keeps the quality of the input. Without photos it "
-        "reaches 32.5 dB against renders of the input; with photos it loses at most 0.3 dB on them.",
-        metavar="30dB|-0.2dB", whole="value", in_trial=None)  # fmt: skip
+        "reaches 32.5 dB against renders of the input; with photos it loses at most 0.3 dB on them.")  # fmt: skip
     output: str = setting(
         "", "Name of the output file, with its ending. A file size as `budget` counts its bytes.", internal=True
     )
     levels: int = setting(1, "Number of levels of detail. Each level has a quarter of the Gaussians of the one before. "
         "They are written to one file each, or all to a lod-meta.json.",
-        "Each level is fitted on its own.", least=1, most=8, whole="name", in_trial=1,
-        in_batches=False)  # fmt: skip
+        "Each level is fitted on its own.", least=1, most=8)  # fmt: skip
 
     def __post_init__(self) -> None:
         if self.quality is not None:
@@ -66,6 +63,11 @@ class BudgetOptions(Settings):
         """Names of the settings in use that need several results to be built and compared."""
         requests = {"budget auto": self.auto, "levels": self.levels > 1, f"quality {self.quality}": self.quality}
         return [name for name, is_asked in requests.items() if is_asked]
+
+    @property
+    def leaves_open(self) -> bool:
+        """Whether the budget leaves the number of Gaussians to the scene, at most with a limit."""
+        return self.budget in (None, AUTO, *DEVICES)
 
     @property
     def auto(self) -> bool:

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from gsmerge.frozen import dataclass
 from gsmerge.runtime import MOST_THREADS
 from gsmerge.runtime.plugins import METHODS, find_plugins
-from gsmerge.settings.budget import BudgetOptions
+from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.reading import SCENE_ARGUMENTS
-from gsmerge.settings.setting import (
-    Setting,
-    Settings,
-    change_settings,
-    flat_settings,
-    setting,
-    settings_of,
-    suggest_name,
-)
+from gsmerge.settings.setting import Settings, change_settings, flat_settings, setting, settings_of, suggest_name
 from gsmerge.settings.stages import (
     BlockOptions,
     CleanOptions,
@@ -41,6 +33,15 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {
         "k_low": 100 / 3, "k_high": 200 / 3, "checkpoint": "paper", "require_checkpoint": True,
     },
 }  # fmt: skip
+# Settings that decide the number of Gaussians
+COUNTS = ("superpixels", "k", "budget")
+# Values for a run on a piece of a scene, which is a block or a batch of views: the whole scene decides these
+PIECE: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "new_views": False}
+# Values for a run that tries settings on some of the views
+TRIAL: dict[str, Any] = {
+    **PIECE, "budget": None, "quality": None, "levels": 1, "crop": None, "drop": None,
+    "photo_scale": 1.0, "recipe": None,
+}  # fmt: skip
 
 
 def method_names() -> tuple[str, ...]:
@@ -61,37 +62,33 @@ class CompactOptions(Settings):
         (2, 'draft')
     """
 
-    prepare: PrepareOptions = setting(PrepareOptions(), "What may be changed before merging.", acts_on="views")
-    segment: SegmentOptions = setting(SegmentOptions(), "Superpixels.", acts_on="superpixels")
-    match: MatchOptions = setting(MatchOptions(), "Merging across views.", acts_on="superpixels")
-    decode: DecodeOptions = setting(DecodeOptions(), "Gaussians per group.", acts_on="superpixels")
+    prepare: PrepareOptions = setting(PrepareOptions(), "What may be changed before merging.")
+    segment: SegmentOptions = setting(SegmentOptions(), "Superpixels.")
+    match: MatchOptions = setting(MatchOptions(), "Merging across views.")
+    decode: DecodeOptions = setting(DecodeOptions(), "Gaussians per group.")
     fit: FitOptions = setting(FitOptions(), "Fit to the photos.")
     clean: CleanOptions = setting(CleanOptions(), "Gaussians to leave out of the result.")
     budget: BudgetOptions = setting(BudgetOptions(), "Number of Gaussians.")
     blocks: BlockOptions = setting(BlockOptions(), "Blocks of views, for scenes of many views.")
     method: str = setting(OURS, "Method: gsmerge, or a baseline to compare it with, such as voxel or contribution.",
-        "Baselines need a number of Gaussians.", choices=method_names, metavar="NAME", common=True,
-        whole="value", replaces=True)  # fmt: skip
+        "Baselines need a number of Gaussians.", choices=method_names)  # fmt: skip
     effort: str = setting("default", "Trade time for quality: best is sharper and takes two to three times as "
         "long; fast and draft take less than half.",
         "It sets the defaults of other settings, such as `fit_steps`.", choices=EFFORT_NAMES)  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
         "none, or auto, which uses the shipped networks where they improve the result.",
         "They improve it if no fit follows, and if there are photos or one Gaussian per pixel. A draft or a fast run "
-        "uses only their decoder heads.",
-        metavar="FILE|NAME", neutral=("none",), replaces=True)  # fmt: skip
+        "uses only their decoder heads.")  # fmt: skip
     recipe: str | None = setting(None, "A set of settings under one name. paper: the method of the superpixel merging "
-        "paper, with networks that have absolute outputs.", choices=tuple(RECIPES), in_trial=None,
-        replaces=True)  # fmt: skip
+        "paper, with networks that have absolute outputs.", choices=tuple(RECIPES))  # fmt: skip
     require_checkpoint: bool = setting(False, "Fail if the checkpoint cannot be used, instead of continuing without "
         "networks and with a note.")  # fmt: skip
     new_views: bool | None = setting(None, "Estimate the quality of new views, on photos that a short fit holds out.",
-        "By default if at least four views have photos, but not in a draft or without a fit.",
-        in_piece=False)  # fmt: skip
+        "By default if at least four views have photos, but not in a draft or without a fit.")  # fmt: skip
     seed: int = setting(0, "Seed of all random numbers.",
-        "Runs with the same seed are bit-identical.", least=0, common=True)  # fmt: skip
+        "Runs with the same seed are bit-identical.", least=0)  # fmt: skip
     threads: int | None = setting(None, "Number of threads; the result does not depend on it.", least=1,
-        most=MOST_THREADS, shown="all processors", common=True)  # fmt: skip
+        most=MOST_THREADS)  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,41 +105,48 @@ class CompactOptions(Settings):
     @property
     def changed_counts(self) -> list[str]:
         """Names of the settings that limit the number of Gaussians and differ from their defaults."""
-        return changed_settings(self, lambda one: one.counts)
+        return self.changed(COUNTS)
 
     @property
     def decides_count(self) -> bool:
         """Whether settings decide the number of Gaussians, instead of the scene."""
-        return self.budget.quality is not None or bool(decided_settings(self, lambda one: one.counts))
+        names = [name for name in self.changed_counts if name != "budget" or not self.budget.leaves_open]
+        return self.budget.quality is not None or bool(names)
 
     @property
     def replaces_stages(self) -> bool:
         """Whether a method, networks or a recipe replace the closed formulas of the stages."""
-        return bool(decided_settings(self, lambda one: one.replaces))
+        return self.method != OURS or self.checkpoint not in ("auto", "none") or self.recipe is not None
 
     @property
     def changes_superpixels(self) -> bool:
         """Whether settings change how superpixels are cut, merged or decoded; their number does not count."""
-        return bool(changed_settings(self, lambda one: one.acts_on == "superpixels" and not one.counts))
+        kinds = (SegmentOptions, MatchOptions, DecodeOptions)
+        return bool(self.changed([name for kind in kinds for name in flat_settings(kind) if name not in COUNTS]))
 
     @property
     def whole_only(self) -> list[str]:
         """Names of the settings in use that require the scene in one piece."""
-        values, names = self.to_dict(), changed_settings(self, lambda one: one.whole == "name")
-        for name in changed_settings(self, lambda one: one.whole == "value"):
-            names += [f"{name} {part.strip()}" for part in str(values[name]).split(",")]
-        return names
+        drops = [f"drop {name}" for name in self.clean.drops]
+        quality = [] if self.budget.quality is None else [f"quality {self.budget.quality}"]
+        method = [] if self.method == OURS else [f"method {self.method}"]
+        return [*self.changed(("crop", "levels")), *drops, *quality, *method]
 
     @property
     def uncut(self) -> list[str]:
         """Names of the settings in use that exclude blocks, but allow views that arrive in batches."""
-        values, declared = self.to_dict(), flat_settings(CompactOptions)
-        return [f"{name} {values[name]}" for name, one in declared.items() if values[name] in one.uncut]
+        values, kept = self.to_dict(), {"poses": "free", "exposure": "per-photo", "budget": AUTO}
+        return [f"{name} {value}" for name, value in kept.items() if values[name] == value]
 
     @property
     def compact_only(self) -> list[str]:
         """Names of the settings in use that ``extend`` cannot apply, since it keeps Feature Gaussians only."""
         return [*self.whole_only, *self.blocks.asked]
+
+    def changed(self, names: Iterable[str]) -> list[str]:
+        """Return those of the flat ``names`` whose settings differ from their defaults."""
+        values, declared = self.to_dict(), flat_settings(CompactOptions)
+        return [name for name in names if values[name] != declared[name].default]
 
     def to_dict(self) -> dict[str, Any]:
         """Return all settings by their flat names, as plain values."""
@@ -166,15 +170,3 @@ class CompactOptions(Settings):
             known = f"; known: {', '.join(sorted(all_settings))}"
             raise ValueError(f"unknown setting {unknown[0]!r}{hint or known}")
         return change_settings(self, {**RECIPES.get(str(settings.get("recipe")), {}), **settings})
-
-
-def changed_settings(options: CompactOptions, condition: Callable[[Setting], Any]) -> list[str]:
-    """Return the flat names of settings whose declaration meets a condition and whose value is not the default."""
-    values, declared = options.to_dict(), flat_settings(CompactOptions)
-    return [name for name, one in declared.items() if condition(one) and values[name] != one.default]
-
-
-def decided_settings(options: CompactOptions, condition: Callable[[Setting], Any]) -> list[str]:
-    """Return the :func:`changed_settings` whose values are not neutral, so that the scene decides less itself."""
-    values, declared = options.to_dict(), flat_settings(CompactOptions)
-    return [name for name in changed_settings(options, condition) if values[name] not in declared[name].neutral]

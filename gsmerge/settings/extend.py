@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gsmerge.frozen import dataclass
-from gsmerge.settings.compact import CompactOptions, changed_settings
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import Settings, setting
 
 
@@ -27,6 +27,6 @@ def batch_settings(settings: Mapping[str, Any]) -> tuple[CompactOptions, ExtendO
     values = {"effort": "draft"} | dict(settings)
     extend_options = ExtendOptions(**{name: values.pop(name) for name in names if name in values})
     options = CompactOptions().with_settings(values)
-    for name in changed_settings(options, lambda one: not one.in_batches):
-        raise ValueError(f"{name}: not possible for views that are added in batches; use compact on the whole scene")
+    if options.budget.levels > 1:
+        raise ValueError("levels: not possible for views that are added in batches; use compact on the whole scene")
     return options, extend_options

@@ -83,7 +83,7 @@ class FitOptions(Settings):
         "By default 320, scaled by `effort` and by the numbers of views and Gaussians.", least=1)  # fmt: skip
     photo_scale: float | Literal["auto"] = setting("auto", "Photo scale, relative to the view size, for two of every "
         "five later steps; at most the scale of the photos that are given.",
-        "`auto`: up to 2 with effort `default` and `best`.", least=1, below=math.inf, in_trial=1.0)  # fmt: skip
+        "`auto`: up to 2 with effort `default` and `best`.", least=1, below=math.inf)  # fmt: skip
     dropout: float | None = setting(None, "Share of the Gaussians that are left out of each step.",
         "By default 0.1 for at most five views and at least 150 steps, 0.05 for at least 600 steps and 30 steps per "
         "view, otherwise 0.", least=0, below=1)  # fmt: skip

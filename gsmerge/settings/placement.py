@@ -20,9 +20,8 @@ class PlacementOptions(Settings):
         choices=AXES)  # fmt: skip
     scale: float | None = setting(None, "Enlarge the scene about the origin by this factor.", above=0, below=1e9)
     rotate: str | None = setting(None, "Turn the scene by these angles, in degrees, about the axes x, y and z, in this "
-        "order.", metavar="X,Y,Z")  # fmt: skip
-    translate: str | None = setting(None, "Move the scene along the axes x, y and z, in units after scaling.",
-        metavar="X,Y,Z")  # fmt: skip
+        "order.")  # fmt: skip
+    translate: str | None = setting(None, "Move the scene along the axes x, y and z, in units after scaling.")
     sh_degree: int | None = setting(None, "Leave out spherical harmonics above this degree.", least=0, most=4)
 
     def __post_init__(self) -> None:

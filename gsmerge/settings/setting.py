@@ -6,7 +6,6 @@ declarations. This package imports neither NumPy nor torch, so that ``--help`` i
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import Field, field, fields, is_dataclass, replace
 from functools import cache
@@ -20,8 +19,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from gsmerge.frozen import dataclass
 
 T = TypeVar("T")
-SAME = "as it is"  # marks that a run on a piece of a scene takes the value of the whole scene
-KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
+KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
 
 @dataclass(frozen=True)
@@ -39,25 +37,6 @@ class Setting:
     unique: bool = False  # true: a list must not repeat a value
     filled: bool = False  # true: a list must have at least one value
     internal: bool = False  # true: the program sets it, users cannot
-    counts: bool = False  # true: it decides the number of Gaussians
-    neutral: tuple[Any, ...] = ()  # values besides the default with which it decides nothing
-    replaces: bool = False  # true: it replaces the closed formulas of the stages
-    in_batches: bool = True  # false: batches of views take its default only
-    # For a group of settings: "superpixels" if they decide how views become superpixels, "views" if they have another
-    # effect on views
-    acts_on: Literal["", "views", "superpixels"] = ""
-    common: bool = False  # True if every method uses it, baselines too
-    # Not empty: values other than the default need the whole scene, and messages call the setting by its "name", or
-    # by name and "value"
-
-    whole: Literal["", "name", "value"] = ""
-    uncut: tuple[Any, ...] = ()  # values that exclude blocks, but allow views that arrive in batches
-    # The value in a run on a piece of a scene, which is a block or a batch of views. `in_trial` is the value in a run
-    # that tries settings on some of the views, if it differs
-    in_piece: Any = SAME
-    in_trial: Any = SAME
-    shown: str | None = None  # the default in words, if the program chooses it
-    metavar: str | None = None  # form of the values on the command line
     name: str = ""
     kind: Any = None
     default: Any = None
@@ -118,63 +97,43 @@ class Setting:
         limits = ((self.least, ge), (self.most, le), (self.above, gt), (self.below, lt))
         return all(bool(holds(value, limit)) for limit, holds in limits if is_number and limit is not None)
 
-    def values(self, *, null: bool = True) -> str:
-        """Describe the possible values: choices, a range, or a type; if ``null``, also None."""
+    def values(self) -> str:
+        """Describe the possible values: choices, a range, or a type."""
         kinds = [kind for kind in self.kinds if kind is not NoneType]
         texts = [self._describe_range(kind) if kind in (int, float) else KIND_NAMES.get(kind, "") for kind in kinds]
-        texts += [str(word) for word in self.words]
-        return join_words([*texts, KIND_NAMES[NoneType]] if null and NoneType in self.kinds else texts)
-
-    def expected(self, value: Any, *, null: bool = False) -> str:
-        """Describe the expected values for an error message about ``value``."""
-        values = self.values(null=null)
-        numbers = [kind for kind in (float, int) if kind in self.kinds]
-        is_whole = isinstance(value, float) and numbers == [int]
-        is_other = not isinstance(value, Real | NoneType) and not self.words
-        if not numbers or not (is_whole or is_other) or values.startswith(KIND_NAMES[numbers[0]]):
-            return values
-        return f"{KIND_NAMES[numbers[0]]}, {values}"
+        return join_words([*texts, *map(str, self.words)])
 
     def _describe_range(self, kind: type) -> str:
-        low = None if self.least is None else _number(self.least)
-        high = None if self.most is None else _number(self.most)
-        if low is None and self.above is not None:
-            low = f"above {_number(self.above)}"
-        if high is None and self.below not in (None, inf):
-            high = f"below {_number(self.below)}"
-        if low is None:
+        low = f"above {_number(self.above)}" if self.least is None else _number(self.least)
+        high = f"below {_number(self.below)}" if self.most is None else _number(self.most)
+        if self.least is None and self.above is None:
             return KIND_NAMES[kind]
-        text = f"at least {low}".replace("at least above", "more than") if high is None else f"{low} to {high}"
-        return f"{text} {self.unit}".strip()
+        text = f"from {low} to {high}"
+        if self.most is None and self.below in (None, inf):
+            text = low if self.least is None else f"of at least {low}"
+        return f"{KIND_NAMES[kind]} {text} {self.unit}".strip()
 
     def check(self, value: Any) -> None:
         """Raise ValueError, with the expected values, if a value is not allowed."""
         if value is self.default:
             return
-        if self.is_list:
-            if not isinstance(value, list | tuple):
-                remedy = f"; write ({value!r},)" if self._fits(value) and self._in_range(value) else ""
-                raise ValueError(f"{self.name}: expected a list of {self.expected(value)}, got {value!r}{remedy}")
-            if self.filled and not value:
-                raise ValueError(f"{self.name}: expected at least one value, got none")
-            for element in value:
-                self._check(element)
-            if self.unique and len(set(value)) < len(value):
-                raise ValueError(f"{self.name}: expected every value once, got {','.join(map(str, value))}")
-        else:
+        if not self.is_list:
             self._check(value)
+            return
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{self.name}: expected a list of {self.values()}, got {value!r}")
+        if self.filled and not value:
+            raise ValueError(f"{self.name}: expected at least one value, got none")
+        for element in value:
+            self._check(element)
+        if self.unique and len(set(value)) < len(value):
+            raise ValueError(f"{self.name}: expected every value once, got {','.join(map(str, value))}")
 
     def _check(self, value: Any) -> None:
-        is_text = not self.choices and set(_types(self.kind)) <= {str, NoneType}
-        if is_text and not isinstance(value, str | NoneType):
-            raise ValueError(f"{self.name}: expected a text, got {value!r}")
-        is_checked_later = any(kind not in (int, float, bool, NoneType) for kind in self.kinds)  # by its class
-        if is_checked_later or (self._fits(value) and self._in_range(value)):
+        if self._fits(value) and self._in_range(value):
             return
-        is_number = isinstance(value, str) and re.fullmatch(r"-?\d*\.?\d+", value, re.ASCII) is not None
-        is_quoted = is_number and bool({int, float} & set(self.kinds))
-        hint = f"; perhaps {value} without quotes" if is_quoted else suggest_name(value, self.words)
-        raise ValueError(f"{self.name}: expected {self.expected(value)}, got {value!r}{hint}")
+        hint = suggest_name(value, self.words)
+        raise ValueError(f"{self.name}: expected {self.values()}, got {value!r}{hint}")
 
 
 def setting(default: Any, help: str, more: str = "", **declared: Any) -> Any:
@@ -195,10 +154,8 @@ class Settings:
         for name, declared in settings_of(type(self)).items():
             value = getattr(self, name)
             if declared.is_group and not isinstance(value, declared.kind):
-                actual = repr(value) if isinstance(value, str | Real) else type(value).__name__
-                single = f"{type(self).__name__}().with_settings({{...}}) takes single settings by name"
-                remedy = f"; {single}" if hasattr(self, "with_settings") else ""
-                raise ValueError(f"{name}: expected {declared.kind.__name__}, got {actual}{remedy}")
+                problem = f"{name}: expected {declared.kind.__name__}, got {value!r:.40}"
+                raise ValueError(f"{problem}; {type(self).__name__}().with_settings takes single settings by name")
             declared.check(value)
 
 
@@ -220,27 +177,8 @@ def flat_settings(options: type) -> dict[str, Setting]:
     flat: dict[str, Setting] = {}
     for name, declared in settings_of(options).items():
         if not declared.internal:
-            inner = flat_settings(declared.kind) if declared.is_group else {name: declared}
-            flat |= {key: replace(entry, acts_on=entry.acts_on or declared.acts_on) for key, entry in inner.items()}
+            flat |= flat_settings(declared.kind) if declared.is_group else {name: declared}
     return flat
-
-
-def names_of(options: type, condition: Callable[[Setting], Any]) -> tuple[str, ...]:
-    """Return the flat names of the settings whose declaration meets a condition."""
-    return tuple(name for name, declared in flat_settings(options).items() if condition(declared))
-
-
-def piece_settings(options: type, *, trial: bool = False) -> dict[str, Any]:
-    """Return the values that a run on a piece of a scene needs, by flat name.
-
-    ``trial`` stands for a run that tries settings on some of the views.
-    """
-    declared = flat_settings(options)
-    values = {
-        name: entry.in_trial if trial and entry.in_trial is not SAME else entry.in_piece
-        for name, entry in declared.items()
-    }
-    return {name: value for name, value in values.items() if value is not SAME}
 
 
 def change_settings(options: T, values: Mapping[str, Any]) -> T:
@@ -261,20 +199,12 @@ def join_words(words: Iterable[str]) -> str:
     return " or ".join(filter(None, (", ".join(listed[:-1]), *listed[-1:])))
 
 
-def find_near_names(word: str, names: Iterable[Any], count: int = 1, least: float = 0.6) -> list[Any]:
-    """List at most ``count`` names that resemble a word, the nearest first; case does not matter.
-
-    ``least``: least similarity, 0 to 1, as difflib measures it.
-    """
+def suggest_name(word: Any, names: Iterable[Any]) -> str:
+    """Return "; perhaps NAME", the end of a message about an unknown word, or "" if no name resembles it."""
     from difflib import get_close_matches
 
     lower = {str(name).lower(): name for name in names}
-    return [lower[match] for match in get_close_matches(word.lower(), lower, count, least)]
-
-
-def suggest_name(word: Any, names: Iterable[Any]) -> str:
-    """Return "; perhaps NAME", the end of a message about an unknown word, or "" if no name resembles it."""
-    return "".join(f"; perhaps {name}" for name in find_near_names(word, names)) if isinstance(word, str) else ""
+    return "".join(f"; perhaps {lower[match]}" for match in get_close_matches(str(word).lower(), lower, 1))
 
 
 def _types(kind: Any) -> list[Any]:
@@ -285,4 +215,4 @@ def _types(kind: Any) -> list[Any]:
 
 
 def _number(value: float | None) -> str:
-    return str(value) if isinstance(value, int) else f"{value:g}"
+    return f"{value:g}" if isinstance(value, float) else str(value)

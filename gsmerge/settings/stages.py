@@ -20,7 +20,6 @@ KRule = Literal["saliency", "distortion"]
 
 SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
 SHARE = "4.4%"  # superpixels per pixel by default
-AUTO_SHARE = "auto"
 MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # K differs between groups, and is one of these values
 USUAL_K = 1  # the K of "auto", except for a single camera without a long fit
@@ -38,11 +37,10 @@ class PrepareOptions(Settings):
     poses: Poses = setting("auto", "Move cameras to where their photos agree. auto: only if their poses are wrong; "
         "fixed: never; free: always.",
         "`auto` moves them if some view is more than 1.5 pixels off and agrees clearly better elsewhere. Cameras that "
-        "move are refined during the fit.", uncut=("free",),
-        in_piece="fixed")  # fmt: skip
+        "move are refined during the fit.")  # fmt: skip
     exposure: Exposure = setting("auto", "Bring the exposure and white balance of all photos to their mean. "
         "auto: if they differ at random; fixed: never; per-photo: always.",
-        "The Gaussians of their pixels change with them.", uncut=("per-photo",), in_piece="fixed")  # fmt: skip
+        "The Gaussians of their pixels change with them.")  # fmt: skip
     unseen: Unseen = setting("drop", "Gaussians that belong to no pixel and that no view sees: drop them, or keep "
         "them.",
         "`keep` merges them with their neighbours, at the same rate as the other Gaussians.")  # fmt: skip
@@ -59,8 +57,7 @@ class SegmentOptions(Settings):
 
     superpixels: int | str = setting(SHARE, "Superpixels per view: a number such as 3000, a share of its pixels, or "
         "auto. auto takes 4.4 to 7 %, more the better the depths of the views agree.",
-        "`bass-adaptive` starts from a share and adapts it to each view.", metavar="NUMBER|SHARE|auto",
-        counts=True)  # fmt: skip
+        "`bass-adaptive` starts from a share and adapts it to each view.")  # fmt: skip
     segmentation: str = setting("rdseg", "Method that cuts views into superpixels; `gsmerge.stages.superpixels` lists "
         "all.", choices=SEGMENTATIONS)  # fmt: skip
     rectangles: float | None = setting(None, "Of `rdseg`: number of rectangles per superpixel at its start.",
@@ -75,7 +72,7 @@ class SegmentOptions(Settings):
         super().__post_init__()
         if self.per_view is not None and self.per_view < 1:
             raise ValueError(f"superpixels: expected at least 1, got {self.superpixels}")
-        if self.per_view is None and self.superpixels != AUTO_SHARE:
+        if self.per_view is None and self.superpixels != AUTO:
             try:
                 parse_share(str(self.superpixels))
             except ValueError as error:
@@ -90,7 +87,7 @@ class SegmentOptions(Settings):
     @property
     def share(self) -> float:
         """Superpixels per pixel; the default share where the option gives a number or "auto"."""
-        is_share = self.per_view is None and self.superpixels != AUTO_SHARE
+        is_share = self.per_view is None and self.superpixels != AUTO
         return parse_share(str(self.superpixels) if is_share else SHARE)
 
     @property
@@ -106,7 +103,7 @@ class MatchOptions(Settings):
     match: MatchMethod | None = setting(None, "Rule by which Feature Gaussians of different views are merged.",
         "`overlap` compares Bhattacharyya coefficients and colours, and merges star clusters, which cannot chain. "
         "`aabb`, the rule of the paper (section 4.4), compares the IoU of boxes and latents, and merges connected "
-        "components. By default `overlap`, but `none` in a draft.", neutral=("none",))  # fmt: skip
+        "components. By default `overlap`, but `none` in a draft.")  # fmt: skip
     overlap: float = setting(0.7, "Of `overlap`: least Bhattacharyya coefficient.", least=0, most=1)
     iou: float = setting(0.2, "Of `aabb`: least IoU of the boxes (tau_g).", least=0, most=1)
     similarity: float = setting(0.8, "Of `aabb`: least cosine of the latents (tau_f).",
@@ -133,8 +130,7 @@ class DecodeOptions(Settings):
     k: int | Literal["mixed", "auto"] = setting(AUTO, "Gaussians per superpixel; more give more detail and a larger "
         "file. mixed: 1, 2 or 4, most where there is most to see; auto: 1, but 4 for a single camera without a long "
         "fit.",
-        "`mixed` is described in the paper's supplement.", least=1, most=MAX_CHILDREN, metavar="1-8|mixed|auto",
-        counts=True)  # fmt: skip
+        "`mixed` is described in the paper's supplement.", least=1, most=MAX_CHILDREN)  # fmt: skip
     k_low: float = setting(50.0, "Of `mixed`: percentile up to which groups become one Gaussian.",
         "The paper uses 33.3, and 66.7 for `k_high`.", least=0, most=100)  # fmt: skip
     k_high: float = setting(85.0, "Of `mixed`: percentile above which groups become four Gaussians.", least=0, most=100)
@@ -168,12 +164,12 @@ class CleanOptions(Settings):
     crop: str | None = setting(None, "Keep only the Gaussians inside sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in "
         "the scene's world units, or inside the shape in a .json or .toml file. Counts, fit and scores are of these.",
         "Three more numbers of a box turn it about its centre, in degrees about x, y and z. Only the command line "
-        "reads files.", metavar="SHAPE", common=True, whole="name", in_trial=None)  # fmt: skip
+        "reads files.")  # fmt: skip
     drop: str | None = setting(None, "Kinds of Gaussians to leave out, separated by commas: floaters, sky, "
         "transparent, unseen.",
         "`floaters`: isolated, far beyond the scene, or huge and across it; `sky`: what is sky in the photos; "
-        "`transparent`: opacity below 1/255; `unseen`: what no camera sees. Without cameras, viewpoints are placed.",
-        metavar="floaters,sky,...", common=True, whole="value", in_trial=None)  # fmt: skip
+        "`transparent`: opacity below 1/255; `unseen`: what no camera sees. Without cameras, viewpoints are "
+        "placed.")  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -229,8 +225,7 @@ class Engine(Settings):
 
     engine: str = setting("local", "Where scenes or blocks are compacted. local: on this machine; ray: on a Ray "
         "cluster (pip install gsmerge[ray]).", choices=("local", "ray"))  # fmt: skip
-    address: str | None = setting(None, "Address of the Ray cluster, such as auto or HOST:PORT.",
-        shown="one of this machine")  # fmt: skip
+    address: str | None = setting(None, "Address of the Ray cluster, such as auto or HOST:PORT.")  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -245,8 +240,7 @@ class BlockOptions(Settings):
     blocks: int | Literal["auto", "none"] = setting("auto", "Number of blocks of views that are compacted one by one. "
         "auto: one for every 8 million Gaussians if there are more than 20 million; also several for hundreds of "
         "views that see little of each other. none: one piece.",
-        "A run needs the memory of one block. `auto` counts one Gaussian for each pixel.", least=1,
-        metavar="auto|none|NUMBER", in_piece="none")  # fmt: skip
+        "A run needs the memory of one block. `auto` counts one Gaussian for each pixel.", least=1)  # fmt: skip
     engine: Engine = setting(Engine(), "Where the blocks are compacted.", internal=True)
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsmerge.arguments import check_arguments
 from gsmerge.compaction.compact import compact
@@ -20,11 +20,6 @@ from gsmerge.states.features import decode_features, extend_features
 from gsmerge.states.remove import remove
 from gsmerge.states.state_file import State, load_state, save_state
 from gsmerge.types import Gaussians, Scene, StrPath
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from gsmerge.settings.keywords import CompactKeywords, DecodeKeywords, StateKeywords
 
 
 def extend_state(
@@ -77,14 +72,14 @@ class Compactor:
         200
     """
 
-    def __init__(self, **settings: Unpack[StateKeywords]) -> None:
+    def __init__(self, **settings: Any) -> None:
         batch_settings(settings)
         self._settings = settings
         self._state: State | None = None
 
     @classmethod
     @check_arguments
-    def load(cls, path: StrPath, **settings: Unpack[StateKeywords]) -> Compactor:
+    def load(cls, path: StrPath, **settings: Any) -> Compactor:
         """Load a saved state; ``settings`` apply to further batches.
 
         Raises:
@@ -138,7 +133,7 @@ class Compactor:
         self._state = remove(self.state, number)
 
     @check_arguments
-    def compact(self, *, progress: Progress | None = None, **settings: Unpack[CompactKeywords]) -> CompactResult:
+    def compact(self, *, progress: Progress | None = None, **settings: Any) -> CompactResult:
         """Compact the scene of all batches so far; see :func:`gsmerge.compact`.
 
         Raises:
@@ -148,7 +143,7 @@ class Compactor:
             raise ValueError("expected a state of results, found Feature Gaussians; use decode for these")
         return compact(self.state.scene, progress=progress, **settings)
 
-    def decode(self, **settings: Unpack[DecodeKeywords]) -> Gaussians:
+    def decode(self, **settings: Any) -> Gaussians:
         """Decode Feature Gaussians in the world frame.
 
         Args:

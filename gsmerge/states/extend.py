@@ -22,9 +22,8 @@ from gsmerge.io.photo_files import photo_array
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
-from gsmerge.settings.setting import piece_settings
 from gsmerge.types import Cameras, Gaussians, Scene
 
 # Earlier Gaussians that are compared with new views
@@ -78,7 +77,7 @@ def extend(
     scene has the kept views at the size of the first batch's views; each has its mended photo, or what stands in for
     it. ValueError if a setting is impossible for the scene; SceneError if the scene seems to be in another world.
     """
-    options = options.with_settings(piece_settings(CompactOptions))
+    options = options.with_settings(PIECE)
     with use_threads(options.threads), record_run(progress):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)

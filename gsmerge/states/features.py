@@ -27,9 +27,8 @@ from gsmerge.networks.weights import NetworkWeights
 from gsmerge.pooling import Members, feature_to_gaussians, gaussian_members
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
-from gsmerge.settings.setting import piece_settings
 from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat
@@ -134,7 +133,7 @@ def extend_features(
     harmonics have another degree.
     """
     _check_options(options)
-    options = options.with_settings(piece_settings(CompactOptions))
+    options = options.with_settings(PIECE)
     with use_threads(options.threads), record_run(progress) as record:
         prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame)
         prepared_scene, world = prepared.scene, _check_world(state, prepared.scene, extend_options)

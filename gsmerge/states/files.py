@@ -28,7 +28,7 @@ from gsmerge.report import document_head, seconds_document, seconds_line
 from gsmerge.runtime.memory import human_bytes, human_share, peak_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.content_hash import content_hash, list_files
-from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.scene.files import SceneFiles, scene_title
 from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.reading import OpacityChoice
@@ -48,7 +48,7 @@ def extend_file(
     settings: Mapping[str, Any],
     *,
     opacity: OpacityChoice = "auto",
-    hints: ReadHints = AUTO,
+    hints: ReadHints = NO_HINTS,
     progress: Progress | None = None,
     seconds_before: Mapping[str, float] | None = None,
     dry_run: bool = False,

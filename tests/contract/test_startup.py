@@ -48,7 +48,7 @@ for words in (one, loaded, kinds):
     print(*words)
 """
     one, loaded, kinds = (line.split() for line in run_python(code).splitlines()[-3:])
-    parts = ("app", "compact_command", "console", "parameters", "paths", "plain_values", "usage")
+    parts = ("app", "compact_command", "console", "parameters", "paths", "usage")
     assert set(one) == {f"gsmerge.cli.{name}" for name in parts}  # a command loads no other
     assert set(loaded) & set(HEAVY) == set()
     assert kinds == ["function"] * 4

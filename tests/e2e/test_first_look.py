@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from messages import says
@@ -63,14 +62,6 @@ def test_a_plan_and_what_no_page_shows_open_none(smallest_copy: Path, run: Run, 
     assert "would write" in run(smallest_copy, *FAST, "--dry-run", code=0).out
     run(smallest_copy, *FAST, "-o", smallest_copy / "colmap", code=0)
     assert (pages_in(smallest_copy), opened) == ([], [])
-
-
-def test_a_name_of_no_file_is_a_scene_by_its_ending(tmp_path: Path, run: Run, monkeypatch: Any) -> None:
-    monkeypatch.chdir(tmp_path)
-    for scene in ("nowhere.ply", "./nowhere", "some/nowhere"):
-        assert_refused(run(scene), 3, scene.removeprefix("./"), "no such file")
-    assert "No such command" in run("nowhere").err
-    assert "No such command" in run("nowhere.txt").err
 
 
 def test_results_are_written_into_folders_that_exist(smallest_copy: Path, tmp_path: Path, run: Run) -> None:

@@ -116,16 +116,6 @@ def test_what_is_left_out_on_purpose_is_no_loss(smallest_scene: Path) -> None:
     assert report.worse is None
 
 
-def test_the_warning_is_red(smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    for name, red in (("FORCE_COLOR", True), ("NO_COLOR", False)):
-        monkeypatch.setenv(name, "1")
-        said = run("compact", smallest_scene, "-o", tmp_path / f"{name}.ply", *FEW, code=0)
-        before, _, after = said.err.partition("gsmerge: warning: ")
-        assert (before.endswith("\033[31m"), "\033[0m" in after) == (red, red)
-        monkeypatch.delenv(name)
-
-
 def test_a_batch_names_worse_results(
     smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,26 +18,22 @@ RESULT = gsmerge.compact(SCENE, budget=50, effort="draft")
 ANY: Any = gsmerge
 QUICK = gsmerge.EvaluateOptions(lpips=(), fog=False)
 CALLS: dict[str, Callable[[], Any]] = {
-    "results: expected a result or Gaussians by name, got list of Gaussians; name each": lambda: ANY.evaluate(
-        SCENE, [RESULT.gaussians]
-    ),
-    "scene: expected a Scene, got str; gsmerge.read_scene": lambda: ANY.evaluate("a.ply", {}),
-    "results: expected a result, Gaussians, a path or several by name, got list of CompactResult": lambda: ANY.view(
-        SCENE, [RESULT]
-    ),
+    "results: expected Mapping[a text, a result or Gaussians]": lambda: ANY.evaluate(SCENE, [RESULT.gaussians]),
+    "scene: expected Scene, got str; gsmerge.read_scene": lambda: ANY.evaluate("a.ply", {}),
+    "results: expected ": lambda: ANY.view(SCENE, [RESULT]),
     "cameras: expected Cameras, got NoneType": lambda: ANY.render(SCENE.gaussians, None),
-    "gaussians: expected Gaussians, got CompactResult; pass its .gaussians": lambda: ANY.render(RESULT, SCENE.cameras),
+    "gaussians: expected Gaussians, got CompactResult; pass the .gaussians": lambda: ANY.render(RESULT, SCENE.cameras),
     "path: expected a path, got int": lambda: ANY.read_scene(3),
     "more: expected a path, got int": lambda: ANY.read_scene("a.ply", 3),
     "images: expected a path, got ndarray": lambda: ANY.inspect("a.ply", images=np.zeros(3)),
     "progress: expected a function, got int": lambda: ANY.compact(SCENE, progress=3),
-    "scene: expected a Scene or a path, got Gaussians; write": lambda: ANY.compact(SCENE.gaussians),
+    "scene: expected Scene or a path, got Gaussians; gsmerge.read_scene": lambda: ANY.compact(SCENE.gaussians),
     "options: expected CompactOptions, got dict": lambda: ANY.compact(SCENE, {"k": 2}),
     "path: expected a path, got Gaussians": lambda: ANY.write_ply(SCENE.gaussians, "a.ply"),
-    "levels: expected a list of Gaussians, got Gaussians": lambda: ANY.write_levels("lod-meta.json", SCENE.gaussians),
+    "levels: expected Sequence[Gaussians], got Gaussians": lambda: ANY.write_levels("lod-meta.json", SCENE.gaussians),
     "unknown argument 'foo'; expected cameras": lambda: ANY.read_scene("a.ply", foo=1),
     "unknown argument 'imges'; perhaps images": lambda: ANY.read_scene("a.ply", imges="photos"),
-    "scene: expected a Scene or a path, got int": lambda: ANY.Compactor().extend(3),
+    "scene: expected Scene or a path, got int": lambda: ANY.Compactor().extend(3),
 }
 
 

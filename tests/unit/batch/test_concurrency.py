@@ -10,10 +10,10 @@ from gsmerge.batch import BatchOptions, Job, run
 from gsmerge.batch.jobs import CompactCall
 from gsmerge.batch.run import choose_concurrency
 from gsmerge.runtime.estimate import memory_bytes
-from gsmerge.scene.exporters import AUTO
+from gsmerge.scene.exporters import NO_HINTS
 from gsmerge.settings.compact import CompactOptions
 
-CALL = CompactCall(CompactOptions(), "auto", AUTO)
+CALL = CompactCall(CompactOptions(), "auto", NO_HINTS)
 
 
 def jobs(*counts: int) -> list[Job]:

@@ -62,7 +62,7 @@ def test_options_and_set_are_one() -> None:
     settings = args.settings()
     assert (settings.decode.k, settings.effort, settings.match.overlap) == (2, "fast", 0.5)
     refuse_all(UsageError, [
-        (Args(k=2, set=["k=3"]).settings, "--set k", "--k"), (Args(set=["iou=2"]).settings, "iou", "0 to 1", 2),
+        (Args(k=2, set=["k=3"]).settings, "--set k", "--k"), (Args(set=["iou=2"]).settings, "--set iou", "0 to 1", 2),
         (lambda: Args(set=["fit=full"]).settings(fit="none"), "--set fit", "unknown", "--set help"),
     ])  # fmt: skip
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from messages import noted
 
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.compaction.left_out import LEAST_VIEWS, choose_views, cover, leave_out, mean_seen
@@ -76,16 +75,6 @@ def test_a_draft_tells_who_asks(room: Scene) -> None:
 def test_too_few_photos_say_nothing(room: Scene) -> None:
     assert compact(scenes.take_views(room, range(LEAST_VIEWS - 1)), **QUICK).report.new_views is None
     assert compact(replace(room, images=None), **QUICK).report.new_views is None
-
-
-def test_a_note_says_why_an_estimate_is_missing_that_was_asked_for(room: Scene) -> None:
-    few, bare = scenes.take_views(room, range(LEAST_VIEWS - 1)), replace(room, pixels=None)
-    for scene, *words in ((few, LEAST_VIEWS, "photos"), (bare, "per pixel"), (room, "10 %")):
-        settings = QUICK | {"fit": "none"} | ({"superpixels": "50%", "k": 2} if scene is room else {})
-        report = compact(scene, **settings, new_views=True).report
-        assert report.new_views is None
-        assert noted(report.notes, "new_views=true", *words)
-        assert not noted(compact(scene, **settings).report.notes, "new_views=true")
 
 
 def test_threads_change_nothing(room: Scene) -> None:

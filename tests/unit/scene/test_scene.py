@@ -15,8 +15,8 @@ from gsmerge.errors import SceneError
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene import rows
 from gsmerge.scene.files import find_scene_files, scene_title
-from gsmerge.scene.read import load_scene, read_scene
 from gsmerge.scene.photos import stored_photos
+from gsmerge.scene.read import load_scene, read_scene
 
 
 def rewrite(path: Path, change: Callable[[dict], None]) -> None:

@@ -1,38 +1,36 @@
-"""What declarations say of settings beside their values: lists that runs of parts and of baselines go by."""
+"""What settings ask of a run: one piece, all views, a number of Gaussians."""
 
 from __future__ import annotations
 
 from gsmerge import CompactOptions
-from gsmerge.compaction.methods import COUNTS
-from gsmerge.settings.setting import names_of, piece_settings
+from gsmerge.settings.compact import PIECE, TRIAL
 
 
-def test_lists_are_those_of_the_declarations() -> None:
-    assert set(COUNTS) == {"budget", "superpixels", "k"}
-    common = names_of(CompactOptions, lambda one: one.common)
-    assert set(common) == {"method", "seed", "threads", "crop", "drop"}
-    assert set(names_of(CompactOptions, lambda one: one.whole)) == {"method", "levels", "quality", "crop", "drop"}
-
-
-def test_a_part_leaves_to_the_whole_what_the_whole_decides() -> None:
-    """A block or a batch, and a trial, which also leaves out what only the result has."""
-    part = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "new_views": False}
-    only = {"budget": None, "quality": None, "levels": 1, "crop": None, "drop": None}
-    assert piece_settings(CompactOptions) == part
-    trial = part | only | {"photo_scale": 1.0, "recipe": None}
-    assert piece_settings(CompactOptions, trial=True) == trial
-    CompactOptions().with_settings(trial)  # all are values that the settings take
+def test_values_for_parts_of_a_scene_are_possible() -> None:
+    for values in (PIECE, TRIAL):
+        assert CompactOptions().with_settings(values).to_dict().items() >= values.items()
 
 
 def test_settings_that_need_the_scene_in_one_piece_are_named() -> None:
     asked = {"method": "voxel", "budget": 100, "crop": "sphere:0,0,0,1", "drop": "floaters, unseen"}
     named = CompactOptions().with_settings(asked).whole_only
     assert set(named) == {"method voxel", "crop", "drop floaters", "drop unseen"}
-    assert set(CompactOptions().with_settings({"levels": 2, "quality": "30dB"}).whole_only) == {
-        "levels",
-        "quality 30dB",
-    }
+    levels = CompactOptions().with_settings({"levels": 2, "quality": "30dB"})
+    assert set(levels.whole_only) == {"levels", "quality 30dB"}
     assert CompactOptions().whole_only == CompactOptions().uncut == []
     uncut = CompactOptions().with_settings({"budget": "auto", "poses": "free", "exposure": "per-photo"})
     assert set(uncut.uncut) == {"budget auto", "poses free", "exposure per-photo"}
     assert uncut.whole_only == []
+
+
+def test_what_decides_instead_of_the_scene() -> None:
+    def decides(**settings: object) -> tuple[bool, bool, bool]:
+        options = CompactOptions().with_settings(settings)
+        return options.decides_count, options.replaces_stages, options.changes_superpixels
+
+    assert decides() == decides(budget="auto") == decides(budget="mobile") == decides(checkpoint="none")
+    assert decides() == (False, False, False)
+    assert decides(budget=100) == decides(k=2) == decides(superpixels="2%") == decides(quality="30dB")
+    assert decides(budget=100) == (True, False, False)
+    assert decides(checkpoint="shipped") == (False, True, False)
+    assert decides(match="none") == decides(compactness=0.1) == decides(k_low=20.0) == (False, False, True)
