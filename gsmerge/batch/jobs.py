@@ -19,7 +19,7 @@ from gsmerge.io.formats.table import estimate_counts
 from gsmerge.io.formats.write import level_output
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.report import SCHEMA_VERSION, file_sha256
-from gsmerge.runtime.estimate import memory_bytes
+from gsmerge.runtime.memory import memory_bytes
 from gsmerge.scene.content_hash import content_hash, digest, fill_template, list_files, scene_name
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.settings.budget import AUTO
