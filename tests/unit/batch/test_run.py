@@ -304,7 +304,8 @@ def test_a_record_cut_in_the_middle_is_done_again(scene: Path, out: Path, undist
 
 
 @pytest.mark.parametrize(
-    "name", ["gsmerge.batch.run.atomic_output", "gsmerge.batch.jobs.compact_files", "gsmerge.io.formats.write.write_gaussians"]
+    "name",
+    ["gsmerge.batch.run.atomic_output", "gsmerge.batch.jobs.compact_files", "gsmerge.io.formats.write.write_gaussians"],
 )
 def test_a_full_disk_fails_the_scene_and_leaves_nothing(
     name: str, scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
