@@ -11,7 +11,9 @@ from dataclasses import replace
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import Fitted, fit_scene
+from gsmerge.networks.corrector import Corrector
 from gsmerge.plan import Plan
+from gsmerge.pooling import Members
 from gsmerge.runtime.record import choose
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged, keep_all
@@ -23,7 +25,7 @@ from gsmerge.stages.merge import MergedViews, merge
 from gsmerge.stages.pair_merge import POWERS, merge_neighbors
 from gsmerge.stages.prune import split_unseen
 from gsmerge.stages.segment import segment_scene
-from gsmerge.types import Decoded, Gaussians
+from gsmerge.types import Decoded, FeatureGaussians, Gaussians, Segmentation
 
 # Prepared scene, plan and count -> fitted canonical Gaussians; a count of None: as many as the plan gives
 Build = Callable[[Prepared, Plan, int | None], Fitted]
@@ -52,16 +54,23 @@ def decode_views(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
 
 
 def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedViews:
-    """Merge the superpixels of all views; used to compact a scene and to add views to a state."""
+    """Merge the superpixels of all views."""
+    features, members, segmentation, networks = encode_views(prepared, plan, count)
+    merged = networks.refine(merge(features, match(features, plan.match), networks))
+    choose(groups=len(features), clusters=len(merged), **plan.network_facts)
+    return MergedViews(merged, members, segmentation, len(features), networks)
+
+
+def encode_views(
+    prepared: Prepared, plan: Plan, count: int | None
+) -> tuple[FeatureGaussians, Members, Segmentation, Corrector]:
+    """Encode the superpixels of all views into Feature Gaussians, to compact a scene or to add views to a state."""
     scene = prepared.scene
     segmentation = segment_scene(scene, plan.superpixels, count)
     members = assign(scene, segmentation.groups, by_contribution=plan.by_contribution)
     networks = make_corrector(plan.networks, members, scene.cameras, plan.seed)
     pooled = encode(scene, members, segmentation.groups)
-    features = correct(pooled, members, scene.cameras, networks, weaken=plan.weakens)
-    merged = networks.refine(merge(features, match(features, plan.match), networks))
-    choose(groups=len(features), clusters=len(merged), **plan.network_facts)
-    return MergedViews(merged, members, segmentation, len(features), networks)
+    return correct(pooled, members, scene.cameras, networks, weaken=plan.weakens), members, segmentation, networks
 
 
 def fit(starts: list[Decoded], prepared: Prepared, plan: Plan) -> Fitted:

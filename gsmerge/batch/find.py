@@ -181,29 +181,20 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
 
 
 def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
-    """Yield the scenes that match a pattern, and those in matching folders."""
-    for name in dict.fromkeys(natural_order(_expand(pattern, search))):
+    """Yield the scenes that match a pattern, and those in matching folders; links are not followed into folders."""
+    anchor = Path(pattern).anchor
+    found = Path(anchor).glob(os.path.relpath(pattern, anchor) if anchor else pattern)
+    for name in natural_order(str(path) for path in found if not _is_hidden(path, pattern)):
         path = Path(name)
-        if os.path.isdir(path):
+        if path.is_dir():
             yield from search.walk(path)
-        elif may_hold_gaussians(path):
+        elif may_hold_gaussians(path) and search.skip not in map(str, Path(os.path.realpath(path)).parents):
             yield path, None
 
 
-def _expand(pattern: str, search: _Search) -> Iterator[str]:
-    """Yield the files and folders that match a pattern; ``**`` enters each folder once, despite links."""
-    parts = Path(pattern).parts
-    if "**" not in parts:
-        yield from glob.iglob(pattern)
-        return
-    head, tail = parts[: parts.index("**")], parts[parts.index("**") + 1 :]
-    tree = _Search(search.skip)
-    for base in glob.iglob(os.path.join(*head)) if head else (os.curdir,):
-        for folder, entries, _ in tree.folders(Path(base)):
-            names = [str(folder)] if entries is None or not tail else []
-            names += _expand(os.path.join(glob.escape(str(folder)), *(tail or ("*",))), search)
-            tree.num_empty = 0 if names else tree.num_empty
-            yield from names
+def _is_hidden(path: Path, pattern: str) -> bool:
+    """Return whether a part of a path that a pattern matches is hidden, and the pattern does not name it."""
+    return any(part.startswith(".") and part not in Path(pattern).parts for part in path.parts)
 
 
 def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from gsmerge.io.formats.table import estimate_counts
 from gsmerge.io.formats.write import level_output
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.report import SCHEMA_VERSION, file_sha256
-from gsmerge.runtime.estimate import memory_bytes
+from gsmerge.runtime.memory import memory_bytes
 from gsmerge.scene.content_hash import content_hash, digest, fill_template, list_files, scene_name
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.settings.budget import AUTO
@@ -64,23 +63,17 @@ class BatchOptions(Settings):
         super().__post_init__()
         Engine(self.engine, self.address)
         try:
-            fields = [(name, spec) for _, name, spec, _ in Formatter().parse(self.output) if name is not None]
-            names = [name if not re.search(r"\{|\d{3}", spec or "") else "" for name, spec in fields]  # no vast widths
-            example = "" if "" in names else self.output.format(**dict.fromkeys(FIELDS, 1))
-        except (ValueError, LookupError, AttributeError, TypeError):
-            names, example = [""], ""
-        placeholders, endings = ", ".join(f"{{{name}}}" for name in FIELDS), OUTPUT_FORMATS
-        is_outside = example.startswith(("/", "~", ".")) or ".." in example.split("/")
-        for is_possible, expected in (
-            (all(name in FIELDS for name in names), f"{placeholders} in braces"),
-            (example.lower().endswith(endings), f"a name ending in {', '.join(endings)}"),
-            (
-                not is_outside and "\\" not in example and "\0" not in example,
-                "a name inside the output folder, not hidden",
-            ),
-        ):
-            if not is_possible:
-                raise ValueError(f"output: expected {expected}, got {self.output!r}")
+            names = {name for _, name, _, _ in Formatter().parse(self.output) if name is not None}
+            example = self.output.format(**dict.fromkeys(FIELDS, 1)) if names <= set(FIELDS) else ""
+        except (ValueError, LookupError):
+            example = ""
+        is_inside = not example.startswith(("/", "~", ".")) and "\\" not in example and ".." not in example.split("/")
+        if not (is_inside and example.lower().endswith(OUTPUT_FORMATS)):
+            placeholders, endings = ", ".join(f"{{{name}}}" for name in FIELDS), ", ".join(OUTPUT_FORMATS)
+            expected = (
+                f"a name inside the output folder, not hidden, that ends in {endings} and has only {placeholders}"
+            )
+            raise ValueError(f"output: expected {expected} in braces, got {self.output!r}")
 
 
 class SceneCall(Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,8 @@ SKIPPED = "skipped"  # `status` of a result that was done before; it is reported
 class DoneResult:
     """A result that is done, as its record describes it."""
 
-    key: str  # digest of the scene's files, the settings and the version; "" if making it again failed
+    key: str  # digest of the scene's files, the settings and the version
     files: list[dict[str, Any]]  # ``path`` in the output folder, ``sha256`` and ``bytes`` of each file
-    end: int  # byte after its record
     worse: str | None = None  # warning that it shows its photos worse than the input does
     left_out: str | None = None  # note that cameras or photos beside its scene do not belong to the scene
 
@@ -58,11 +57,8 @@ class RecordIndex:
             with suppress(KeyError, TypeError, AttributeError):  # the line is not a record
                 if line is None:
                     continue
-                output, status = _text(line["output"]), line["status"]
-                if status == DONE:
-                    self.results[output] = _read_result(line, end)
-                elif status == FAILED and line["key"] is None and output in self.results:  # a refusal has a key
-                    self.results[output] = replace(self.results[output], key="")
+                if line["status"] == DONE:
+                    self.results[_text(line["output"])] = _read_result(line)
         return self
 
     def paths(self) -> Iterator[str]:
@@ -73,11 +69,11 @@ class RecordIndex:
                     yield os.path.realpath(self.folder / file["path"])
 
 
-def _read_result(line: Mapping[str, Any], end: int) -> DoneResult:
+def _read_result(line: Mapping[str, Any]) -> DoneResult:
     """Read a record of a result; KeyError, TypeError or AttributeError if it is damaged."""
     files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
     doubts = line["report"].get("worse"), line["report"].get("input", {}).get("left_out")
-    return DoneResult(_text(line["key"]), files, end, *(None if doubt is None else _text(doubt) for doubt in doubts))
+    return DoneResult(_text(line["key"]), files, *(None if doubt is None else _text(doubt) for doubt in doubts))
 
 
 def _text(value: Any) -> str:
@@ -93,8 +89,8 @@ def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **facts}
 
 
-def check_folder(folder: Path) -> int:
-    """Make the output folder, and return the size of its records; SceneError if they cannot be written."""
+def check_folder(folder: Path) -> None:
+    """Make the output folder; SceneError if its records cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         records = folder / RECORDS
@@ -103,8 +99,7 @@ def check_folder(folder: Path) -> int:
             raise SceneError(records, problem, "remove it, or name another folder with --output")
         if records.exists():
             check_file(records)  # not a pipe, which would wait for its reader
-        with records.open("ab") as file:
-            return file.tell()
+        records.touch()
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"
         raise SceneError(folder, problem, "name another folder with --output") from error

@@ -19,16 +19,16 @@ from typing import Any
 
 from gsmerge.batch.jobs import BatchOptions, Job
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, check_folder, record
-from gsmerge.errors import SceneError, UsageError, error_line
+from gsmerge.errors import SceneError, error_line
 from gsmerge.frozen import dataclass
-from gsmerge.io.atomic import remove_stale
+from gsmerge.io.atomic import atomic_output, remove_stale
 from gsmerge.io.jsonl import append_line
 from gsmerge.io.locks import lock_file
 from gsmerge.report import file_sha256, finite
 from gsmerge.runtime.memory import free_memory
-from gsmerge.runtime.processes import LostProcess, ProcessPool
+from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.threads import available_threads
-from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, RayPool, WorkerPool
+from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, LostProcess, RayPool, WorkerPool
 from gsmerge.words import count_words
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory, for all scenes that run at the same time by default
@@ -51,7 +51,6 @@ class Run:
     """Values that all jobs of a run share."""
 
     folder: Path  # of the results
-    start: int  # size of its records in bytes when the run began
     threads: int  # of each call
     overwrite: bool
 
@@ -92,8 +91,8 @@ def refusal(job: Job, folder: Path, known: DoneResult | None, key: str, *, begun
     foreign = [name for name in job.outputs if os.path.lexists(folder / name) and name not in names]
     if foreign and not begun:
         return f"{folder / foreign[0]}: exists already and was not written by a batch; pass --overwrite to replace it"
-    former = "" if known is None else known.key.partition(".")[2]  # the digest of the settings
-    if former in ("", key.partition(".")[2]) or not any(os.path.lexists(folder / name) for name in names):
+    settings, former = key.partition(".")[2], known and known.key.partition(".")[2]
+    if former in (None, settings) or not any(os.path.lexists(folder / name) for name in names):
         return None
     remedy = "pass --overwrite to make it again, or name another --output"
     return f"{folder / job.output}: was made with other settings; {remedy}"
@@ -107,8 +106,8 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
     is not installed.
     """
     concurrency = choose_concurrency(jobs, options)
-    run = Run(folder, check_folder(folder), concurrency.threads, options.overwrite)
-    active: dict[str, Job] = {}
+    check_folder(folder)
+    run, active = Run(folder, concurrency.threads, options.overwrite), dict[str, Job]()
     with ExitStack() as stack:
         stack.callback(lambda: remove_unfinished(run, active.values()))
         pool: WorkerPool = ProcessPool(concurrency.jobs, concurrency.threads)
@@ -127,7 +126,7 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
             busy: list[Job] = []
             for job, outcome in pool.run(make_result, make_calls(remaining, wait=wait)):
                 del active[job.output]
-                line = record_loss(job, run, outcome.reason) if isinstance(outcome, LostProcess) else outcome
+                line = make_result(job, run, False, outcome.reason) if isinstance(outcome, LostProcess) else outcome
                 if line is None:
                     busy.append(job)
                 else:
@@ -135,71 +134,56 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
             remaining, wait = busy, True
 
 
-def make_result(job: Job, run: Run, wait: bool) -> dict[str, Any] | None:
+def make_result(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str, Any] | None:
     """Make a result unless it is done, record the outcome, and return the record.
 
-    If another process works on the result, ``wait`` for it or return None. SceneError if the record cannot be written.
+    If another process works on the result, ``wait`` for it or return None. ``lost``: why the process that made the
+    result has ended; only the failure is recorded. SceneError if the record cannot be written.
     """
     with lock_result(run.folder, job.output, wait=wait) as begun:
         if begun is None:
             return None
         _clean(job, run, begun)
         try:
-            line = _make(job, run, begun)
+            line = _make(job, run, begun) if lost is None else record(FAILED, job.scene, job.output, error=lost)
         except Exception as error:  # a bad scene must not end the batch
             line = record(FAILED, job.scene, job.output, error=error_line(error))
         if line["status"] != SKIPPED:
             append_line(run.folder / RECORDS, line)
-        begun.unlink(missing_ok=True)
+        if lost is None:
+            begun.unlink(missing_ok=True)
     return line
 
 
 def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     """Make a locked result unless it is done or refused; return its record."""
     files = job.find_files()
-    key, known = job.call.key(files), read_index(run.folder, run.start).read_on().results.get(job.output)
-    is_new = known is not None and known.end > run.start  # made since this run began, by it or by another run
-    if known is not None and (is_new or not run.overwrite) and known.holds(run.folder, key):
+    key, known = job.call.key(files), read_index(run.folder).read_on().results.get(job.output)
+    if known is not None and not run.overwrite and known.holds(run.folder, key):
         doubts = {"worse": known.worse, "left_out": known.left_out}
         return record(SKIPPED, job.scene, job.output, key=key, files=known.files, **doubts)
-    if known is not None and is_new and known.key not in (key, ""):
-        problem = "another run made it with other settings in the meantime; wait for that run, or name another --output"
-        raise UsageError(f"{run.folder / job.output}: {problem}")
     refused = None if run.overwrite else refusal(job, run.folder, known, key, begun=begun.exists())
     if refused:
         return record(FAILED, job.scene, job.output, key=key, error=refused)
-    mark(begun)
     out = run.folder / job.output
-    out.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_output(begun, overwrite=True) as temporary:  # on the disk before the result
+        temporary.write_text(f"{os.getpid()}\n")
     with warnings.catch_warnings(record=True) as caught_warnings:
         warnings.simplefilter("default")
         document, written = job.call.run(files, out, run.threads)
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught_warnings))
-    facts = [_describe_file(run.folder, path) for path in written]
+    facts = [
+        {"path": Path(os.path.relpath(path, run.folder)).as_posix(), "sha256": file_sha256(path)}
+        | {"bytes": path.stat().st_size}
+        for path in written
+    ]
     return record(DONE, job.scene, job.output, key=key, files=facts, report=finite(document))
 
 
-def _describe_file(folder: Path, path: Path) -> dict[str, Any]:
-    """Return the path of a file relative to the output folder, its hash and its size in bytes."""
-    path = folder / (name := Path(os.path.relpath(path, folder)))
-    return {"path": name.as_posix(), "sha256": file_sha256(path), "bytes": path.stat().st_size}
-
-
 @lru_cache(maxsize=1)
-def read_index(folder: Path, start: int) -> RecordIndex:
+def read_index(folder: Path) -> RecordIndex:
     """Return the index of a folder's records; each process keeps it between the calls of a run."""
     return RecordIndex(folder)
-
-
-def record_loss(job: Job, run: Run, reason: str) -> dict[str, Any] | None:
-    """Record the failure of a job whose process died; return None if another process works on the job now."""
-    with lock_result(run.folder, job.output, wait=False) as begun:
-        if begun is None:
-            return None
-        line = record(FAILED, job.scene, job.output, error=reason)
-        _clean(job, run, begun)
-        append_line(run.folder / RECORDS, line)
-    return line
 
 
 def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
@@ -218,14 +202,6 @@ def _clean(job: Job, run: Run, begun: Path) -> None:
             remove_stale(folder)
         if not any(map(os.path.lexists, paths)):
             begun.unlink()
-
-
-def mark(begun: Path) -> None:
-    """Write the file that marks a result as begun, with the process id. It shows that the result is from a batch."""
-    with begun.open("wb") as file:
-        file.write(f"{os.getpid()}\n".encode())
-        file.flush()
-        os.fsync(file.fileno())  # it must be on the disk before the result
 
 
 @contextmanager

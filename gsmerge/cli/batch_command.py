@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
 
 MAX_LISTED = 20  # rows of the table, failures, and results that are worse than their input
+# Kinds of reasons at the end of a run, in order, with the word before their lines
+KINDS = {"not used": "not used", "worse": "worse", "left out": "note", "lacking": "note", "failed": "failed"}
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
 
 
@@ -117,21 +119,21 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     finally:
         if (totals.counts or interrupted) and not args.silent:
             print_document({}, totals.lines(terminal_columns(sys.stdout)), as_json=False)
-    worse = ""
-    if totals.worse:
-        worse = f"{len(totals.worse)} of {totals.total} results show their photos worse than the input"
-        worse += _first_reason(totals.worse, listed=not args.silent)
-    if worse and not args.strict:
-        say(worse, kind="warning", quiet=args.silent)
-    check_failures(totals.failed, len(jobs), "scenes", listed=not args.silent)
+    doubts = []
+    for kind, text in (
+        ("worse", "results show their photos worse than the input"),
+        ("left out", "scenes have cameras or photos that do not belong to them"),
+    ):
+        if reasons := totals.reasons[kind]:
+            first = _first_reason(reasons, listed=not args.silent)
+            doubts.append(f"{len(reasons)} of {totals.total} {text}{first}")
+    if totals.reasons["worse"] and not args.strict:
+        say(doubts[0], kind="warning", quiet=args.silent)
+    check_failures(totals.reasons["failed"], len(jobs), "scenes", listed=not args.silent)
     if totals.unmet:
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
-    if totals.left_out:
-        left_out = f"{len(totals.left_out)} of {totals.total} scenes have cameras or photos that do not belong to them"
-        left_out += _first_reason(totals.left_out, listed=not args.silent)
-        worse = f"{worse}; {left_out}" if worse else left_out
-    if worse and args.strict:
-        raise TargetError(worse)
+    if doubts and args.strict:
+        raise TargetError("; ".join(doubts))
 
 
 def run_jobs(
@@ -145,8 +147,7 @@ def run_jobs(
     from gsmerge.batch import run_batch
     from gsmerge.batch.records import FAILED, SKIPPED
 
-    num_failed, weights = 0, {job.output: 1 + job.num_gaussians for job in jobs}
-    done, total = 0, sum(weights.values())  # weights of the finished jobs, and of all jobs that are not skipped
+    num_failed = num_skipped = 0
     with (
         separate_stdout(options.engine, quiet=args.silent),
         closing(run_batch(jobs, args.output, options)) as records,
@@ -156,12 +157,8 @@ def run_jobs(
             add(record)
             failure = record["error"] or ""
             num_failed += record["status"] == FAILED
-            weight = weights.get(record["output"], 0)
-            if record["status"] == SKIPPED:
-                total -= weight
-            else:
-                done += weight
-            share = done / total if total > 0 else 1.0
+            num_skipped += record["status"] == SKIPPED
+            share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
             report = record["report"] or record  # a result that was done before has a record of its doubts alone
             worse = report.get("worse")
             doubts = report.get("doubts", [doubt for doubt in (worse, report.get("left_out")) if doubt])
@@ -192,25 +189,24 @@ class Totals:
     num_output: int = 0  # Gaussians in their results
     unmet: int = 0  # results that miss their target
     rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results
-    worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
-    left_out: list[tuple[str, str]] = field(default_factory=list)  # scene, and a note on files of another scene
-    lacking: list[tuple[str, str]] = field(default_factory=list)  # scene, and the cameras or photos that it lacks
-    failed: list[tuple[str, str]] = field(default_factory=list)  # scene and reason
+    reasons: dict[str, list[tuple[str, str]]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Count the record of one scene."""
         self.counts[record["status"]] += 1
         report = record["report"]
-        worse = report["worse"] if report else record.get("worse")
-        if worse:
-            self.worse.append((record["scene"], worse))
+        doubts = report or record  # a result that was done before has a record of its doubts alone
         left_out = report["input"].get("left_out") if report else record.get("left_out")
-        if left_out:
-            self.left_out.append((record["scene"], left_out))
-        elif report and not report["input"].get("num_photos", 1):
-            self.lacking.append((record["scene"], _describe_lack(report)))
-        if record["error"] is not None:
-            self.failed.append((record["scene"], record["error"]))
+        lacks = report and not left_out and not report["input"].get("num_photos", 1)
+        found = {
+            "worse": doubts.get("worse"),
+            "left out": left_out,
+            "lacking": _describe_lack(report) if lacks else None,
+            "failed": record["error"],
+        }
+        for kind, reason in found.items():
+            if reason is not None:
+                self.reasons[kind].append((record["scene"], reason))
         if report:
             self.num_input += report["input"]["num_gaussians"]
             self.num_output += report["output"]["num_gaussians"]
@@ -231,11 +227,10 @@ class Totals:
         lines = text_table(rows, columns=columns, least=omitted_first) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
-        kinds = (("worse", self.worse), ("note", self.left_out), ("note", self.lacking), (FAILED, self.failed))
-        for status, reasons in kinds:
+        for kind, reasons in self.reasons.items():
             grouped = _list_reasons(reasons)
-            lines += [f"{status}: {line}" for line in grouped[:MAX_LISTED]]
-            lines += [f"... and {len(grouped) - MAX_LISTED:,} more {status}"] if len(grouped) > MAX_LISTED else []
+            lines += [f"{KINDS[kind]}: {line}" for line in grouped[:MAX_LISTED]]
+            lines += [f"... and {len(grouped) - MAX_LISTED:,} more {kind}"] if len(grouped) > MAX_LISTED else []
         statuses = [status for status in (DONE, SKIPPED, FAILED) if self.counts[status] or status == DONE]
         counts = [f"{self.counts[status]:,} {status}" for status in statuses]
         num_left = self.total - self.counts.total()
@@ -244,7 +239,7 @@ class Totals:
             share = human_share(self.num_output / self.num_input)
             line += f"; {self.num_input:,} -> {self.num_output:,} Gaussians ({share})"
         line += f"; {self.unmet:,} missed the target" if self.unmet else ""
-        line += f"; {len(self.worse):,} worse than the input" if self.worse else ""
+        line += f"; {len(self.reasons['worse']):,} worse than the input" if self.reasons["worse"] else ""
         return [*lines, line]
 
 

@@ -247,7 +247,7 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
     from gsmerge.compaction.partition import gaussians_at_once
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.plan import wanted_blocks
-    from gsmerge.runtime.estimate import memory_bytes, memory_problem
+    from gsmerge.runtime.memory import memory_bytes, memory_problem
 
     count, num_rest = estimate_counts([ply for scene_files in (files, *files.more) for ply in scene_files.plys])
     at_once = gaussians_at_once(count, wanted_blocks(settings, count))

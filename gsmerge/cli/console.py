@@ -12,9 +12,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-Progress = Callable[[str, int, int], None]  # stage, done, total
+if TYPE_CHECKING:
+    from gsmerge.runtime.record import Progress
 
 Kind = Literal["info", "note", "warning", "error"]  # of a line on stderr
 PREFIXES: Mapping[Kind, str] = {
@@ -29,20 +30,30 @@ class JsonLines:
 
     start: float = field(default_factory=time.monotonic)
     share: float | None = None  # of the run that is done; None: unknown
-    left: float | None = None  # seconds; None: unknown
+    begun: tuple[float, float] | None = None  # seconds since the start, and share, when the share was first known
 
     def print(self, event: Mapping[str, Any]) -> None:
         """Print an event with the seconds since the start, the share that is done and the seconds left."""
-        share, left = self.share, self.left
+        share, left = self.share, self.seconds_left
         numbers = {"share": None if share is None else round(share, 3), "seconds": round(self.seconds, 2)}
         numbers["seconds_left"] = None if left is None else round(left, 1)
         with suppress(OSError):
             print(json.dumps({**event, **numbers}), file=sys.stderr, flush=True)
 
-    def move(self, share: float | None, left: float | None) -> None:
-        """Set the share that is done and the seconds left; the share never decreases."""
-        self.share = share if self.share is None else max(self.share, share or 0.0)
-        self.left = left
+    def move(self, share: float | None) -> None:
+        """Set the share that is done, unless it is not known; it never decreases."""
+        if share is not None:
+            self.share = max(self.share or 0.0, share)
+            self.begun = self.begun or (self.seconds, self.share)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds until the run ends, at the rate since the share was first known; None if it has not grown since."""
+        if self.share == 1:
+            return 0.0
+        if self.share is None or self.begun is None or self.share <= self.begun[1]:
+            return None
+        return (self.seconds - self.begun[0]) * (1 - self.share) / (self.share - self.begun[1])
 
     @property
     def seconds(self) -> float:
@@ -144,16 +155,14 @@ def json_progress(lines: JsonLines | None = None) -> Iterator[None]:
 
 def _print_stages(stream: JsonLines) -> Progress:
     """Return a progress callback that prints each event as JSON."""
-    from gsmerge.runtime.record import current_forecast
-    from gsmerge.runtime.time_left import Forecast
-
-    fallback = Forecast()
+    from gsmerge.runtime.record import STAGES, current_record
 
     def move(text: str, done: int, total: int) -> None:
         stage, _, detail = one_line(text).partition(": ")
-        fallback.move(text, done, total)
-        left = (current_forecast() or fallback).seconds_left
-        stream.move(None if left is None else stream.seconds / max(stream.seconds + left, 1e-9), left)
+        share = 1.0 if stage == "done" else current_record().forecast.share
+        if share is None and total and (detail or stage not in STAGES):
+            share = done / total
+        stream.move(share)
         stream.print({"stage": stage, "detail": detail, "done": done, "total": total})
 
     return move
@@ -175,7 +184,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
         return
     from rich import progress as rich
 
-    from gsmerge.runtime.time_left import STAGES
+    from gsmerge.runtime.record import STAGES
 
     columns = (
         rich.TextColumn("{task.description:>12}", markup=False), rich.BarColumn(16), rich.TimeElapsedColumn(),
@@ -254,13 +263,12 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     """
     stream = _stream.get()
     if stream is not None:
-        start = time.monotonic()
+        stream.move(0.0)
 
         def print_event(end: RunEnd) -> None:
-            seconds, share = time.monotonic() - start, end.share
             for note in end.notes:
                 say(f"{end.name}: {note}", kind="warning" if note in end.doubts else "note")
-            stream.move(share, seconds * (1 - share) / share if share > 0 else None)
+            stream.move(end.share)
             event = {"scene": end.name, "status": end.status, "done": end.done, "total": total}
             stream.print({**event, "failed": end.num_failed, "worse": end.worse, "error": end.failure or None})
 

@@ -19,14 +19,9 @@ from gsmerge.settings.reading import NONE
 @opt.command(
     opt.argument("state", Path, "STATE", "A .gsm file; the first batch creates it."),
     opt.argument(
-        "scenes",
-        list[Path] | None,
-        "[SCENE]...",
-        "Batches of new views, in order; each is a scene as compact takes it.",
-        default=None,
+        "scenes", list[Path], "SCENE...", "Batches of new views, in order; each is a scene as compact takes it."
     ),
     opt.READING,
-    opt.option("remove", int, "Remove the batch with this number; gsmerge inspect lists the numbers.", min=1),
     "dry_run",
     opt.settings_option(CompactOptions, ExtendOptions, example="budget=2%"),
 )
@@ -37,12 +32,7 @@ def extend(args: opt.Args) -> None:
     start = perf_counter()
     if args.state.suffix.lower() != STATE_ENDING:
         raise UsageError(f"{args.state}: expected a state whose name ends in {STATE_ENDING}")
-    hints, scenes = args.hints(), args.scenes or []
-    if (args.remove is None) == (not scenes):
-        raise UsageError("extend: expected either scenes to add or --remove NUMBER")
-    if args.remove is not None:
-        _remove(args)
-        return
+    hints, scenes = args.hints(), args.scenes
     if len(scenes) > 1 and {args.cameras, args.images} - {None, NONE}:
         raise UsageError("--cameras and --images: expected one batch with them, got several; add one batch at a time")
     from gsmerge.states.files import batch_line, extend_file
@@ -69,11 +59,3 @@ def extend(args: opt.Args) -> None:
         from gsmerge.report import document_head, to_json
 
         sys.stdout.write(to_json(document_head() | {"batches": documents}))
-
-
-def _remove(args: opt.Args) -> None:
-    """Remove a batch from the state."""
-    from gsmerge.states.files import removal_line, remove_batch
-
-    document = remove_batch(args.state, args.remove, dry_run=args.dry_run)
-    print_document(document, removal_line(document), as_json=args.json, quiet=args.quiet)

@@ -112,11 +112,9 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     """Check one output as :func:`check_outputs` does; ``inputs``: real paths."""
-    from gsmerge.io.atomic import check_name
     from gsmerge.io.formats.table import MODEL_NAMES
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
-    check_name(output)
     try:
         os.lstat(output)
     except FileNotFoundError:

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import BeforeAfter, read_before_after
-from gsmerge.cli.console import Progress, print_document, say, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, check_replaced, input_files, write_texts
 from gsmerge.errors import UsageError
 
 if TYPE_CHECKING:
+    from gsmerge.runtime.record import Progress
     from gsmerge.types import Cameras, Gaussians
 
 

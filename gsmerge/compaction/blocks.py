@@ -11,8 +11,8 @@ import numpy as np
 from gsmerge.budget import file_size
 from gsmerge.compaction.block_report import BlockScores, join_reports
 from gsmerge.compaction.block_start import BlockStart, start_block
+from gsmerge.compaction.costs import RunCosts
 from gsmerge.compaction.file_size import drop_to_bytes, measure_rest
-from gsmerge.compaction.forecast import AFTER, BEFORE, fit_cost
 from gsmerge.compaction.partition import (
     Block,
     Covisibility,
@@ -24,16 +24,24 @@ from gsmerge.compaction.partition import (
 )
 from gsmerge.compaction.result import CompactResult
 from gsmerge.compaction.scores import measure_parts, measure_result
-from gsmerge.compaction.seams import SEAM_STEPS, SEAM_VIEW_STEPS, fit_seams
+from gsmerge.compaction.seams import fit_seams
 from gsmerge.facts.views import subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.frame import Frame, scene_frame
 from gsmerge.plan import WHOLE_GAUSSIANS, SceneChoices
 from gsmerge.raster.photos import blank_photos
-from gsmerge.runtime.estimate import memory_bytes
-from gsmerge.runtime.memory import free_pages
-from gsmerge.runtime.record import Record, add_seconds, begin_part, choose, current_record, expect_parts, note, stage
-from gsmerge.runtime.time_left import Part
+from gsmerge.runtime.memory import free_pages, memory_bytes
+from gsmerge.runtime.record import (
+    Part,
+    Record,
+    add_seconds,
+    begin_part,
+    choose,
+    current_record,
+    expect_parts,
+    note,
+    stage,
+)
 from gsmerge.runtime.work import start_work
 from gsmerge.settings.budget import AUTO, parse_share, share_text
 from gsmerge.settings.compact import PIECE, CompactOptions
@@ -45,6 +53,7 @@ T = TypeVar("T")
 # Most superpixels of a block, relative to compaction in one piece. A block takes more if views of other blocks see the
 # same surfaces
 MOST_DENSITY = 2.0
+SEAM_COST = 0.5  # of the fit of seams, as a share of the fits of all blocks
 SURPLUS = 1.03  # Gaussians of all blocks, relative to an exact number; the faintest surplus is dropped
 
 
@@ -90,7 +99,7 @@ def compact_in_blocks(
                 free_scene(scene)
                 yield piece, block, shared, piece_options, frame
 
-        expect_parts(block_costs(scene, choices, blocks))
+        expect_parts(block_parts(scene, options, choices, count))
         starts = [start for start, _ in adopt_records(work.run("merge", start_block, count, pieces()))]
         with stage("join"):
             joined, owners = join_parts([start.gaussians for start in starts])
@@ -121,15 +130,15 @@ def join_parts(parts: Sequence[Gaussians]) -> tuple[Gaussians, np.ndarray]:
     return Gaussians.concat(parts), np.repeat(np.arange(len(parts)), [len(gaussians) for gaussians in parts])
 
 
-def block_costs(scene: Scene, choices: SceneChoices, blocks: Sequence[Block]) -> list[Part]:
-    """Return the costs of a run in blocks; the fit of a block takes its share of the steps, by number of views."""
-    pixels, steps = scene.pixels_per_view, 0 if choices.fit.fit == "none" else choices.fit.steps
-    shares = [len(block.views) / len(scene) for block in blocks]
-    merges, scores = ([Part(cost * pixels * len(scene) * share) for share in shares] for cost in (BEFORE, AFTER))
-    count = choices.limits.default
-    fits = [Part(0, fit_cost(round(steps * share), pixels, count * share)) for share in shares]
-    seams = Part(0, fit_cost(max(SEAM_STEPS, SEAM_VIEW_STEPS * len(scene)), pixels, count))
-    return [*merges, *fits, *[seams] * (steps > 0), *scores]
+def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, count: int) -> list[Part]:
+    """Return the parts of a run in ``count`` blocks of equal costs: they are merged, then fitted, and then scored."""
+    steps, num_gaussians = 0 if choices.fit.fit == "none" else choices.fit.steps, choices.limits.default
+    settings, view_pixels = choices.settings(options), scene.pixels_per_view
+    costs = RunCosts(settings, view_pixels * len(scene), view_pixels, 1 / count, steps)
+    build, [scores] = costs.build(num_gaussians), costs.end([], None)
+    merged, fitted = Part(build.stages / count), Part(0.0, build.fits / count)
+    seams = [Part(0.0, SEAM_COST * build.fits)] * (steps > 0)
+    return [merged] * count + [fitted] * count + seams + [Part(scores.stages / count)] * count
 
 
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:

@@ -18,17 +18,18 @@ import numpy as np
 
 from gsmerge.arguments import check_arguments
 from gsmerge.compaction.candidate import Candidate, score
+from gsmerge.compaction.costs import RunCosts, expected_parts, mean_inside
 from gsmerge.compaction.file_size import Rebuild, meet_bytes
-from gsmerge.compaction.forecast import RunForecast
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.methods import Method, choose_method
-from gsmerge.compaction.new_views import trial_part, try_new_views
+from gsmerge.compaction.new_views import try_new_views
 from gsmerge.compaction.report import CompactReport
 from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, meet, search_count
 from gsmerge.errors import DoubtWarning
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.row_colors import RENDERS
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.frozen import dataclass
@@ -41,6 +42,7 @@ from gsmerge.runtime.record import (
     adopt,
     begin_part,
     choose,
+    expect_parts,
     note,
     record_part,
     record_run,
@@ -126,33 +128,46 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
         add_seconds(candidate.record.seconds)  # in addition to those of the search
         return candidate
 
-    forecast = RunForecast(prepared, plan, trial_part(prepared, plan))
-    search = search_count(prepared, plan, method.build, forecast)  # one count, or counts until a quality is met
-    best = run_search(search, method.build, rebuild, prepared, forecast)
+    costs, has_trial = measure_costs(prepared, plan), plan.new_views and can_try(prepared)
+    parts = expected_parts(
+        costs, plan.limits, plan.limits.default, has_target=plan.target_psnr is not None,
+        has_curve=plan.auto_count or plan.max_drop is not None, max_drop=plan.max_drop,
+        rendered=prepared.reference.name == RENDERS, levels=plan.levels, has_trial=has_trial,
+    )  # fmt: skip
+    expect_parts(parts)
+    search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
+    best = run_search(search, method.build, rebuild, prepared)
     best = meet_bytes(best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     counts = level_counts(len(best.gaussians), plan)
-    forecast.expect_end(counts)
+    expect_parts(costs.end(counts, costs.trial(len(best.gaussians)) if has_trial else None))
     levels = [build_scored(method.build, *fixed, count) for count in counts]
     trial = try_new_views(prepared, plan, method.build, len(best.gaussians))
     begin_part()
     return make_result(best, levels, prepared, plan, search.facts(best), trial)
 
 
-def run_search(
-    search: CountSearch, build: Build, rebuild: Rebuild, prepared: Prepared, forecast: RunForecast
-) -> Candidate:
+def measure_costs(prepared: Prepared, plan: Plan) -> RunCosts:
+    """Return the facts about a run from which the costs of its parts follow."""
+    scene, steps = prepared.scene, 0 if plan.fit.fit == "none" else plan.fit.steps
+    settings = plan.settings | ({} if plan.checkpoint else {"checkpoint": "none"})
+    num_pixels = max(scene.pixels_per_view * len(scene), len(scene.gaussians))
+    is_placed = plan.merges_pairs and prepared.reference.placed
+    inside = mean_inside(scene)
+    return RunCosts(settings, num_pixels, scene.pixels_per_view, inside, steps, plan.merges_pairs, is_placed)
+
+
+def run_search(search: CountSearch, build: Build, rebuild: Rebuild, prepared: Prepared) -> Candidate:
     """Run a search for the number of Gaussians; return its best candidate, built from all views and cleaned up."""
     plan = search.plan
     if search.left_out is not None:  # its candidates lack views, so the best count is built again
-        search.run(partial(build_left_out, build, search.left_out, search.left_out.plan(plan)), forecast)
-        forecast.expect_builds(search.count)
+        search.run(partial(build_left_out, build, search.left_out, search.left_out.plan(plan)))
         return rebuild(search.count)
     if plan.cleans_last:
         uncleaned = replace(plan, clean=CleanOptions())
-        search.run(partial(build_scored, build, prepared, uncleaned), forecast)
+        search.run(partial(build_scored, build, prepared, uncleaned))
         return clean_best(search.best, prepared, plan)
-    search.run(partial(build_scored, build, prepared, plan), forecast)
+    search.run(partial(build_scored, build, prepared, plan))
     return search.best
 
 

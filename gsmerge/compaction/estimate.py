@@ -6,44 +6,28 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from gsmerge.budget import largest_count
-from gsmerge.compaction.curve import DROP_SHARES, DROP_STEPS, KNEE_SHARES, KNEE_STEPS, curve_counts
+from gsmerge.compaction.costs import RunCosts, expected_parts, mean_inside
 from gsmerge.compaction.files import Outputs, check_cameras, sized
 from gsmerge.compaction.make_plan import load_networks
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.partition import gaussians_at_once
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.crop import crop_scene
-from gsmerge.facts.place_cameras import count_placed, placed_views
 from gsmerge.facts.prepare import views_notes, without_repeats
-from gsmerge.facts.scene_size import SceneSize, measure_size
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
-from gsmerge.measure.coverage import shares_inside
-from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, SceneChoices, choose_for_scene, resolve_budget, stands_alone
+from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, choose_for_scene, resolve_budget, stands_alone
 from gsmerge.report import document_head
-from gsmerge.runtime.estimate import (
-    TRIED,
-    TRIED_BY_PHOTOS,
-    fit_of,
-    memory_bytes,
-    memory_problem,
-    placed_seconds,
-    wall_seconds,
-)
-from gsmerge.runtime.memory import human_bytes
+from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
 from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import available_threads
 from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
 from gsmerge.words import count_words
-
-COARSER = 0.5  # time of each coarser level, as a share of the time of the result
-MAX_DRAWN_GAUSSIANS = 10_000  # the share of Gaussians inside a view is estimated from a sample of this size
 
 
 def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
@@ -71,18 +55,20 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     count = min(scene.num_gaussians or pixels, max_count)
     at_once, num_rest = gaussians_at_once(pixels, choices.blocks), 3 * scene.gaussians.shN.shape[1]
     drawn = pixels if options.method == "unmerged-fit" else count
-    threads, steps = options.threads or available_threads(), choices.fit.steps
-    if stands_alone(scene, options):
-        seconds = placed_seconds(
-            scene.num_gaussians, count, threads=threads, fit_steps=steps * (choices.fit.fit != "none"),
-            views=count_placed(placed_views(steps)), tries=TRIED if choices.keeps_fidelity else 1,
-        )  # fmt: skip
-    else:
-        inside = float(np.mean(shares_inside(scene, MAX_DRAWN_GAUSSIANS) or [1.0]))
-        seconds = wall_seconds(
-            at_once * choices.blocks, len(scene), settings, threads=threads, fit_steps=steps, num_drawn=drawn * inside,
-            **_search(size, options, choices, inside),
-        )  # fmt: skip
+    threads, kind = (
+        options.threads or available_threads(),
+        {OURS: choices.fit.fit, "unmerged-fit": "full"}.get(options.method, "none"),
+    )
+    steps, alone = 0 if kind == "none" else choices.fit.steps, stands_alone(scene, options)
+    num_pixels, budget = at_once * choices.blocks, options.budget
+    inside = 1.0 if alone else mean_inside(scene)
+    costs = RunCosts(settings, num_pixels, num_pixels / max(1, len(scene)), inside, steps, alone, alone)
+    parts = expected_parts(
+        costs, limits, drawn, has_target=choices.keeps_fidelity or budget.target_psnr is not None,
+        has_curve=budget.auto or budget.max_drop is not None, max_drop=budget.max_drop, rendered=size.rendered,
+        levels=budget.levels, has_trial=steps > 0 and scene.has_own_pixels and options.new_views is not False,
+    )  # fmt: skip
+    seconds = costs.seconds(parts, len(scene), threads)
     memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {
@@ -97,25 +83,12 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "method": options.method,
         "superpixels_per_view": 0 if choices.may_merge_pairs else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
-        "fit": fit_of(settings | {"fit": choices.fit.fit}),
+        "fit": kind,
         "fit_steps": choices.fit.steps,
         "seconds": float(f"{seconds:.2g}"),
         "memory_bytes": int(float(f"{memory:.2g}")),
         "memory_problem": memory_problem(memory),
     }
-
-
-def _search(size: SceneSize, options: CompactOptions, choices: SceneChoices, inside: float) -> dict[str, Any]:
-    """Return the builds of a search and of levels of detail, as arguments of :func:`wall_seconds`."""
-    budget, limits = options.budget, choices.limits
-    coarser = COARSER * (budget.levels - 1)
-    if choices.keeps_fidelity or budget.target_psnr is not None:
-        return {"tries": TRIED_BY_PHOTOS + coarser}
-    if size.rendered or not (budget.auto or budget.max_drop is not None):
-        return {"tries": 1 + coarser}
-    shares, steps = (KNEE_SHARES, KNEE_STEPS) if budget.max_drop is None else (DROP_SHARES, DROP_STEPS)
-    counts = curve_counts(shares, limits.default, limits.min_count, limits.max_count)
-    return {"short_steps": steps, "short_drawn": [count * inside for count in counts]}
 
 
 def estimate_lines(run: Mapping[str, Any]) -> list[str]:

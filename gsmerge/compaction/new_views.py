@@ -12,7 +12,6 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from gsmerge.compaction.forecast import AFTER, BEFORE, fit_cost
 from gsmerge.compaction.left_out import LEAST_SEEN, can_leave_out, choose_views, leave_out, mean_seen
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import subset
@@ -24,7 +23,6 @@ from gsmerge.pipeline import Build
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import add_seconds, begin_part, record_part
-from gsmerge.runtime.time_left import Part
 from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
 from gsmerge.types import Cameras, PicturedScene, Pixels
@@ -82,18 +80,6 @@ class Trial:
         before = own_before + self.before - self.own_before
         before, after, low, high = (round(psnr, 2) for psnr in (before, before + gain, gain - SPREAD, gain + SPREAD))
         return NewViews(before, after, low, high, self.views)  # rounded as in files
-
-
-def trial_part(prepared: Prepared, plan: Plan) -> Part | None:
-    """Return the cost of the trial on views that are left out; None if there is no trial."""
-    if not (plan.new_views and can_try(prepared)):
-        return None
-    scene, num_rounds = prepared.scene, len(choose_views(prepared.reference.score_views))
-    pixels = scene.pixels_per_view / _reduction(scene) ** 2
-    num_views = min(MOST_VIEWS, len(scene))
-    fits = fit_cost(min(STEPS, plan.fit.steps), pixels, USUAL * pixels * num_views)
-    before, after = (num_rounds * cost * pixels * num_views for cost in (BEFORE, AFTER))
-    return Part(before, num_rounds * fits, after, num_rounds)
 
 
 def can_try(prepared: Prepared, count: int = 0) -> bool:

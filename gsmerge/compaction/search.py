@@ -19,7 +19,6 @@ from gsmerge.compaction.curve import (
     curve_knee,
     measure_curve,
 )
-from gsmerge.compaction.forecast import USUAL_TRIES, RunForecast
 from gsmerge.compaction.left_out import LEAST_VIEWS, LeftOut, can_leave_out, choose_views, leave_out, mean_seen
 from gsmerge.compaction.scores import covers_all, may_leave_gaps, measure_input, measure_renders
 from gsmerge.facts.prepare import Prepared
@@ -84,20 +83,9 @@ class CountSearch:
     most: int | None = None  # Gaussians from which on left-out photos gain nothing; None: as the plan allows
     candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
-    def run(self, build: Callable[[int | None], Candidate], forecast: RunForecast | None = None) -> None:
-        """Build a candidate for each count that the search chooses; expect as many builds as are usual."""
-        done = 0
-
-        def build_next(count: int | None) -> Candidate:
-            nonlocal done
-            if forecast is not None:
-                # against renders, the first count mostly reaches the target; against photos, seldom
-                tries = 1 if self.plan.target_psnr is None or self.rendered > done else max(1, USUAL_TRIES - done)
-                forecast.expect_builds(count, tries=tries, again=self.left_out is not None)
-            done += 1
-            return build(count)
-
-        self.candidates = meet(build_next, build_next(self.first), self.choose_next)
+    def run(self, build: Callable[[int | None], Candidate]) -> None:
+        """Build a candidate for each count that the search chooses."""
+        self.candidates = meet(build, build(self.first), self.choose_next)
 
     def choose_next(self, candidates: Sequence[Candidate]) -> int | None:
         """Choose the next count by the candidates built so far; None ends the search."""
@@ -222,14 +210,14 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
     return replace(plan, before=before, target_psnr=psnr - FIDELITY_LOSS)
 
 
-def search_count(prepared: Prepared, plan: Plan, build: Build, forecast: RunForecast | None = None) -> CountSearch:
+def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
     """Prepare a search for the number of Gaussians; measure the scene's curve first if the options need it."""
     limits, left_out = plan.limits, leave_out_for_scores(prepared, plan)
     agreement, most = prepared.agreement, limits.max_count
     if left_out is not None and agreement is not None:  # more Gaussians gain nothing on photos that are left out
         most = max(limits.min_count, min(most, int(agreement.share * limits.num_pixels)))
     if plan.target_psnr is None:
-        return CountSearch(plan, choose_count(prepared, plan, build, left_out, most, forecast))
+        return CountSearch(plan, choose_count(prepared, plan, build, left_out, most))
     first = min(max(limits.default, limits.min_count), most)
     return CountSearch(plan, first, prepared.reference.name == RENDERS, left_out, most)
 
@@ -271,9 +259,7 @@ def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | Non
     return Candidate(count, fitted, fitted.gaussians, fitted.cameras, psnr, current_record(), psnr)
 
 
-def choose_count(
-    prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None, most: int, forecast: RunForecast | None
-) -> int | None:
+def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None, most: int) -> int | None:
     """Choose the number of Gaussians by the budget or the scene's curve; None: ``superpixels`` and K decide.
 
     ``left_out``: photos that the curve is measured on; None: patches of all photos. ``most``: largest count of the
@@ -287,8 +273,6 @@ def choose_count(
     with stage("curve"):
         shares, steps = (KNEE_SHARES, KNEE_STEPS) if drop is None else (DROP_SHARES, DROP_STEPS)
         counts = curve_counts(shares, limits.default, limits.min_count, most)
-        if forecast is not None:
-            forecast.expect_curve(counts, steps, limits.default)
         points = measure_curve(prepared, plan, build, steps, counts, left_out)
     choose(curve=[asdict(point) for point in points], curve_left_out=0 if left_out is None else len(left_out.photos))
     return curve_knee(points) if drop is None else count_within(points, drop)

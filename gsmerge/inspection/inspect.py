@@ -260,7 +260,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _batch_lines(batches: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Describe each batch of a state, with the number by which ``extend --remove`` removes it."""
+    """Describe each batch of a state."""
     lines = []
     for number, batch in enumerate(batches, 1):
         count, before, after = (batch.get(name, 0) for name in ("num_views", "num_input", "num_new"))

@@ -7,7 +7,6 @@ process.
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import os
 import re
@@ -22,7 +21,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import field
 from functools import cache
 from itertools import groupby, takewhile
-from pathlib import Path, PurePath
+from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
@@ -32,11 +31,9 @@ from gsmerge.types import StrPath
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
 _MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps, since names have at most 255
-_STALE_SECONDS = 7 * 86400  # age at which a file of another machine is stale; its processes are not visible here
-_SYNCHRONIZE, _NO_PROCESS = 0x100000, 87  # Windows: an access right, and the error code of an unknown process
+_STALE_SECONDS = 7 * 86400  # age at which a file is stale if its process is not visible here
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _TEMPORARY = re.compile(r"\.gsmerge-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
-_RESERVED = re.compile(r"(?is)(con|prn|aux|nul|com\d|lpt\d) *(\..*)?|.*[<>:\"|?*\x00-\x1f].*|(?!\.\.?$).*[ .]")
 
 AddOutput = Callable[[Path], Path]  # adds a file to :func:`atomic_outputs`, and returns the temporary file to write
 _written: set[str] = set()  # the temporary files of this process
@@ -161,7 +158,7 @@ def _make_folder(folder: Path) -> Iterator[Path]:
 
 
 def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
-    """Rename each temporary file to its final name, folder by folder; an interrupt takes effect after the last rename.
+    """Rename each temporary file to its final name, folder by folder.
 
     Without ``overwrite``, all renamed files are removed again if another process has made one of the names meanwhile.
     """
@@ -172,10 +169,6 @@ def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
                 (os.replace if overwrite else _rename_to_new)(temporary, target)
                 renamed.append(target)
             _flush_names(folder)
-    except KeyboardInterrupt:
-        remaining = [(temporary, target) for temporary, target in files if os.path.lexists(temporary)]
-        _rename_all(remaining, overwrite=overwrite)
-        raise
     except FileExistsError as error:
         for path in renamed:
             os.unlink(path)
@@ -183,18 +176,18 @@ def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
 
 
 def _rename_to_new(temporary: str, target: Path) -> None:
-    """Rename a file to a new name; FileExistsError if the name exists, even if another process makes it meanwhile."""
+    """Give a file a new name; FileExistsError if it exists, even if another process makes it meanwhile.
+
+    The temporary name may stay, for :meth:`_Outputs.remove_rest`.
+    """
     try:
         (os.rename if sys.platform == "win32" else os.link)(temporary, target)  # both fail if the name exists
     except FileExistsError:
-        if not os.path.samefile(temporary, target):  # they are the same if an interrupt came after the link was made
-            raise
+        raise
     except OSError:  # a file system without links
         if os.path.lexists(target):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), temporary) from None
         os.replace(temporary, target)
-    with suppress(FileNotFoundError):
-        os.unlink(temporary)
 
 
 def _flush_names(folder: Path) -> None:
@@ -254,38 +247,17 @@ _remove_stale_once = cache(remove_stale)  # once per folder and process, since l
 
 def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
     """Return whether the process that wrote a temporary file has ended, or a file of another machine is old."""
-    if machine != _machine_hash():
+    if machine != _machine_hash() or sys.platform == "win32":  # where no call asks for a process without ending it
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS
-    if sys.platform == "win32":  # where a signal 0 would end the process
-        kernel = ctypes.WinDLL("kernel32", use_last_error=True)
-        process = kernel.OpenProcess(_SYNCHRONIZE, False, ctypes.c_uint32(pid))
-        has_ended = kernel.WaitForSingleObject(process, 0) == 0 if process else ctypes.get_last_error() == _NO_PROCESS
-        kernel.CloseHandle(process)
-        return has_ended
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
-        return True
-    except (OSError, OverflowError):  # a process of another user
-        return False
-    try:  # a killed process whose parent has not asked for its exit status is still listed, as a zombie
-        status = Path(f"/proc/{pid}/stat").read_bytes()
-        return status.rpartition(b") ")[2][:1] in (b"Z", b"X")
-    except OSError:
-        return False
-
-
-def check_name(path: PurePath, system: str = sys.platform) -> None:
-    """Raise SceneError for an output with a name that Windows reads as a device or a stream, or changes."""
-    for part in path.parts[bool(path.anchor) :] if system == "win32" else ():
-        if _RESERVED.fullmatch(part):
-            remedy = 'choose a name without : * ? " < > |, which is no device such as aux and ends in no dot or blank'
-            raise SceneError(path, f"expected a name that Windows can use, found {part!r}", remedy)
+    except (OSError, OverflowError) as error:  # any other error: a process of another user
+        return isinstance(error, ProcessLookupError)
+    return False
 
 
 def _refuse(path: Path, overwrite: bool) -> None:
     """Raise SceneError for an output that cannot be written or must not be replaced."""
-    check_name(path)
     try:
         status = os.stat(path)
     except FileNotFoundError:

@@ -17,16 +17,7 @@ from gsmerge.io.encode_pictures import encode_indexed, encode_picture
 from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.error_maps import ErrorReference, draw_errors, expected_errors, make_reference
-from gsmerge.measure.evaluate import (
-    INPUT,
-    EvaluateOptions,
-    Evaluation,
-    OnImage,
-    Progress,
-    Quality,
-    ResultScores,
-    evaluate,
-)
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, OnImage, Quality, ResultScores, evaluate
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, draw_borders, mean_colors, to_picture
 from gsmerge.pages.marks import Marks, draw_marks, find_marks
@@ -34,6 +25,7 @@ from gsmerge.pages.splats import MAX_GAUSSIANS, drawn_rows, highest_degree, pack
 from gsmerge.raster import Splats, make_splats, render
 from gsmerge.raster.metrics import is_worse
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE
+from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.superpixels import segment

@@ -21,6 +21,12 @@ LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_by
 # values, clearing new pages for each array took a tenth of the time of `gsmerge view` for a page.
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 MAPPED_BYTES = 1 << 28  # arrays of this size or more are mapped from files
+# Bytes that a run needs
+BYTES_FIXED = 250_000_000  # interpreter and libraries
+BYTES_PER_GAUSSIAN = 150
+BYTES_PER_VALUE = 4.5  # for each value of higher harmonics: of the scene, and of some of its groups
+BYTES_PER_PIXEL = 90  # the photo as floats, and arrays of segmentation and rendering
+BYTES_ELSEWHERE = 40  # per Gaussian of the whole scene while a block of it is in memory
 _own_pages: WeakSet[mmap.mmap] = WeakSet()  # maps made here: only their pages may be discarded
 
 
@@ -64,6 +70,27 @@ def _memory_status() -> list[int]:
     if sys.platform == "win32":
         ctypes.windll.kernel32.GlobalMemoryStatusEx(status)
     return list(status)
+
+
+def memory_bytes(pixels: int, *, num_rest: int = 0, num_elsewhere: int = 0) -> int:
+    """Estimate the memory of a run in bytes, imports included.
+
+    ``pixels``: number of pixels or Gaussians of the scene, or of the block in memory. ``num_rest``: columns of higher
+    harmonics. ``num_elsewhere``: number of Gaussians outside the block.
+    """
+    pixel_bytes = BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL
+    return BYTES_FIXED + round(pixel_bytes * pixels + BYTES_ELSEWHERE * num_elsewhere)
+
+
+def memory_problem(needed: int) -> str | None:
+    """Return why a run that needs ``needed`` bytes may not fit into this machine; None if it should fit."""
+    available = machine_memory()
+    if available is None or needed <= available:
+        return None
+    return (
+        f"about {needed / 1e9:.1f} GB of memory are needed, and this machine has {available / 1e9:.1f} GB; use fewer"
+        " views (gsmerge extend adds more later), export without higher harmonics, or try --effort draft"
+    )
 
 
 def keep_memory() -> None:

@@ -12,12 +12,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from gsmerge.runtime.memory import release_memory
-from gsmerge.runtime.time_left import STAGES, Forecast, Part
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
+STAGES = (
+    "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
+    "cover", "decode", "join", "fit", "prune", "fill", "score", "input",
+)  # fmt: skip
+FIT_STEP = "fit: "  # reports of a fit's steps begin with this
+BEFORE_FIT = 0.8  # share of the stages' seconds that pass before the fits
 MAX_NAMED = 4  # largest number of items that a note lists
 # Stages after which memory is released, since other threads have freed much of it
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
@@ -29,6 +34,57 @@ class Note:
 
     text: str
     doubt: bool = False  # The result may be poor or wrong: commands show a warning, and Python raises a DoubtWarning
+
+
+class Part(NamedTuple):
+    """A part of a run: the seconds of its fits and of all other stages, of which only the ratios count here."""
+
+    stages: float
+    fits: float = 0.0
+    num_fits: int = 1
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of the part."""
+        return self.stages + self.fits
+
+
+@dataclass
+class Forecast:
+    """Share of a run that is done, by the seconds of its parts; within a part, by the steps of its fits."""
+
+    parts: list[Part] = field(default_factory=list)  # The present one and those after it
+    spent: float = 0.0  # Seconds of the parts that have ended
+    has_begun: bool = False
+    fit: int = 0  # Fit of the present part, from 0, with its last step
+    step: int = 0
+    part_spent: float = 0.0  # Seconds of what is done of the present part
+
+    def begin(self) -> None:
+        """End the present part, if there is one, and begin the next."""
+        if self.has_begun:
+            self.spent += self.parts.pop(0).seconds
+        if not self.parts:  # more parts than were expected
+            self.parts.append(Part(0.0))
+        self.has_begun, self.fit, self.step, self.part_spent = True, 0, 0, 0.0
+
+    def expect(self, parts: Iterable[Part]) -> None:
+        """Set the parts that follow the present one."""
+        self.parts[self.has_begun :] = parts
+
+    def take_step(self, step: int, num_steps: int) -> None:
+        """Take a step of a fit; a lower number than the last one means that the next fit has begun."""
+        self.fit += step < self.step
+        self.step = step
+        if self.has_begun:
+            share = min(1.0, (self.fit + step / max(num_steps, 1)) / self.parts[0].num_fits)
+            self.part_spent = BEFORE_FIT * self.parts[0].stages + share * self.parts[0].fits
+
+    @property
+    def share(self) -> float | None:
+        """Share of the run that is done; None if no part is expected."""
+        total = self.spent + sum(part.seconds for part in self.parts)
+        return (self.spent + self.part_spent) / total if total else None
 
 
 @dataclass
@@ -67,12 +123,6 @@ def record_run(progress: Progress | None = None) -> Iterator[Record]:
 def current_record() -> Record:
     """Return the record of the current run; outside a run, return an empty one."""
     return _current.get() or Record()
-
-
-def current_forecast() -> Forecast | None:
-    """Return the forecast of the current run; None outside a run."""
-    record = _current.get()
-    return None if record is None else record.forecast
 
 
 @contextmanager
@@ -168,6 +218,7 @@ def begin_part() -> None:
 def report_progress(text: str, done: int, total: int) -> None:
     """Report the progress of a stage, or of a step as ``"stage: detail"``, to the caller of the current run."""
     record = current_record()
-    record.forecast.move(text, done, total)
+    if text.startswith(FIT_STEP):
+        record.forecast.take_step(done, total)
     if record.progress is not None:
         record.progress(text, done, total)

@@ -17,7 +17,6 @@ from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.extend import BatchReport, extend
 from gsmerge.states.features import decode_features, extend_features
-from gsmerge.states.remove import remove
 from gsmerge.states.state_file import State, load_state, save_state
 from gsmerge.types import Gaussians, Scene, StrPath
 
@@ -118,19 +117,6 @@ class Compactor:
         """
         self._state, report = extend_state(self._state, as_scene(scene), self._settings, progress=progress)
         return report
-
-    @check_arguments
-    def remove(self, number: int) -> None:
-        """Remove a batch; see :func:`gsmerge.states.remove.remove`.
-
-        Args:
-            number: Number of the batch, from 1; the numbers of later batches decrease by one.
-
-        Raises:
-            ValueError: If there is no such batch, if it is the only one, or if the state has Feature Gaussians, since
-                these are merged across batches.
-        """
-        self._state = remove(self.state, number)
 
     @check_arguments
     def compact(self, *, progress: Progress | None = None, **settings: Any) -> CompactResult:

@@ -15,7 +15,7 @@ import numpy as np
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
-from gsmerge.facts.views import concat_cameras, in_float64, resize_cameras
+from gsmerge.facts.views import concat_cameras, resize_cameras
 from gsmerge.frame import Frame
 from gsmerge.frozen import dataclass
 from gsmerge.kernels.gaussians.cluster import connected_components
@@ -24,18 +24,16 @@ from gsmerge.networks.checkpoint import Checkpoint
 from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group_features
 from gsmerge.networks.weights import NetworkWeights
+from gsmerge.pipeline import encode_views
 from gsmerge.pooling import Members, feature_to_gaussians, gaussian_members
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
-from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat
-from gsmerge.stages.encode import correct, encode
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
-from gsmerge.stages.segment import segment_scene
 from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.states.extend import NOT_COMPARED, NOT_KNOWN, BatchReport, compare_worlds, number_names, refuse_other_world
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
@@ -143,13 +141,9 @@ def extend_features(
             raise UsageError(
                 f"recipe paper: expected networks with an encoder and absolute outputs, {options.checkpoint} lacks them"
             )
-        cameras = in_float64(prepared_scene.cameras)
-        segmentation = segment_scene(prepared_scene, plan.superpixels, None)
-        members = assign(prepared_scene, segmentation.groups, by_contribution=plan.by_contribution)
-        context = NetworkContext(weights, members, cameras, plan.seed)
-        pooled = encode(prepared_scene, members, segmentation.groups)
-        features = correct(pooled, members, cameras, context, weaken=False)
-        samples = sample_views(members, cameras, state)
+        features, members, _, context = encode_views(prepared, plan, None)
+        assert isinstance(context, NetworkContext)
+        samples = sample_views(members, prepared_scene.cameras, state)
         corners = scene_saliency(prepared_scene.images)
         if state is None:
             merged = merge(features, match(features, plan.match), context)

@@ -36,8 +36,8 @@ from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.compactor import extend_state
 from gsmerge.states.extend import BATCH
 from gsmerge.states.features import decode_features, feature_arrays
-from gsmerge.states.remove import remove
 from gsmerge.states.state_file import State, load_state, save_state
+from gsmerge.words import count_words
 
 ARRAYS = ".npz"  # ending of a file with the arrays of Feature Gaussians
 
@@ -110,31 +110,10 @@ def _find_batch(state: State, sha256: str) -> int | None:
     return hashes.index(sha256) + 1 if sha256 in hashes else None
 
 
-def remove_batch(path: Path, number: int, *, dry_run: bool = False) -> dict[str, Any]:
-    """Remove a batch, counted from 1, from the state in a file; return the report as plain JSON types.
-
-    The file is replaced as by :func:`extend_file`. ``dry_run``: write nothing. SceneError if the file cannot be read or
-    written or was changed in the meantime; UsageError if the batch cannot be removed.
-    """
-    identity, before = _file_identity(path), load_state(path)
-    state = remove(before, number)
-    with _replace_file(path, identity, dry_run=dry_run) as temporary:
-        if temporary is not None:
-            save_state(temporary, state, overwrite=True)
-    return {
-        **document_head(),
-        "dry_run": dry_run,
-        "removed": {"number": number, **before.about["batches"][number - 1]},
-        "num_gaussians": len(state),
-        "state": _describe_file(path, state),
-        "notes": [],
-    }
-
-
 def _note_source(state: State, sha256: str, comments: Sequence[str]) -> State:
-    """Return a state whose last batch records the hash of its files and the comments that results copy."""
+    """Return a state that records the hash of its last batch's files, and the comments that results copy."""
     *earlier, last = state.about["batches"]
-    last = last | {"sha256": sha256} | ({"comments": list(comments)} if comments else {})
+    last = last | {"sha256": sha256}
     all_comments = list(dict.fromkeys([*state.about.get("comments", []), *comments]))
     return replace(state, about={**state.about, "batches": [*earlier, last], "comments": all_comments})
 
@@ -174,7 +153,7 @@ def batch_line(document: Mapping[str, Any]) -> str:
     """Describe the report of a batch in one line."""
     state, would = document["state"], "would be " * document["dry_run"]
     if document["left_out"]:
-        return f"{state['path']}: {would}unchanged, {_count_batches(state)}"
+        return f"{state['path']}: {would}unchanged, {count_words(state['num_batches'], 'batch')}"
     size = f", {human_bytes(state['bytes'])}; {seconds_line(document)}"
     world = f"; world: {document['choices']['world']}" if state["num_batches"] > 1 else ""
     return (
@@ -182,23 +161,6 @@ def batch_line(document: Mapping[str, Any]) -> str:
         f" {document['num_input']:,} -> {document['num_new']:,} Gaussians; {document['num_gaussians']:,} in all"
         f"{world if would else size}"
     )
-
-
-def removal_line(document: Mapping[str, Any]) -> str:
-    """Describe the report of :func:`remove_batch` in one line."""
-    state, removed = document["state"], document["removed"]
-    would = "would be " * document["dry_run"]
-    left = f"{_count_batches(state)}, {document['num_gaussians']:,} Gaussians left"
-    size = "" if would else f", {human_bytes(state['bytes'])}"
-    return (
-        f"{state['path']}: {would}without batch {removed['number']} of {removed['num_views']} views and"
-        f" {removed['num_new']:,} Gaussians; {left}{size}"
-    )
-
-
-def _count_batches(state: Mapping[str, Any]) -> str:
-    """Return the number of batches with its unit."""
-    return f"{state['num_batches']} batch{'' if state['num_batches'] == 1 else 'es'}"
 
 
 def decode_file(

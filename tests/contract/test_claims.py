@@ -33,7 +33,7 @@ from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
 from gsmerge.pages import data, splats
 from gsmerge.raster import metrics, photos, tiled_view
-from gsmerge.runtime import estimate, work
+from gsmerge.runtime import memory, work
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene
 from gsmerge.settings.budget import DEVICES
@@ -80,10 +80,10 @@ def million(number: int) -> str:
 
 def degree(number: int) -> str:
     """Gigabytes for a million Gaussians with harmonics of a degree."""
-    return f"{1e-3 * round((estimate.memory_bytes(10**6, num_rest=3 * ((number + 1) ** 2 - 1)) - FIXED) / 1e6):.2f}"
+    return f"{1e-3 * round((memory.memory_bytes(10**6, num_rest=3 * ((number + 1) ** 2 - 1)) - FIXED) / 1e6):.2f}"
 
 
-FIXED = estimate.memory_bytes(0)
+FIXED = memory.memory_bytes(0)
 CLAIMS: dict[str, tuple[str, ...]] = {
     DECISIONS: (
         f"It starts with {percent(stage.START)} of the Gaussians, splits those with the largest error"

@@ -63,7 +63,7 @@ def test_a_killed_process_costs_its_scene_alone(make_scene: Callable[..., Path],
 
     threading.Thread(target=kill, daemon=True).start()
     outcome = run("batch", rooms, "--output", out, *FAST, "--jobs", 1, "-q", code=5)
-    assert names(outcome.err, "1 of 2 scenes", rooms / "room0", "SIGKILL")
+    assert names(outcome.err, "1 of 2 scenes", rooms / "room0", "--jobs")
     assert outcome.err.count("\n") == 1
     assert sorted(record["status"] for record in records(out)) == ["done", "failed"]
     assert len(results(out)) == 1

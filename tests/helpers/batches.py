@@ -98,10 +98,8 @@ def one_job(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Job,
     """What :func:`make_result` takes for a single scene, as a run would have it that begins now."""
     out.mkdir(exist_ok=True)
     read_index.cache_clear()
-    records = out / RECORDS
-    size = records.stat().st_size if records.exists() else 0
     (job,) = find_jobs([str(scene)], out, options)
-    return job, Run(out, size, 1, options.overwrite)
+    return job, Run(out, 1, options.overwrite)
 
 
 def touch(*names: str) -> None:

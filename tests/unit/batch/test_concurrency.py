@@ -9,7 +9,7 @@ import pytest
 from gsmerge.batch import BatchOptions, Job, run
 from gsmerge.batch.jobs import CompactCall
 from gsmerge.batch.run import choose_concurrency
-from gsmerge.runtime.estimate import memory_bytes
+from gsmerge.runtime.memory import memory_bytes
 from gsmerge.scene.exporters import NO_HINTS
 from gsmerge.settings.compact import CompactOptions
 

@@ -124,7 +124,7 @@ def test_a_pattern_enters_folders_of_every_depth() -> None:
     touch("s/scene.ply", "s/gs_ply/0000.ply", "s/a/b/c.ply", "s/a/b/.hidden/d.ply", "s/out/e.ply")
     assert actual("s/**/*.ply", out=Path("s/out")) == ["s/a/b/c.ply", "s/gs_ply/0000.ply", "s/scene.ply"]
     assert actual("s/**/b/*", "**/c.ply", out=Path("s/out")) == ["s/a/b/c.ply", "s/a/b/c.ply"]
-    assert actual("s/a/**") == ["s/a/b/c.ply", "s/a/b/c.ply"]
+    assert actual("s/a/**") == ["s/a/b/c.ply"]
 
 
 def test_a_link_to_itself_is_passed_by() -> None:
@@ -174,7 +174,7 @@ def locked(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_folder_that_cannot_be_read_is_a_scene_that_fails() -> None:
     touch("all/a.ply", "all/locked/b.ply", "all/z/c.ply")
     assert actual("all") == ["all/a.ply", "all/locked", "all/z/c.ply"]
-    for given in ("all/locked", "all/lock*", "all/locked/**/*.ply"):
+    for given in ("all/locked", "all/lock*"):
         assert actual(given) == ["all/locked"]
     if sys.version_info < (3, 13):  # whose pathlib calls what the fixture put in the place of os.scandir
         with refuses(SceneError, "all/locked", "Permission denied"):

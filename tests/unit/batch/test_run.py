@@ -23,7 +23,7 @@ from gsmerge.batch import jobs as calls
 from gsmerge.batch import run as runs
 from gsmerge.batch import run_batch
 from gsmerge.batch.records import DONE, FAILED, SKIPPED
-from gsmerge.batch.run import lock_result, make_result, record_loss, remove_unfinished
+from gsmerge.batch.run import lock_result, make_result, remove_unfinished
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic
 
@@ -207,34 +207,14 @@ def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> N
     assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
 
 
-def test_what_another_run_has_done_meanwhile_is_skipped(scene: Path, out: Path) -> None:
-    call = one_job(scene, out)
-    assert run(scene, out)["status"] == DONE
-    assert status(call) == SKIPPED
-    call = one_job(scene, out, replace(QUICK, overwrite=True))
-    assert status(call) == DONE
-    assert status(call) == SKIPPED  # done again since the run began
-
-
-def test_what_another_run_has_done_meanwhile_with_other_settings_is_left_to_it(scene: Path, out: Path) -> None:
-    call = one_job(scene, out)
-    other = replace(QUICK, settings=QUICK.settings.with_settings({"seed": 1}))
-    assert run(scene, out, other)["status"] == DONE
-    before = results(out)
-    actual = make_result(*call, wait=False)
-    assert actual is not None
-    assert says(actual["error"], out / "room.ply", "settings", "--output")
-    assert results(out) == before
-
-
 def test_what_another_run_works_on_is_left_to_it(scene: Path, out: Path) -> None:
     job, started = one_job(scene, out)
     with lock_result(out, "room.ply", wait=False) as begun:
         assert begun is not None
-        runs.mark(begun)
+        begun.touch()
         (out / left_by_a_dead_process()).touch()
         assert make_result(job, started, wait=False) is None
-        assert record_loss(job, started, "died") is None
+        assert make_result(job, started, False, "died") is None
         remove_unfinished(started, [job])
         assert len(results(out)) == 3  # lock, mark, and the file that the other process may yet clean up
     assert not (out / "batch.jsonl").exists()
@@ -324,7 +304,8 @@ def test_a_record_cut_in_the_middle_is_done_again(scene: Path, out: Path, undist
 
 
 @pytest.mark.parametrize(
-    "name", ["gsmerge.batch.run.mark", "gsmerge.batch.jobs.compact_files", "gsmerge.io.formats.write.write_gaussians"]
+    "name",
+    ["gsmerge.batch.run.atomic_output", "gsmerge.batch.jobs.compact_files", "gsmerge.io.formats.write.write_gaussians"],
 )
 def test_a_full_disk_fails_the_scene_and_leaves_nothing(
     name: str, scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
@@ -354,7 +335,7 @@ def test_where_nothing_can_be_recorded_nothing_is_forgotten(
         run(scene, out)
     job, started = one_job(scene, out)
     with refuses(SceneError, "batch.jsonl", "No space"):
-        record_loss(job, started, "died")
+        make_result(job, started, False, "died")
     remove_unfinished(started, [job])
     monkeypatch.undo()
     assert run(scene, out)["status"] == DONE  # the result is there without a record, and known as ours
@@ -378,7 +359,7 @@ def leave_mark(out: Path) -> Path:
     """Leave the mark of a process that was killed while it worked on the scene."""
     with lock_result(out, "room.ply", wait=False) as begun:
         assert begun is not None
-        runs.mark(begun)
+        begun.touch()
     return begun
 
 
@@ -392,7 +373,7 @@ def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path
     job, started = one_job(scene, out)
     kill(out)
     (out / ".room-mine.ply").touch()
-    actual = record_loss(job, started, "killed")
+    actual = make_result(job, started, False, "killed")
     assert actual is not None
     assert (actual["status"], actual["error"]) == (FAILED, "killed")
     assert records(out) == [actual]

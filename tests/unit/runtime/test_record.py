@@ -7,7 +7,10 @@ import threading
 import pytest
 
 from gsmerge.runtime.record import (
+    BEFORE_FIT,
     STAGES,
+    Forecast,
+    Part,
     adopt,
     choose,
     current_record,
@@ -91,3 +94,25 @@ def test_threads_of_the_caller_have_runs_of_their_own() -> None:
         thread.join()
     assert record.notes == []
     assert notes == [["other"]]
+
+
+def test_parts_and_steps_of_their_fits_say_what_share_is_done() -> None:
+    """Also with two fits in a part, and after fewer or more parts than were expected."""
+    forecast, shares = Forecast(), []
+    assert forecast.share is None
+    forecast.expect([Part(20, 80, num_fits=2), Part(10, 90), Part(100), Part(100)])
+    for _ in range(2):
+        forecast.begin()
+        for step in (1, 50, 100, 1, 100)[: 5 if not shares else 3]:
+            forecast.take_step(step, 100)
+            shares.append(forecast.share)
+    before = 20 * BEFORE_FIT
+    done = [before + 0.4, before + 20, before + 40, before + 40.4, before + 80]
+    done += [100 + 10 * BEFORE_FIT + share * 90 for share in (0.01, 0.5, 1.0)]
+    assert shares == pytest.approx([seconds / 400 for seconds in done])
+    forecast.expect([Part(50)])  # the search has ended before it was expected to
+    forecast.begin()
+    assert forecast.share == pytest.approx(200 / 250)
+    forecast.begin()
+    forecast.begin()
+    assert forecast.share == 1

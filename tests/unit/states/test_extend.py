@@ -145,22 +145,6 @@ def test_a_batch_that_shows_something_else_is_refused_unless_asked_for(room: Sce
     assert compare_worlds(earlier, views, centre + 0.5 * rays) == "not known"
 
 
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_a_state_without_a_batch_is_that_of_the_others(number: int, room: Scene, tmp_path: Path) -> None:
-    """Byte for byte, with names that are taken and harmonics of several degrees."""
-    rich = scenes.make_scene(scenes.room(), scenes.arc(2, 48, 36), degree=1)
-    parts = [scenes.take_views(room, range(3)), rich, replace(scenes.take_views(room, [5, 3]), names=room.names[1:3])]
-    compactor = Compactor(**FEW)
-    for part in parts:  # as by files, one at a time
-        compactor.extend(part)
-        compactor.save(tmp_path / "all.gsm", overwrite=True)
-        compactor = Compactor.load(tmp_path / "all.gsm", **FEW)
-    compactor.remove(number)
-    compactor.save(tmp_path / "left.gsm")
-    fed(*(part for place, part in enumerate(parts, 1) if place != number)).save(tmp_path / "alone.gsm")
-    assert (tmp_path / "left.gsm").read_bytes() == (tmp_path / "alone.gsm").read_bytes()
-
-
 def test_a_batch_without_cameras_adds_gaussians_alone(room: Scene) -> None:
     alone = Scene(room.gaussians, room.cameras[[]], None, None, ())
     only, after = fed(alone), fed(scenes.take_views(room, range(3)), alone)
@@ -236,10 +220,6 @@ def test_wrong_use(room: Scene) -> None:
     for call in (empty.compact, lambda: empty.save("a.gsm")):
         with pytest.raises(ValueError, match="at least one batch"):
             call()
-    for number in (0, 1, 2):
-        with pytest.raises(ValueError, match=f"remove {number}: expected a batch") as refused:
-            compactor.remove(number)
-        assert ("Compactor.batches" in str(refused.value)) == (number != 1)
     with pytest.raises(ValueError, match="recipe"):
         compactor.decode(k=1)
     with pytest.raises(ValueError, match=r"\.gsm"):

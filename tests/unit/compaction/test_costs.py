@@ -1,0 +1,53 @@
+"""What a run is said to take before it begins."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from made_gaussians import random_gaussians
+
+from gsmerge import CompactOptions
+from gsmerge.budget import count_limits
+from gsmerge.compaction.costs import IMPORT_SECONDS, RunCosts, expected_parts
+from gsmerge.compaction.estimate import estimate
+from gsmerge.facts.scene_size import SceneSize
+from gsmerge.types import Cameras, Scene
+
+VIEW = 480 * 320
+ALONE = Scene(random_gaussians(20_000, 0), Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1), None, None, ())
+USUAL: dict[str, Any] = {
+    "has_target": False, "has_curve": False, "max_drop": None, "rendered": False, "levels": 1, "has_trial": False,
+}  # fmt: skip
+
+
+def seconds(views: int = 12, *, steps: int = 240, count: int = 50_000, threads: int = 1, **changes: Any) -> float:
+    """Wall time of a run, with settings of ``compact`` and with arguments of ``expected_parts``."""
+    parts = {name: changes.pop(name) for name in tuple(changes) if name in USUAL}
+    options = CompactOptions().with_settings({"checkpoint": "none"} | changes)
+    size = SceneSize(views * VIEW, views, 320, 480, True, rendered=False)
+    costs = RunCosts(options.to_dict(), views * VIEW, VIEW, 0.5, steps)
+    expected = expected_parts(
+        costs, count_limits(size, options.segment, options.decode, options.budget), count, **USUAL | parts
+    )
+    return costs.seconds(expected, views, threads)
+
+
+def test_more_work_takes_longer() -> None:
+    usual = seconds()
+    assert IMPORT_SECONDS < seconds(steps=0) < seconds(steps=0, segmentation="slic")
+    assert seconds(steps=0, method="voxel") < usual < seconds(recipe="paper", checkpoint="paper")
+    assert usual < min(seconds(24), seconds(steps=1000), seconds(count=10**6))
+    assert seconds(steps=0, count=1) == seconds(steps=0, count=10**6)
+    for changes in ({"has_curve": True}, {"has_target": True}, {"levels": 3}, {"has_trial": True}):
+        assert usual < seconds(**changes) < 4 * usual
+    assert seconds(2) > seconds(2, threads=2) == seconds(2, threads=16)
+
+
+def test_a_fit_is_told_where_a_budget_is_named() -> None:
+    plain, asked, best = (
+        estimate(ALONE, CompactOptions().with_settings(settings))
+        for settings in ({}, {"budget": "10%"}, {"budget": "10%", "effort": "best"})
+    )
+    assert (plain["fit"], asked["fit"], best["fit"]) == ("none", "full", "full")
+    assert asked["seconds"] < best["seconds"]
