@@ -39,9 +39,8 @@ TASKS: dict[str, tuple[tuple[str, ...], ...]] = {
     "reference": (("python", "docs/generate_reference.py"), ("python", "docs/one_run.py")),
     "fuzz": (("python", "tools/fuzz.py"),),
     "sanitize": (("python", "tools/sanitize.py"),),
-    "kills": (("python", "benchmarks/kills.py"),),
+    "kills": (("python", "tools/kills.py"),),
     "preview": (("python", "tools/make_preview.py"),),
-    "small": (("python", "tools/small_modules.py"),),
 }
 CHECKS = ("lint", "types", "imports", "docs", "tests", "sweeps")
 

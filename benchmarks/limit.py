@@ -1,23 +1,31 @@
 """How near the kernels come to what a machine can do: docs/results/limit.md.
 
-python benchmarks/limit.py                                    # fox and fern, the package that Python finds
+python benchmarks/limit.py                                    # fox and fern
 python benchmarks/limit.py fern --page docs/results/limit.md  # its tables into the page
-python benchmarks/limit.py --tree ../before --tree .          # two checkouts with built kernels, in turns
-GSMERGE_TARGET=v3 python benchmarks/limit.py --json           # kernels of another target; numbers for programs
+GSMERGE_TARGET=v3 python benchmarks/limit.py                  # kernels of another target
 
 Each step of a real fit is timed, and its pairs of a pixel and a Gaussian are counted in a run of their own. Needed
 pairs change the picture. Visited pairs are those on which the kernels work. The limit of a kernel is the time that its
 operations take at the peak of the processor, or its bytes at the bandwidth of the memory that holds them, whichever is
-longer (``kernel_work.py``). Times are the least of several runs, since other programs disturb them.
+longer. Times are the least of several runs, since other programs disturb them.
+
+Operations and bytes (``COSTS``) are counted in the source of each kernel. A slot is one instruction in one lane of a
+vector: an add, a multiplication, a comparison, a selection, a minimum, a rounding or a bitwise operation, or a
+multiply-add, which is two operations in one slot. A division or a square root takes as many slots as the machine makes
+multiply-adds in its time. Loads, stores, shuffles, addresses and loops are not counted: an ideal processor does them
+beside. Bytes are those that have to come or go once for each call: a tile's planes and a block's planes stay in the
+first cache.
 """
 
 from __future__ import annotations
 
-import argparse
+import atexit
 import ctypes
+import inspect
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 import tempfile
@@ -25,56 +33,97 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from kernel_work import KERNELS, work_of
-from page_tables import make_table
-from shared_scenes import export, scene_folders
+from captures import export, make_parser, make_table, scene_folders
 
+from gsmerge.kernels import signature
 from gsmerge.kernels.build import compiler, find_platform
+from gsmerge.kernels.gaussians.optimise import adam
 from gsmerge.kernels.library import load_library
+from gsmerge.kernels.raster.binning import sort_bits
+from gsmerge.kernels.raster.blend import gather_slots
+from gsmerge.kernels.raster.project import project, project_backward
+from gsmerge.kernels.raster.step import PHASES, STEP
 
 HERE = Path(__file__).parent
+RECORD, COUNTER = "LIMIT_RECORD", "LIMIT_COUNTER"  # environment of a run that is recorded: its file, and the counter
+REPEATS = 5  # runs of each command
 SIZES = {"L2": 2**19, "L3": 2**24, "memory": 2**28}  # bytes of a stream that is read and written
 THREADS = 1, 2
 TRIES = {1: 40, 2: 160}  # of a peak, by threads; the best counts
-GOAL = 0.7  # share of the limit that the last table supposes
 # Kernels in the phases of a step; those with several parts are divided by separate calls
-PHASES = {
+KERNELS_OF = {
     "cull": ("cull",), "project": ("project", "sort"), "count": ("bin",), "count_open": ("bin",), "deal": ("bin",),
     "deal_open": ("bin",), "blend": ("blend",), "loss": ("loss",), "backward": ("backward",),
     "update": ("gather_slots", "project_backward", "adam"),
 }  # fmt: skip
-OF_COUNTS = ("num_visible", "n", "pixels", "listed", "walked", "shown", "visited", "needed", "vectors", "useful")
-# Kernels outside of steps that draw a view
-DRAWING = {
-    "cull": "cull", "project": "project", "sort_bits": "bin", "count_boxes": "bin", "deal_tiles": "bin",
-    "deal_open_tiles": "bin", "blend": "blend",
-}  # fmt: skip
-READ = """
-import json, sys, time
-from pathlib import Path
-import cv2
-from gsmerge.io import read_ply
-def least(call):
-    seconds = []
-    for _ in range(5):
-        start = time.process_time()
-        result = call()
-        seconds.append(time.process_time() - start)
-    return min(seconds), result
-path, folder = Path(sys.argv[1]), Path(sys.argv[2])
-seconds, scene = least(lambda: read_ply(path))
-arrays = [value for value in vars(scene.gaussians).values() if hasattr(value, "nbytes")]
-photos = [one for one in folder.rglob("*") if one.suffix.lower() in (".png", ".jpg", ".jpeg")]
-decoding, _ = least(lambda: [cv2.imread(str(one)) for one in photos])
-num_bytes = path.stat().st_size + sum(array.nbytes for array in arrays)
-print(json.dumps({"rows": len(scene.gaussians), "bytes": num_bytes, "seconds": seconds,
-                  "photos": len(photos), "decoding": decoding}))
-"""
+COUNTS = ("pixels", "listed", "walked", "shown", "visited", "needed", "vectors", "useful")  # of limit.c
+OF_COUNTS = ("num_visible", "n", *COUNTS)
+OF_STEPS = ("n", "height", "width", "num_visible", "num_intersections")
+WRITTEN = ("x", "m", "v", "means", "quats", "scales", "opacities", "colors")  # by adam
+FLOAT, ROW = 4, 14 * 4  # bytes of a number, and of a row of the optimiser's state
+# Bytes of a Gaussian's mean, quaternion, scales and opacity; of its conic with its colour; and of a row of slots
+SPLAT, CONIC, SLOT = 11 * FLOAT, (8 + 3) * FLOAT, 9 * FLOAT
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a kernel does for each unit of a count."""
+
+    kernel: str
+    unit: str  # A count of a step; "pair" is a visited or a needed pair
+    plain: float  # Slots with one operation
+    fused: float  # Multiply-adds
+    divisions: float  # Divisions and square roots
+    bytes: float
+    why: str
+
+    def slots(self, division: float) -> float:
+        return self.plain + self.fused + division * self.divisions
+
+    def operations(self, division: float) -> float:
+        return self.plain + 2 * self.fused + 2 * division * self.divisions
+
+
+NARROW = "transpose of the conic, narrow_rows: two axes of the ellipse, their ends, whole numbers"
+TRACE = "trace: base and top of sixteen rows, and the columns of a row"
+COSTS = (
+    Cost("cull", "n", 42, 12, 3, 7 * FLOAT, "depth, two coordinates and their limits, two reaches, seven comparisons"),
+    Cost("cull", "num_visible", 0, 0, 0, FLOAT, "its id"),
+    Cost("project", "num_visible", 134, 63, 9, FLOAT + SPLAT + 8 * FLOAT + FLOAT + 8 + 6 * FLOAT,
+         "position 12, Jacobian 26, rotation 34, two half axes 24, covariance 22, logarithm 20, box 41, conic 18"),
+    Cost("bin", "num_visible", 0, 0, 0, 4 + 4 + 8 + 3 * 16 + 12 + 20 + 12,
+         "sort: keys, three passes that read and write them, order; boxes in that order; dealt. Scalar: bytes alone"),
+    Cost("bin", "listed", 0, 0, 0, FLOAT, "its place in a tile's list"),
+    Cost("blend", "pair", 13, 9, 0, 0,
+         "exponent 2, exp: polynomial 5, squares 3, cut and clamp 3; share of the light 6, three colours"),
+    Cost("blend", "walked", 70, 10, 8, 0, NARROW),
+    Cost("blend", "shown", 64, 32, 0, 0, TRACE),
+    Cost("blend", "listed", 0, 0, 0, FLOAT, "its row"),
+    Cost("blend", "num_visible", 0, 0, 0, CONIC, "conic and colour"),
+    Cost("blend", "pixels", 1, 3, 0, 4 * FLOAT, "background; image and transmittance"),
+    Cost("loss", "pixels", 375, 37.5, 3, 10 * FLOAT,
+         "three values: means over windows 21, SSIM's derivatives 56, their means 10, gradient 32, edges 19"),
+    Cost("backward", "pair", 25, 12, 1, 0,
+         "alpha and share of the light as in blend, 20; g.c 3, what is left behind 5, six sums 9"),
+    Cost("backward", "walked", 70, 10, 8, 0, NARROW),
+    Cost("backward", "shown", 264, 32, 0, 0, TRACE + "; add_columns: moments with x, sums of nine vectors"),
+    Cost("backward", "listed", 0, 0, 0, FLOAT + SLOT, "its row; its slot"),
+    Cost("backward", "num_visible", 0, 0, 0, CONIC, "conic and colour"),
+    Cost("backward", "pixels", 1, 3, 0, 6 * FLOAT, "g.C; image and gradient"),
+    Cost("gather_slots", "listed", 9, 0, 0, FLOAT + SLOT, "its row, its slot"),
+    Cost("gather_slots", "num_visible", 0, 0, 0, 2 * SLOT, "sums, zeroed and written"),
+    Cost("project_backward", "num_visible", 213, 134, 6, FLOAT + SPLAT + SLOT + SPLAT,
+         "position and Jacobian 34, rotation and half axes 62, conic 55, scales 33, quaternion 58, mean 70, pose 30"),
+    Cost("adam", "num_visible", 809, 96, 37, 4 * ROW + 3 * ROW + 5 * FLOAT + 4 * FLOAT + ROW + ROW,
+         "a row is sixteen lanes: moments and step 27 each with root and division, box 24; four exponentials 80"),
+)  # fmt: skip
+KERNELS = tuple(dict.fromkeys(cost.kernel for cost in COSTS))
+OF_LISTS = "walked", "shown", "listed"  # units of tile lists, which the task itself does not ask for
 
 
 @dataclass(frozen=True)
@@ -86,10 +135,14 @@ class Machine:
     divisions: dict[int, float]
     bandwidths: dict[str, dict[int, float]]  # Bytes read and written, by the memory that holds them
 
-    @property
-    def division(self) -> float:
-        """Slots of a division."""
-        return self.slots[1] / self.divisions[1]
+    def work(self, kernel: str, counts: dict[str, float], *, needed: bool) -> np.ndarray:
+        """Return the slots, operations and bytes of a kernel: of the task alone (``needed``), or of this algorithm."""
+        division, total = self.slots[1] / self.divisions[1], np.zeros(3)
+        for cost in COSTS:
+            if cost.kernel == kernel and not (needed and cost.unit in OF_LISTS):
+                count = counts[("needed" if needed else "visited") if cost.unit == "pair" else cost.unit]
+                total += count * np.array([cost.slots(division), cost.operations(division), cost.bytes])
+        return total
 
     def bandwidth(self, num_bytes: float) -> float:
         """Return the bandwidth, for one thread, of memory that holds so many bytes; between streams on a power law."""
@@ -98,14 +151,14 @@ class Machine:
 
     def limit(self, kernel: str, counts: dict[str, float], *, needed: bool) -> tuple[float, str]:
         """Return the least processor seconds of a kernel at the counts of a step, and what bounds it."""
-        work = work_of(kernel, counts, needed=needed, division=self.division)
-        slots, moved = work.slots / self.slots[1], work.bytes / self.bandwidth(work.bytes)
+        slots, _, num_bytes = self.work(kernel, counts, needed=needed)
+        slots, moved = slots / self.slots[1], num_bytes / self.bandwidth(num_bytes)
         return max((slots, "operations"), (moved, "bytes"))
 
 
-def compile_counter(tree: Path, target: str, folder: Path) -> Path:
-    """Compile limit.c for a target of the kernels, with the headers of a tree."""
-    platform, kernels = find_platform(), tree / "gsmerge" / "kernels"
+def compile_counter(target: str, folder: Path) -> Path:
+    """Compile limit.c for a target of the kernels."""
+    platform, kernels = find_platform(), HERE.parent / "gsmerge" / "kernels"
     options = next(one for one in platform.targets if one.name == target)
     command, path = compiler(), folder / f"limit-{target}{platform.suffix}"
     is_zig = Path(command[0]).stem == "zig"
@@ -172,22 +225,128 @@ def measure_machine(path: Path, target: str) -> Machine:
     )
 
 
-def run_tree(tree: Path, words: list[str], threads: int, counter: Path | None = None) -> dict[str, Any]:
-    """Run a command with the package of a tree, and return what kernel_times.py writes."""
-    environment = {**os.environ, "PYTHONPATH": str(tree), "GSMERGE_THREADS": str(threads)}
-    environment |= {"LIMIT_COUNTS": str(counter)} if counter else {}
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "record.json"
-        call = [sys.executable, str(HERE / "kernel_times.py"), str(out), *words, "--overwrite", "-q"]
-        subprocess.run(call, check=True, env=environment)
-        return json.loads(out.read_text())
+class Recorder:
+    """Times of the phases of each step of a fit."""
+
+    def __init__(self, counter: ctypes.CDLL | None) -> None:
+        self.counter, self.lock = counter, threading.Lock()
+        self.steps: list[dict[str, Any]] = []
+        self.phases: dict[str, list[float]] = {}  # of the step that runs: processor seconds and calls
+        self.separate: dict[str, Any] = {}  # times of parts and counts of pairs of that step
+
+    def time_phase(self, entry: Callable[..., Any], address: int, phase: int, fields: int) -> Any:
+        """Time one call of a phase; each thread of a step makes one."""
+        table, name = Fields(address), PHASES[phase]
+        if name == "update" and self.counter is not None:
+            self.separate = {"parts": time_parts(table), **count_pairs(self.counter, table)}
+        start = time.thread_time()
+        result = entry(address, phase, fields)
+        seconds = time.thread_time() - start
+        with self.lock:
+            one = self.phases.setdefault(name, [0.0, 0])
+            if one[1] == table["threads"]:  # the phase begins anew, with more room
+                one[:] = [0.0, 0]
+            one[:] = [one[0] + seconds, one[1] + 1]
+            if name == "update" and one[1] == table["threads"]:
+                cpu = {phase: spent for phase, (spent, _) in self.phases.items()}
+                self.steps.append({**{key: table[key] for key in OF_STEPS}, "cpu": cpu, **self.separate})
+                self.phases = {}
+        return result
+
+
+class Fields:
+    """Numbers and arrays of a step's table, by name, at its address."""
+
+    def __init__(self, address: int) -> None:
+        self.values = (ctypes.c_int64 * len(STEP.fields)).from_address(address)
+
+    def __getitem__(self, key: str) -> int:
+        return self.values[STEP.fields[key]]
+
+    def array(self, key: str) -> np.ndarray:
+        """Return an array of the table without a copy."""
+        argument = STEP.arrays[key]
+        shape = [size if isinstance(size, int) else self[size] for size in argument.shape]
+        count = int(np.prod(shape)) * argument.dtype.itemsize
+        if count == 0:
+            return np.empty(shape, argument.dtype)
+        return np.frombuffer((ctypes.c_char * count).from_address(self[key]), argument.dtype).reshape(shape)
+
+
+def count_pairs(counter: ctypes.CDLL, table: Fields) -> dict[str, int]:
+    """Count the pairs of pixels and Gaussians in a step's lists of tiles, before its last phase."""
+    counts = np.zeros(len(COUNTS), np.int64)
+    pointers = [ctypes.c_void_p(table[key]) for key in ("conics", "flatten_ids", "offsets")]
+    sizes = ("tiles", "height", "width", "num_visible", "num_intersections", "ends")
+    numbers = [ctypes.c_int64(size) for size in (-(-table["width"] // 16), 0, *(table[key] for key in sizes))]
+    if counter.count_pairs(*pointers, *numbers, ctypes.c_void_p(counts.ctypes.data)):
+        raise ValueError("expected lists within their arrays, found an index outside")
+    return dict(zip(COUNTS, counts.tolist(), strict=True))
+
+
+def time_parts(table: Fields) -> dict[str, float]:
+    """Time what the phases "project" and "update" consist of by separate calls; adam works on copies."""
+    m, count = table["num_visible"], table["num_intersections"]
+    arrays = {key: table.array(key) for key in STEP.arrays}
+    of_view = (
+        "sums", "ids", "g_means", "g_quats", "g_scales", "g_opacities", "g_colors", "conics", "depths", "boxes",
+        "order", "keys", "spare",
+    )  # fmt: skip
+    arrays |= {key: arrays[key][:m] for key in of_view} | {
+        "flatten_ids": arrays["flatten_ids"][:count], "slots": arrays["slots"][:count], "first": 0, "last": m,
+        "step": table["step"], "grad_poses": None, "bits": arrays["depths"][:m].view(np.uint32),
+    }  # fmt: skip
+    arrays |= {f"grad_{key[2:]}": arrays[key] for key in of_view if key.startswith("g_")}
+    copies = {key: arrays[key].copy() for key in WRITTEN}
+    seconds = {}
+    for name, function, own in (
+        ("project", project, {"opacities": arrays["drawn"]}),
+        ("sort", sort_bits, {}),
+        ("gather_slots", gather_slots, {}),
+        ("project_backward", project_backward, {"opacities": arrays["drawn"]}),
+        ("adam", adam, copies),
+    ):
+        if name == "gather_slots":
+            arrays["sums"][:] = 0
+        if name == "adam":
+            arrays["g_colors"][:] = arrays["sums"][:, :3]
+        values = [(arrays | own)[key] for key in inspect.signature(function).parameters]
+        start = time.thread_time()
+        function(*values)
+        seconds[name] = time.thread_time() - start
+    return seconds
+
+
+def record_run(out: str) -> None:
+    """Run the command of this process's arguments with clocks around its kernels, and write what they say."""
+    library = os.environ.get(COUNTER)
+    recorder = Recorder(ctypes.CDLL(library) if library else None)
+    find_entry = signature._entry
+
+    def find_timed(library: Any, name: str, *rest: Any) -> Callable[..., Any]:
+        entry = find_entry(library, name, *rest)
+        return (lambda *values: recorder.time_phase(entry, *values)) if name == "fit_phase" else entry
+
+    signature._entry = find_timed
+    atexit.register(lambda: Path(out).write_text(json.dumps(recorder.steps)))  # the program ends its process itself
+    runpy.run_module("gsmerge", run_name="__main__", alter_sys=True)
+
+
+def run_command(folder: Path, threads: int, counter: Path | None = None) -> list[dict[str, Any]]:
+    """Compact a scene in a process of its own, and return the record of its steps."""
+    with tempfile.TemporaryDirectory() as place:
+        environment = {**os.environ, "GSMERGE_THREADS": str(threads), RECORD: f"{place}/record.json"}
+        environment |= {COUNTER: str(counter)} if counter else {}
+        words = ["compact", str(folder), "-o", f"{place}/out.ply", "-q"]
+        subprocess.run([sys.executable, __file__, *words], check=True, env=environment)
+        return json.loads(Path(environment[RECORD]).read_text())
 
 
 def divide_phases(phases: dict[str, float], parts: dict[str, float]) -> dict[str, float]:
     """Divide the seconds of a step's phases among kernels; sorting by depth belongs to the lists."""
     seconds: dict[str, float] = defaultdict(float)
     for phase, value in phases.items():
-        names = PHASES[phase]
+        names = KERNELS_OF[phase]
         total = sum(parts[name] for name in names) if len(names) > 1 else 1.0
         for name in names:
             share = parts[name] / total if len(names) > 1 else 1.0
@@ -195,20 +354,20 @@ def divide_phases(phases: dict[str, float], parts: dict[str, float]) -> dict[str
     return seconds
 
 
-def join_steps(counted: dict[str, Any], runs: dict[int, list[dict[str, Any]]]) -> dict[str, Any]:
+def join_steps(counted: list[dict[str, Any]], runs: dict[int, list[list[dict[str, Any]]]]) -> dict[str, Any]:
     """Return the mean counts and the mean least processor seconds of the steps of each size, by threads and kernel."""
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for i, step in enumerate(counted["steps"]):
+    for i, step in enumerate(counted):
         groups[step["height"], step["width"]].append(i)
     joined = {}
     for (height, width), rows in sorted(groups.items(), reverse=True):
-        steps = [counted["steps"][i] for i in rows]
+        steps = [counted[i] for i in rows]
         counts = {key: float(np.mean([step[key] for step in steps])) for key in OF_COUNTS}
         seconds: dict[int, dict[str, float]] = {}
         for threads, records in runs.items():
             sums = dict.fromkeys(KERNELS, 0.0)
             for i, step in zip(rows, steps, strict=True):
-                times = [record["steps"][i]["cpu"] for record in records]
+                times = [record[i]["cpu"] for record in records]
                 least = {phase: min(one[phase] for one in times) for phase in times[0]}
                 for kernel, value in divide_phases(least, step["parts"]).items():
                     sums[kernel] += value / len(rows)
@@ -217,47 +376,14 @@ def join_steps(counted: dict[str, Any], runs: dict[int, list[dict[str, Any]]]) -
     return joined
 
 
-def draw_result(tree: Path, result: Path, pictures: Path, counter: Path, repeats: int) -> dict[str, Any]:
-    """Return mean counts and the least seconds of the kernels for a view of a result, one thread."""
-    words = ["render", str(result), "-o", str(pictures)]
-    counted = run_tree(tree, words, 1, counter)
-    runs, views = [run_tree(tree, words, 1)["kernels"] for _ in range(repeats)], counted["kernels"]["sort_bits"][1]
-    seconds: dict[str, float] = defaultdict(float)
-    for name, kernel in DRAWING.items():
-        seconds[kernel] += min(run.get(name, [0.0])[0] for run in runs) / views
-    return {"counts": {key: count / views for key, count in counted["drawn"].items()}, "seconds": seconds}
-
-
-def read_scene(tree: Path, path: Path, folder: Path) -> dict[str, Any]:
-    """Return bytes and seconds of reading the rows of a scene, and the seconds of decoding its photos."""
-    environment = {**os.environ, "PYTHONPATH": str(tree), "GSMERGE_THREADS": "1"}
-    run = subprocess.run(
-        [sys.executable, "-c", READ, str(path), str(folder)], check=True, env=environment, stdout=subprocess.PIPE
-    )
-    return json.loads(run.stdout)
-
-
-def measure_scene(trees: list[Path], folder: Path, counters: list[Path], repeats: int, out: Path) -> list[Any]:
-    """Compact a scene with each tree, in turns; return a record of each tree."""
-    results = [out / f"{folder.name}-{i}.ply" for i in range(len(trees))]
-    words = [["compact", str(folder), "-o", str(result)] for result in results]
-    counted = [run_tree(tree, *rest) for tree, *rest in zip(trees, words, [1] * len(trees), counters, strict=True)]
-    runs: list[dict[int, list[Any]]] = [{threads: [] for threads in THREADS} for _ in trees]
-    for _ in range(repeats):
+def measure_scene(folder: Path, counter: Path) -> dict[str, Any]:
+    """The steps of a scene's default run, by size."""
+    counted = run_command(folder, 1, counter)
+    runs: dict[int, list[list[dict[str, Any]]]] = {threads: [] for threads in THREADS}
+    for _ in range(REPEATS):
         for threads in THREADS:
-            for i, tree in enumerate(trees):
-                runs[i][threads].append(run_tree(tree, words[i], threads))
-    rows = sorted(folder.rglob("*.ply"))[0]
-    records = []
-    for i, tree in enumerate(trees):
-        alone = runs[i][1]
-        least = min(alone, key=lambda run: run["seconds"])
-        other = sum(seconds for seconds, _ in least["kernels"].values())
-        record = {"scene": folder.name.removesuffix("-plain"), "tree": i, "seconds": least["seconds"]}
-        record |= {"other_kernels": other, "sizes": join_steps(counted[i], runs[i])}
-        record |= {"drawing": draw_result(tree, results[i], out / "pictures", counters[i], repeats)}
-        records.append(record | {"reading": read_scene(tree, rows, folder)})
-    return records
+            runs[threads].append(run_command(folder, threads))
+    return {"scene": folder.name.removesuffix("-plain"), "sizes": join_steps(counted, runs)}
 
 
 def machine_table(machine: Machine) -> str:
@@ -289,21 +415,14 @@ def kernel_rows(machine: Machine, counts: dict[str, float], seconds: dict[int, d
     """Return a row for each kernel: milliseconds, what bounds it, and the shares of the limits."""
     rows = []
     for kernel in KERNELS:
-        own = seconds[1].get(kernel, 0.0)
-        if own == 0:
-            continue
+        own = seconds[1][kernel]
         visited, bound = machine.limit(kernel, counts, needed=False)
         needed, _ = machine.limit(kernel, counts, needed=True)
-        work = work_of(kernel, counts, needed=False, division=machine.division)
-        plain = work.operations / (2 * machine.slots[1]) / own
+        plain = machine.work(kernel, counts, needed=False)[1] / (2 * machine.slots[1]) / own
         row = [kernel, f"{1e3 * own:.3f}", bound, f"{visited / own:.2f}", f"{needed / own:.2f}", f"{plain:.2f}"]
-        if 2 in seconds:
-            row += [f"{1e3 * seconds[2][kernel]:.3f}", f"{visited / seconds[2][kernel]:.2f}"]
+        row += [f"{1e3 * seconds[2][kernel]:.3f}", f"{visited / seconds[2][kernel]:.2f}"]
         rows.append(row)
     return rows
-
-
-HEAD = ("", "ms", "bound by", "of the algorithm's limit", "of the task's", "in FLOPs")
 
 
 def steps_table(machine: Machine, records: list[dict[str, Any]]) -> str:
@@ -316,82 +435,8 @@ def steps_table(machine: Machine, records: list[dict[str, Any]]) -> str:
         for size, group in groups[:2]:
             rows.append([f"**{record['scene']}, {size}**", *[""] * 7])
             rows += kernel_rows(machine, group["counts"], group["seconds"])
-    return make_table((*HEAD, "of two threads, ms", "of the algorithm's limit"), rows)
-
-
-def drawing_table(machine: Machine, records: list[dict[str, Any]]) -> str:
-    rows = []
-    for record in records:
-        drawing, reading, scene = record["drawing"], record["reading"], record["scene"]
-        for row in kernel_rows(machine, drawing["counts"], {1: drawing["seconds"]}):
-            rows.append([f"{scene}, {row[0]}", *row[1:]])
-        share = f"{reading['bytes'] / machine.bandwidth(reading['bytes']) / reading['seconds']:.2f}"
-        rows.append([f"{scene}, rows read", f"{1e3 * reading['seconds']:.1f}", "bytes", share, share, ""])
-        if reading["photos"]:
-            name = f"{scene}, {reading['photos']} photos decoded"
-            rows.append([name, f"{1e3 * reading['decoding']:.1f}", *[""] * 4])
-    return make_table(HEAD, rows)
-
-
-def kernel_seconds(machine: Machine, record: dict[str, Any], *, needed: bool) -> dict[str, tuple[float, float]]:
-    """Return the seconds of each kernel in all steps of a command, and their limit, one thread."""
-    totals = {}
-    for kernel in KERNELS:
-        groups = record["sizes"].values()
-        spent = sum(group["steps"] * group["seconds"][1][kernel] for group in groups)
-        limit = sum(group["steps"] * machine.limit(kernel, group["counts"], needed=needed)[0] for group in groups)
-        totals[kernel] = spent, limit
-    return totals
-
-
-def goal_table(machine: Machine, records: list[dict[str, Any]]) -> str:
-    """What a command would take if the kernels of its steps reached GOAL of their limits, and nothing else changed.
-
-    Lists of tiles are left out: their limit counts bytes alone, which scalar code never reaches.
-    """
-    rows = []
-    for record in records:
-        totals = kernel_seconds(machine, record, needed=False)
-        steps = sum(spent for spent, _ in totals.values())
-        rest = record["seconds"] - steps - record["other_kernels"]
-        cells = [record["seconds"], steps, record["other_kernels"], rest]
-        for needed in (False, True):
-            pairs = [pair for key, pair in kernel_seconds(machine, record, needed=needed).items() if key != "bin"]
-            cells.append(record["seconds"] - sum(max(0.0, spent - limit / GOAL) for spent, limit in pairs))
-        rows.append((record["scene"], *(f"{cell:.2f}" for cell in cells)))
-    goals = f"at {GOAL:.0%} of the algorithm's limits", f"at {GOAL:.0%} of the task's"
-    head = "seconds, one thread", "command", "its steps", "other kernels", "the rest", *goals
-    return make_table(head, rows)
-
-
-def trees_table(machine: Machine, records: list[dict[str, Any]]) -> str:
-    """Seconds of each kernel in all steps of a command, by tree, and their share of the algorithm's limit."""
-    rows, names = [], ("before", "now")
-    for scene in dict.fromkeys(record["scene"] for record in records):
-        some = [record for record in records if record["scene"] == scene]
-        totals = [kernel_seconds(machine, record, needed=False) for record in some]
-        for kernel in KERNELS:
-            cells = [f"{one[kernel][0]:.3f} ({one[kernel][1] / one[kernel][0]:.2f})" for one in totals]
-            rows.append((f"{scene}, {kernel}", *cells, f"{totals[-1][kernel][0] / totals[0][kernel][0]:.2f}"))
-        ratio = some[-1]["seconds"] / some[0]["seconds"]
-        rows.append((f"{scene}, command", *(f"{record['seconds']:.2f}" for record in some), f"{ratio:.2f}"))
-    return make_table(
-        ("seconds (share)", *(names if len(totals) == 2 else map(str, range(len(totals)))), "ratio"), rows
-    )
-
-
-def make_tables(machine: Machine, records: list[dict[str, Any]]) -> dict[str, str]:
-    """Return the tables of the last tree by name and target, and one that compares trees if there are several."""
-    last = [record for record in records if record["tree"] == records[-1]["tree"]]
-    tables = {
-        "machine": machine_table(machine),
-        "pairs": pairs_table(last),
-        "steps": steps_table(machine, last),
-        "drawing": drawing_table(machine, last),
-        "goal": goal_table(machine, last),
-    }
-    tables |= {"trees": trees_table(machine, records)} if len(last) < len(records) else {}
-    return {f"{name} {machine.target}": table for name, table in tables.items()}
+    head = "", "ms", "bound by", "of the algorithm's limit", "of the task's", "in FLOPs"
+    return make_table((*head, "of two threads, ms", "of the algorithm's limit"), rows)
 
 
 def write_page(path: Path, tables: dict[str, str]) -> None:
@@ -402,42 +447,27 @@ def write_page(path: Path, tables: dict[str, str]) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def find_scenes(text: str, cache: Path) -> list[Path]:
-    """Return the folders of scenes: a folder itself, or exports of captures by name."""
-    if Path(text).is_dir():
-        return [Path(text)]
-    paths = [export(folder, cache) for folder in scene_folders(text)]
-    return [next(parent for parent in path.parents if parent.parent == cache) for path in paths]
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scenes", nargs="*", default=["fox,fern"], help="train, eval, names with commas, folders")
-    parser.add_argument("--tree", type=Path, action="append", help="checkout with built kernels; may be repeated")
-    parser.add_argument("--repeats", type=int, default=5, help="runs of each command")
-    parser.add_argument("--json", action="store_true", help="print all numbers instead of tables")
+    parser = make_parser(__doc__, "fox,fern")
     parser.add_argument("--page", type=Path, help="page whose tables of this target are replaced")
-    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
     args = parser.parse_args()
-    args.cache.mkdir(parents=True, exist_ok=True)
-    trees = [tree.resolve() for tree in args.tree or [HERE.parent]]
-    target = Path(load_library()._name).stem.split("-")[-1]
+    target, folders = Path(load_library()._name).stem.split("-")[-1], scene_folders(args.scenes)
     with tempfile.TemporaryDirectory() as name:
-        counters = []
-        for i, tree in enumerate(trees):
-            (Path(name) / str(i)).mkdir()
-            counters.append(compile_counter(tree, target, Path(name) / str(i)))
-        machine, records = measure_machine(counters[-1], target), []
-        for folder in (folder for text in args.scenes for folder in find_scenes(text, args.cache)):
-            records += measure_scene(trees, folder, counters, args.repeats, Path(name))
-    tables = make_tables(machine, records)
+        counter = compile_counter(target, Path(name))
+        machine = measure_machine(counter, target)
+        records = [measure_scene(export(folder, args.cache).parent, counter) for folder in folders]
+    tables = {
+        f"machine {target}": machine_table(machine),
+        f"pairs {target}": pairs_table(records),
+        f"steps {target}": steps_table(machine, records),
+    }
     if args.page:
         write_page(args.page, tables)
-    if args.json:
-        print(json.dumps({"machine": asdict(machine), "records": records}))
-    else:
-        print("\n\n".join(f"{key}\n\n{table}" for key, table in tables.items()))
+    print("\n\n".join(f"{key}\n\n{table}" for key, table in tables.items()))
 
 
 if __name__ == "__main__":
-    main()
+    if RECORD in os.environ:
+        record_run(os.environ[RECORD])
+    else:
+        main()

@@ -20,7 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from capture_exports import frame_of
+from captures import frame_of
 
 from gsmerge.geometry import project_points
 from gsmerge.io.cameras.camera_file import CameraFile

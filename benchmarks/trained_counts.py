@@ -1,52 +1,33 @@
-"""How like the input a trained scene stays at several counts: ours beside splat-transform, mean and worst view.
+"""How like the input trained files stay at several counts, without photos and cameras: ours beside splat-transform.
 
-python benchmarks/trained_counts.py fox,fern --folder made      # made/fox.ply and .cameras.json, by trained_scenes.py
-python benchmarks/trained_counts.py biker --folder made --orbits    # made/biker.ply, which has neither; --walk: a room
-python benchmarks/trained_counts.py biker --folder made --views transforms.json    # cameras of a file
+python benchmarks/trained_counts.py biker.ply guitar.ply
+python benchmarks/trained_counts.py garden.ply --walk           # a room: from inside, too
+python benchmarks/trained_counts.py biker.ply --ours-only
 
-Input and results are rendered at the held-out cameras and at cameras at random between the input's; or on two orbits,
-on a walk inside, and at the cameras of a file.
-Results of both modes of splat-transform (on the PATH, or named by GSMERGE_SPLAT_TRANSFORM) are kept in the folder. A
-line has the mean of all views, the worst by PSNR, and processor seconds of what was made anew; `least` is what ours has
-more than theirs in the view where that is least.
+Each cell has the mean PSNR of 16 views from two orbits (and 8 inside): of ours, and of both modes of splat-transform
+(on the PATH, or named by GSMERGE_SPLAT_TRANSFORM). The last column has their processor seconds at 4.4 %.
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
-import subprocess
+import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
-from shared_scenes import read_held_out, scene_folders
+from captures import CAPTURES, make_table, run_command
 
 import gsmerge
-from gsmerge.geometry import quat_to_rotmat, rotmat_to_quat
 from gsmerge.io import read_ply
 from gsmerge.io.formats.splat_transform import find_program
-from gsmerge.measure.lpips import lpips
-from gsmerge.raster.metrics import psnr, ssim
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.raster.metrics import psnr
+from gsmerge.types import Cameras, Gaussians
 
-BETWEEN = 12  # cameras at random
 ORBITS, AROUND, SIDE = (1.2, 2.2), 8, 512  # radii of half the extent's diagonal; cameras on each; pixels
 WALK = 0.525  # of the longest side
-MODES = {"uniform": "-d", "adaptive": "--decimate-adaptive"}
-
-
-def cameras_between(cameras: Cameras, count: int, seed: int = 0) -> Cameras:
-    """Draw cameras at random on the lines between two of the input's, turned as the share of each says."""
-    rng = np.random.default_rng(seed)
-    quats, centres = rotmat_to_quat(cameras.viewmats[:, :3, :3].astype(np.float64)), cameras.centres
-    viewmats, rows = np.tile(np.eye(4), (count, 1, 1)), rng.integers(0, len(cameras), (count, 2))
-    for view, (a, b) in enumerate(rows):
-        share, sign = rng.uniform(), 1 if quats[a] @ quats[b] >= 0 else -1
-        quat = (1 - share) * quats[a] + share * sign * quats[b]
-        viewmats[view, :3, :3] = quat_to_rotmat(quat[None] / np.linalg.norm(quat))[0]
-        viewmats[view, :3, 3] = -viewmats[view, :3, :3] @ ((1 - share) * centres[a] + share * centres[b])
-    return Cameras(viewmats, cameras.Ks[rows[:, 0]], cameras.width, cameras.height)
+MODES = ("-d", "--decimate-adaptive")
+SHARES = ("1", "4.4", "10", "20")  # percent
 
 
 def look(eye: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -58,7 +39,7 @@ def look(eye: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
     return viewmat
 
 
-def placed(gaussians: Gaussians, walk: bool) -> list[Cameras]:
+def place_cameras(gaussians: Gaussians, walk: bool) -> Cameras:
     """Place cameras on two circles about the middle, around the shortest axis, and if asked for on a line inside."""
     low, high = np.quantile(gaussians.means.astype(np.float64), [0.05, 0.95], axis=0)
     sides, turns = high - low, 2 * np.pi * np.arange(AROUND) / AROUND
@@ -66,81 +47,44 @@ def placed(gaussians: Gaussians, walk: bool) -> list[Cameras]:
     level = [np.cos(turn) * np.roll(up, 1) + np.sin(turn) * np.cross(up, np.roll(up, 1)) for turn in turns]
     away = [(side + 0.25 * up) / np.linalg.norm(side + 0.25 * up) for side in level]
     reach = np.linalg.norm(sides) / 2
-    groups = [[look((low + high) / 2 + radii * reach * d, -d, up) for d in away] for radii in ORBITS]
+    viewmats = [look((low + high) / 2 + radii * reach * d, -d, up) for radii in ORBITS for d in away]
     if walk:
         steps = np.outer(np.linspace(-0.5, 0.5, AROUND) * WALK, np.eye(3)[sides.argmax()] * sides.max())
-        groups.append([look(np.median(gaussians.means, 0) + s, d, up) for s, d in zip(steps, level, strict=True)])
+        viewmats += [look(np.median(gaussians.means, 0) + s, d, up) for s, d in zip(steps, level, strict=True)]
     K = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
-    return [Cameras(np.stack(group), np.repeat(K[None], AROUND, 0), SIDE, SIDE) for group in groups]
+    return Cameras(np.stack(viewmats), np.repeat(K[None], len(viewmats), 0), SIDE, SIDE)
 
 
-def cameras_of(path: Path) -> list[Cameras]:
-    """Read the cameras of a file, each for itself: their sizes differ."""
-    file = gsmerge.read_cameras(path)
-    sizes = zip(file.widths.tolist(), file.heights.tolist(), strict=True)
-    return [Cameras(file.viewmats[[v]], file.Ks[[v]], *size) for v, size in enumerate(sizes)]
-
-
-def seconds_of(call: list[str]) -> float:
-    """Run a command; return its processor seconds."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(call, check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
-def draw(gaussians: Gaussians, sets: list[Cameras]) -> list[np.ndarray]:
-    """Render all views of all sets of cameras."""
-    return [image for cameras in sets for image in gsmerge.render(gaussians, cameras).images.clip(0, 1)]
-
-
-def compare(images: list[np.ndarray], expected: list[np.ndarray], perceptual: bool) -> np.ndarray:
-    """PSNR, SSIM and, if asked for, LPIPS of each view, ``[views,measures]``."""
-    pairs = zip(images, expected, strict=True)
-    return np.array([[psnr(a, b), ssim(a, b), *([lpips(a, b, "vgg")] if perceptual else [])] for a, b in pairs])
+def measure(path: Path, share: str, *, walk: bool, ours_only: bool) -> tuple[list[float], list[float]]:
+    """PSNR from the input, and processor seconds, of ours and of the other program."""
+    if not path.is_file():
+        raise SystemExit(f"{path}: expected a trained file, found none; {CAPTURES}")
+    source = read_ply(path, opacity="logit").gaussians
+    cameras, count = place_cameras(source, walk), str(round(len(source) * float(share) / 100))
+    start, bare = time.process_time(), gsmerge.Scene(source, cameras[:0], None, None, ())
+    made, seconds = [gsmerge.compact(bare, budget=int(count)).gaussians], [time.process_time() - start]
+    for mode in () if ours_only else MODES:
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "out.ply"
+            spent, _ = run_command([find_program(), "-q", "-g", "cpu", str(path.resolve()), mode, count, str(out)])
+            made.append(read_ply(out, opacity="logit").gaussians)
+            seconds.append(spent)
+    expected, *images = (gsmerge.render(each, cameras).images.clip(0, 1) for each in (source, *made))
+    return [float(np.mean([psnr(a, b) for a, b in zip(each, expected, strict=True)])) for each in images], seconds
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scenes", help="train, eval, or names with commas between")
-    parser.add_argument("--folder", type=Path, default=Path(), help="has the scenes of trained_scenes.py")
-    parser.add_argument("--shares", nargs="*", default=["1", "2", "4.4", "10", "20"], help="percent")
-    parser.add_argument("--cameras", action="store_true", help="give ours the cameras")
-    parser.add_argument("--orbits", action="store_true", help="judge from two orbits")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", type=Path, nargs="+")
     parser.add_argument("--walk", action="store_true", help="judge from a walk inside, too")
-    parser.add_argument("--views", type=Path, help="judge from the cameras of a file, too")
-    parser.add_argument("--effort", default="default")
     parser.add_argument("--ours-only", action="store_true")
-    parser.add_argument("--lpips", action="store_true")
     args = parser.parse_args()
-    bare_files = args.orbits or args.walk or args.views is not None
-    for name in args.scenes.split(",") if bare_files else [folder.name for folder in scene_folders(args.scenes)]:
-        path = args.folder / f"{name}.ply"
-        source, seen = read_ply(path, opacity="logit").gaussians, gsmerge.read_scene(path)
-        if bare_files:
-            sets = placed(source, args.walk) if args.orbits or args.walk else []
-            sets += cameras_of(args.views) if args.views else []
-        else:
-            sets = [read_held_out(scene_folders(name)[0]).cameras, cameras_between(seen.cameras, BETWEEN)]
-        expected, bare = draw(source, sets), Scene(source, seen.cameras[:0], None, None, ())
-        for share in args.shares:
-            start, count = time.process_time(), round(len(source) * float(share) / 100)
-            made = gsmerge.compact(seen if args.cameras else bare, budget=count, effort=args.effort).gaussians
-            seconds = {"ours": time.process_time() - start}
-            results = {"ours": compare(draw(made, sets), expected, args.lpips)}
-            for mode, option in {} if args.ours_only else MODES.items():
-                target = args.folder / "theirs" / f"{name}-{share}-{mode}.ply"
-                target.parent.mkdir(exist_ok=True)
-                if not target.exists():
-                    call = [find_program(), "-q", "-g", "cpu", str(path), option, str(count), str(target)]
-                    seconds[mode] = seconds_of(call)
-                theirs = draw(read_ply(target, opacity="logit").gaussians, sets)
-                results[mode] = compare(theirs, expected, args.lpips)
-            for way, values in results.items():
-                worst, least = (each[each[:, 0].argmin()] for each in (values, results["ours"] - values))
-                line = [name, share, way, *np.round(values.mean(0), 3), "worst", *np.round(worst, 3)]
-                line += [] if way == "ours" else ["least", *np.round(least, 3)]
-                print(*line, f"{seconds[way]:.1f} s" if way in seconds else "", flush=True)
+    rows = []
+    for path in args.files:
+        runs = {share: measure(path, share, walk=args.walk, ours_only=args.ours_only) for share in SHARES}
+        cells = [" ".join(f"{value:.1f}" for value in values) for values, _ in runs.values()]
+        rows.append((path.stem, *cells, " ".join(f"{value:.2g}" for value in runs["4.4"][1])))
+    print(make_table(("file", *(f"{share} %" for share in SHARES), "seconds"), rows))
 
 
 if __name__ == "__main__":

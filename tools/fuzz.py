@@ -1,8 +1,9 @@
 """Read changed files of every kind, and keep those that fail: ``python tasks.py fuzz --minutes 30 KIND...``.
 
-With atheris (pip install atheris) changes follow the lines of code that they reach, and files that reached new ones are
-kept in build/fuzz; without it files are changed blindly. A reader returns, or raises an error of the package, within
-its budget; the smallest file that makes it do anything else goes to tests/damage/findings, which the tests read.
+atheris (pip install atheris) lets changes follow the lines of code that they reach; files that reached new ones are
+kept in build/fuzz. A reader returns, or raises an error of the package, within its budget; a file that makes it do
+anything else goes to tests/damage/findings, which the tests read. Without atheris,
+``GSMERGE_FUZZ_EXAMPLES=2000 python -m pytest tests/property/test_readers_fuzz.py`` changes files blindly.
 """
 
 from __future__ import annotations
@@ -13,27 +14,27 @@ import os
 import re
 import resource
 import signal
+import subprocess
 import sys
 import tempfile
-import time
 import traceback
-from collections.abc import Callable
-from contextlib import nullcontext
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from random import Random
 from typing import Any
 
-try:
-    import atheris
-except ImportError:
-    atheris = None
+import atheris
 
 ROOT = Path(__file__).resolve().parent.parent
 TESTS = ROOT / "tests"
 sys.path[:0] = [str(ROOT), str(TESTS), str(TESTS / "helpers")]
+os.environ["OPENCV_LOG_LEVEL"] = "SILENT"
+with atheris.instrument_imports(include=["gsmerge"]):
+    from damage import SOUNDS
+    from damage.random_changes import FINDINGS, mutate, splice
+
 LEARNT = ROOT / "build" / "fuzz"
 SECONDS, BYTES = 15, 512 << 20  # of processor time and memory, several times the budget of such small files
-TRIES = 300  # to make a finding smaller
 SHARED_MEMORY = "/dev/shm" if os.path.isdir("/dev/shm") else None
 
 
@@ -46,7 +47,7 @@ def stop(*_: object) -> None:
     raise TooLong
 
 
-def failure(sound: Any, data: bytes) -> tuple[str, str]:
+def describe_failure(sound: Any, data: bytes) -> tuple[str, str]:
     """Read bytes -> where and how it fails, and the traceback; two empty texts if it does not."""
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     with tempfile.TemporaryDirectory(dir=SHARED_MEMORY) as folder:
@@ -62,69 +63,32 @@ def failure(sound: Any, data: bytes) -> tuple[str, str]:
     return "", ""
 
 
-def shrink(sound: Any, data: bytes, cause: str) -> bytes:
-    """Leave out pieces of a file as long as it fails in the same way."""
-    size, tries = len(data) // 2, 0
-    while size and tries < TRIES:
-        for start in range(0, len(data), size):
-            shorter = data[:start] + data[start + size :]
-            tries += 1
-            if tries < TRIES and failure(sound, shorter)[0] == cause:
-                data = shorter
-                break
-        else:
-            size //= 2
-    return data
-
-
 def keep(kind: str, data: bytes) -> Path:
     """Write a finding to the folder of findings."""
-    from damage.random_changes import FINDINGS
-
     FINDINGS.mkdir(exist_ok=True)
     path = FINDINGS / f"{kind}.{hashlib.sha256(data).hexdigest()[:8]}"
     path.write_bytes(data)
     return path
 
 
-def work(kind: str, seconds: int) -> None:
-    """Try files of one kind for some seconds; print each finding, and the number of inputs as libFuzzer does."""
-    from damage import SOUNDS
-    from damage.random_changes import FINDINGS, mutate, splice
-
+def try_kind(kind: str, seconds: int) -> None:
+    """Try files of one kind for some seconds by libFuzzer, which ends the process; print each finding."""
     signal.signal(signal.SIGPROF, stop)
-    sound = SOUNDS[kind]
-    seeds = [sound.content()]
-    failure(sound, seeds[0])  # which imports all that it takes
-    seeds += [path.read_bytes() for path in FINDINGS.glob(f"{kind}.*")]
+    sound, corpus = SOUNDS[kind], LEARNT / kind
+    seeds = [sound.content(), *(path.read_bytes() for path in FINDINGS.glob(f"{kind}.*"))]
+    describe_failure(sound, seeds[0])  # which imports all that it takes
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
-    causes: set[str] = set()
-
-    def attempt(data: bytes) -> None:
-        cause, trace = failure(sound, data)
-        if cause and cause not in causes:
-            causes.add(cause)
-            path = keep(kind, data if cause.startswith("TooLong") else shrink(sound, data, cause))
-            print(f"FINDING {cause}: {path}\n{trace}", flush=True)
-
-    if atheris:
-        learn(kind, seconds, seeds, attempt, mutate, splice)
-    random, count, end = Random(time.time_ns()), 0, time.monotonic() + seconds
-    while time.monotonic() < end:
-        attempt(mutate(random.choice(seeds), random))
-        count += 1
-    print(f"stat::number_of_executed_units: {count}", flush=True)
-
-
-def learn(
-    kind: str, seconds: int, seeds: list[bytes], attempt: Callable[[bytes], None], mutate: Any, splice: Any
-) -> None:
-    """Run libFuzzer, which keeps the files that reach new lines; it ends the process."""
-    corpus = LEARNT / kind
     corpus.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
         (corpus / hashlib.sha256(seed).hexdigest()).write_bytes(seed)
+    causes: set[str] = set()
+
+    def attempt(data: bytes) -> None:
+        cause, trace = describe_failure(sound, data)
+        if cause and cause not in causes:
+            causes.add(cause)
+            print(f"FINDING {cause}: {keep(kind, data)}\n{trace}", flush=True)
 
     def leaf(data: bytes, random: Random) -> bytes:
         return splice(data, random) if random.random() < 0.5 else atheris.Mutate(data, len(data) + 64)
@@ -142,37 +106,20 @@ def learn(
     atheris.Fuzz()
 
 
-def start(kind: str, seconds: int) -> int:
-    """Try files of one kind in a process of its own, which writes a log -> its id."""
+def run_kind(kind: str, seconds: int) -> bool:
+    """Try files of one kind in a process of its own and print what came of it -> whether the kind is sound."""
     for left in LEARNT.glob(f"{kind}.input-*"):
         left.unlink()
-    process = os.fork()
-    if process == 0:
-        log = os.open(LEARNT / f"{kind}.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(log, 1)
-        os.dup2(log, 2)
-        try:
-            work(kind, seconds)
-            os._exit(0)
-        except Exception:
-            traceback.print_exc()
-            os._exit(1)
-    return process
-
-
-def report(kind: str, code: int, seconds: float) -> bool:
-    """Print what came of a kind -> whether its kind is sound."""
-    log = LEARNT / f"{kind}.log"
-    text = log.read_text(errors="replace")
-    counted = re.findall(r"number_of_executed_units: +(\d+)", text)
-    findings = re.findall(r"^FINDING (.*)", text, re.MULTILINE)
-    for crash in LEARNT.glob(f"{kind}.input-*"):
-        findings.append(f"ended the process: {keep(kind, crash.read_bytes())}")
-    if code and not findings:
-        findings.append(f"ended with exit code {code}: {log}")
-    print(f"{kind:18}{int(counted[0]) if counted else 0:10,} inputs{seconds:7.0f} s", flush=True)
-    for finding in findings:
-        print(f"  {finding}", flush=True)
+    call = [sys.executable, __file__, kind, "--minutes", str(seconds / 60)]
+    done = subprocess.run(
+        call, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace", check=False
+    )
+    counted = re.findall(r"number_of_executed_units: +(\d+)", done.stdout)
+    findings = re.findall(r"^FINDING (.*)", done.stdout, re.MULTILINE)
+    findings += [f"ended the process: {keep(kind, one.read_bytes())}" for one in LEARNT.glob(f"{kind}.input-*")]
+    if done.returncode and not findings:
+        findings.append(f"ended with exit code {done.returncode}: {done.stdout[-2000:]}")
+    print(f"{kind:18}{int(counted[0]) if counted else 0:10,} inputs", *findings, sep="\n  ", flush=True)
     return not findings
 
 
@@ -181,25 +128,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10)
     parser.add_argument("kinds", nargs="*")
-    arguments = parser.parse_args()
-    LEARNT.mkdir(parents=True, exist_ok=True)
-    os.environ["OPENCV_LOG_LEVEL"] = "SILENT"
-    with atheris.instrument_imports(include=["gsmerge"]) if atheris else nullcontext():
-        from damage import SOUNDS
-
-        waiting = arguments.kinds or [kind for kind, sound in SOUNDS.items() if sound.fuzzed]
-        processes = min(os.cpu_count() or 1, len(waiting))
-        seconds = max(1, round(60 * arguments.minutes * processes / len(waiting)))
-        running: dict[int, tuple[str, float]] = {}
-        sound = True
-        while waiting or running:
-            while waiting and len(running) < processes:
-                kind, waiting = waiting[0], waiting[1:]
-                running[start(kind, seconds)] = kind, time.monotonic()
-            process, status = os.wait()
-            kind, begin = running.pop(process)
-            sound &= report(kind, os.waitstatus_to_exitcode(status), time.monotonic() - begin)
-    return 0 if sound else 1
+    args = parser.parse_args()
+    if len(args.kinds) == 1:
+        try_kind(args.kinds[0], round(60 * args.minutes))
+    kinds = args.kinds or [kind for kind, sound in SOUNDS.items() if sound.fuzzed]
+    processes = os.cpu_count() or 1
+    seconds = max(1, round(60 * args.minutes * processes / len(kinds)))
+    with ThreadPoolExecutor(processes) as pool:
+        return 0 if all(list(pool.map(lambda kind: run_kind(kind, seconds), kinds))) else 1
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 MAX_LISTED = 20  # rows of the table, failures, and results that are worse than their input
 # Kinds of reasons at the end of a run, in order, with the word before their lines
-KINDS = {"not used": "not used", "worse": "worse", "left out": "note", "lacking": "note", "failed": "failed"}
+KINDS = {"worse": "worse", "left out": "note", "lacking": "note", "failed": "failed"}
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
 
 

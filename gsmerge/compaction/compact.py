@@ -22,7 +22,7 @@ from gsmerge.compaction.costs import RunCosts, expected_parts, mean_inside
 from gsmerge.compaction.file_size import Rebuild, meet_bytes
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.methods import Method, choose_method
-from gsmerge.compaction.new_views import try_new_views
+from gsmerge.compaction.new_views import can_try, try_new_views
 from gsmerge.compaction.report import CompactReport
 from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, meet, search_count

@@ -70,7 +70,7 @@ def test_a_capture_is_read_by_its_export(
     assert roles == ["context", "target", "context", "target", "context"]
     assert {(frame["w"], frame["h"]) for frame in document["frames"]} == {(128, 64)}
 
-    views = script("capture_exports").read_scene(capture)
+    views = script("captures").read_context(capture)
     assert [view["name"] for view in views] == ["00000.jpg", "00002.jpg", "00004.jpg"]
     own = gsmerge.read_scene(made)
     frames = [frame for frame in document["frames"] if frame["role"] == "context"]
@@ -82,7 +82,7 @@ def test_a_capture_is_read_by_its_export(
         assert view["depth"] == pytest.approx((frame["depth_near"] * frame["depth_far"]) ** 0.5, rel=1e-3)
         assert view["conf"] == pytest.approx(0.75, abs=0.005)
 
-    loaded = load_scene(script("capture_exports").export(capture, tmp_path / "plain"))
+    loaded = load_scene(script("captures").write_export(capture, tmp_path / "plain"))
     assert loaded.alignment.ok
     assert loaded.scene.num_gaussians == 3 * 128 * 64
 
@@ -103,6 +103,6 @@ def test_a_frame_without_its_photo_is_left_out(script: Callable[[str], ModuleTyp
 
 @pytest.mark.parametrize("style", ["da3", "depthsplat", "anysplat"])
 def test_every_style_is_read(style: str, script: Callable[[str], ModuleType], capture: Path, tmp_path: Path) -> None:
-    loaded = load_scene(script("capture_exports").export(capture, tmp_path / style, style))
+    loaded = load_scene(script("captures").write_export(capture, tmp_path / style, style))
     assert len(loaded.scene.cameras) == 3
     assert loaded.scene.has_own_pixels == (style != "anysplat")

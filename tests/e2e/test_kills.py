@@ -1,4 +1,4 @@
-"""Commands that end before a call that changes their folder, a few of the many of ``benchmarks/kills.py``."""
+"""Commands that end before a call that changes their folder, a few of the many of ``tools/kills.py``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytestmark = [
 
 
 def kill(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    tool = [sys.executable, str(root / "benchmarks" / "kills.py")]
+    tool = [sys.executable, str(root / "tools" / "kills.py")]
     return subprocess.run([*tool, *words], cwd=root, capture_output=True, text=True, check=False)
 
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from scripts import load_script
 from sweeps import sweep
 
 import gsmerge
 from gsmerge.networks.checkpoint import SHIPPED
-from gsmerge.scene.held_out import read_held_out
-from gsmerge.scene.read import load_scene
 
 LEAST_GAIN = 1.0  # dB on photos that the scene was not made from
 
@@ -44,29 +40,6 @@ def test_a_budget_is_met_with_networks_and_without(make_scene: Callable[..., Pat
         unpruned = gsmerge.compact(scene, checkpoint=checkpoint, k=k, min_contribution=0, **faint)
         counts[checkpoint] = len(unpruned.gaussians)
     assert counts["none"] < counts[str(SHIPPED)]
-
-
-@pytest.mark.slow
-def test_the_benchmark_compares_at_equal_count(
-    make_scene: Callable[..., Path], tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(root / "benchmarks"))
-    benchmark = load_script(root / "benchmarks" / "networks.py")
-    made = make_scene(tmp_path / "scene", num_views=3, width=96, height=72, seed=123)
-    load = load_scene(made)
-    monkeypatch.setattr(benchmark, "export", lambda folder, cache: load.files.ply)
-    monkeypatch.setattr(benchmark, "read_held_out", lambda folder: read_held_out(load, made / "targets"))
-    store = benchmark.Store(tmp_path / "runs.jsonl")
-    args = argparse.Namespace(checkpoint=SHIPPED, lpips=False, cache=tmp_path, store=store)
-    condition = benchmark.Condition("no fit", {"fit": "none", "min_opacity": 0.5, "min_contribution": 0, "k": 2})
-    own = {learned: benchmark.run(made, condition, args, learned=learned) for learned in (False, True)}
-    before, after = benchmark.at_equal_count(made, condition, args)
-    assert own[False]["count"] < own[True]["count"]
-    assert before == own[False]
-    assert after["count"] == before["count"]
-    assert after["psnr"] != own[True]["psnr"]
-    assert len(store.runs) == len(benchmark.Store(store.path).runs) == 3
-    assert "| no fit |" in benchmark.table([made, made], (condition,), args)
 
 
 @pytest.mark.slow

@@ -19,14 +19,12 @@ import pytest
 from damage.case import Change
 from damage.changes import cut
 from damage.tensors import negate
-from scripts import load_script
 
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.files import find_scene_files
-from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene
 from gsmerge.states.extend import NOT_COMPARED
 from gsmerge.states.state_file import load_state, save_state
@@ -271,37 +269,6 @@ def test_what_feature_gaussians_are_not_made_into(features: Path, states: list[P
     assert_refused(run("convert", states[0], tmp_path / "a.npz"), 3, states[0], "Feature Gaussians", "results")
     assert_refused(run("convert", features, tmp_path / "a.ply"), 3, features, "results", "Feature Gaussians")
     assert listing(tmp_path) == {}
-
-
-@pytest.mark.slow
-def test_the_papers_online_experiment(
-    walks: list[Path], tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The naive way beside K = 1, 2 and 4, after each batch and in the end, by one run of one command."""
-    monkeypatch.syspath_prepend(str(root / "benchmarks"))
-    online = load_script(root / "benchmarks" / "online.py")
-    views = read_held_out(load_scene(walks[0]), walks[0] / "targets")
-    targets = online.Targets(views.images, views.cameras, np.ones(views.images.shape[:3], bool))
-    monkeypatch.setattr(online, "scene_folders", lambda names: [Path(name) for name in names.split(",")])
-    monkeypatch.setattr(online, "make_batches", lambda *_: [walk / "scene.ply" for walk in walks])
-    monkeypatch.setattr(online, "read_held_out", lambda folder: targets)
-    monkeypatch.setattr(online, "in_own_process", lambda run, *given: run(*given))
-    monkeypatch.setattr(online, "lpips_available", lambda net: False)
-    online.main(["one,two", "--out", str(tmp_path / "online.svg")])
-    lines = capsys.readouterr().out.splitlines()
-    growth, ends = json.loads(lines[1])["one"]
-    assert [(views, step["naive"]) for views, step in growth.items()] == [("3", 1152), ("7", 2688)]
-    for step in growth.values():
-        assert step["K = 1"] <= step["groups"] < step["K = 2"] < step["K = 4"] < step["naive"]
-    assert growth["3"]["groups"] < growth["7"]["groups"]
-    assert {way: end["count"] for way, end in ends.items()} == {way: growth["7"][way] for way in online.WAYS}
-    kept = gsmerge.Gaussians.concat([gsmerge.read_scene(walk).gaussians for walk in walks])
-    assert ends["naive"]["PSNR"] == online.score(kept, targets)[0]
-    rows = [line.strip("|").split("|") for line in lines if line.startswith("|")]
-    assert [row[0] for row in rows[2:4]] == ["3", "7"]
-    assert [row[0] for row in rows[6:]] == [scene for scene in ("one", "two", "mean") for _ in range(4)]
-    assert rows[6][2:6] == rows[10][2:6] == rows[14][2:6]
-    assert "</svg>" in (tmp_path / "online.svg").read_text()
 
 
 # what may go wrong

@@ -23,11 +23,11 @@ def capture(root: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def exports(root: Path) -> ModuleType:
-    return load_script(root / "benchmarks" / "capture_exports.py")
+    return load_script(root / "benchmarks" / "captures.py")
 
 
 def test_a_plain_export_lines_up(exports: ModuleType, root: Path, tmp_path: Path) -> None:
-    ply = exports.export(capture(root), tmp_path, "plain", max_views=2)
+    ply = exports.write_export(capture(root), tmp_path, "plain", max_views=2)
     loaded = load_scene(ply)
     assert len(loaded.scene) == 2
     assert loaded.alignment.ok
@@ -38,7 +38,7 @@ def test_a_plain_export_lines_up(exports: ModuleType, root: Path, tmp_path: Path
 
 
 def test_a_pruned_export_is_put_back(exports: ModuleType, root: Path, tmp_path: Path) -> None:
-    ply = exports.export(capture(root), tmp_path, "da3", max_views=2, nested=1.7)
+    ply = exports.write_export(capture(root), tmp_path, "da3", max_views=2, nested=1.7)
     loaded = load_scene(ply)
     assert loaded.alignment.share_within_1px > 0.999
     assert loaded.recovery.best.layout.kind == "box+depth"

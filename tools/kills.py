@@ -1,8 +1,8 @@
 """Commands that end before each call that changes their folder, on a disk that keeps all or drops what was not synced.
 
-python benchmarks/kills.py                                       # every call of six commands; Linux and gcc
-python benchmarks/kills.py --calls 6 --commands compact extend   # six calls of each, at equal distances
-python benchmarks/kills.py --plant copies --commands extend      # with a fault, which must be reported
+python tools/kills.py                                       # every call of six commands; Linux and gcc
+python tools/kills.py --calls 6 --commands compact extend   # six calls of each, at equal distances
+python tools/kills.py --plant copies --commands extend      # with a fault, which must be reported
 
 A preloaded library (kills.c) counts the calls (opens for writing, writes, syncs, renames, removals, new folders) and
 ends the process by SIGKILL before one of them. Then every file must be what it was or what the command makes, no index
@@ -249,7 +249,7 @@ def main() -> int:
     if "KILLS_LIBRARY" not in os.environ:
         with tempfile.TemporaryDirectory() as folder:
             library = f"{folder}/kills.so"
-            subprocess.run(["gcc", "-shared", "-fPIC", "-o", library, str(ROOT / "benchmarks" / "kills.c")], check=True)
+            subprocess.run(["gcc", "-shared", "-fPIC", "-o", library, str(ROOT / "tools" / "kills.c")], check=True)
             env = {**os.environ, "LD_PRELOAD": library, "KILLS_LIBRARY": library}
             return subprocess.run([sys.executable, *sys.argv], env=env, check=False).returncode
     num_faults = 0

@@ -1,31 +1,189 @@
-"""Write a capture as feed-forward backbones write their scenes: a Gaussian for each pixel of its context views.
+"""Captures of docs/internals/captures.md: exports as feed-forward backbones write them, held-out views, scores, tables.
 
-python benchmarks/capture_exports.py SCENE OUT                    # plain: all pixels, view by view
-python benchmarks/capture_exports.py SCENE OUT --style anysplat   # or da3, depthsplat
+python benchmarks/captures.py SCENE OUT                    # plain: a Gaussian for each pixel, view by view
+python benchmarks/captures.py SCENE OUT --style anysplat   # or da3, depthsplat
 
-Depth, confidence and colour are the capture's (docs/internals/captures.md); scales, rotations, opacities and offsets,
-which its depth network does not predict, follow from them with jitter. A seed gives the same bytes every time.
+Captures are in ``scenes/train`` and ``scenes/eval`` below ``GSMERGE_DATA``, or else below ``../shared``. Depth,
+confidence and colour of an export are the capture's; scales, rotations, opacities and offsets, which its depth network
+does not predict, follow from them with jitter. A seed gives the same bytes every time. The other benchmarks import this
+file.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+import math
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+import gsmerge
 from gsmerge.geometry import quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
+from gsmerge.measure.lpips import INSTALL, lpips, lpips_available
+from gsmerge.raster.metrics import psnr, ssim
+from gsmerge.types import Cameras, Gaussians
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
 BORDER = 8  # pixels that da3 (of 256) and depthsplat leave out
+LPIPS_VIEWS = 4  # at most this many target views of a scene, every second, third, ...
+CAPTURES = "docs/internals/captures.md says how captures are made, and which files are not public"
 Rows = dict[str, np.ndarray]  # of Gaussians: means, quats, scales, opacities, sh0, of the same length
+Record = dict[str, Any]
 
 
-def read_scene(folder: Path, max_views: int | None = None) -> list[dict[str, Any]]:
+def make_parser(text: str, scenes: str = "eval") -> argparse.ArgumentParser:
+    """A parser with the captures to measure, and the folder of their exports and of finished runs."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="?", default=scenes, help="train, eval, or names, with commas between")
+    cache = Path(tempfile.gettempdir()) / "gsmerge-benchmarks"
+    parser.add_argument("--cache", type=lambda text: Path(text).resolve(), default=cache, help="exports and runs")
+    return parser
+
+
+def scene_folders(text: str) -> list[Path]:
+    """The folders of captures: of ``train``, of ``eval``, or by name; those that are not there are left out."""
+    root = Path(os.environ.get("GSMERGE_DATA", Path(__file__).parents[2] / "shared"))
+    known = {path.name: path for path in sorted(root.glob("scenes/*/*")) if path.is_dir()}
+    found: list[Path] = []
+    for name in text.split(","):
+        asked = [path for path in known.values() if name in (path.name, path.parent.name)]
+        found += asked
+        if not asked:
+            print(f"left out, as not below {root}: {name}; {CAPTURES}", file=sys.stderr)
+    if not found:
+        raise SystemExit(f"expected captures below GSMERGE_DATA, found none; {CAPTURES}")
+    return found
+
+
+def export(scene: Path, cache: Path, style: str = "plain") -> Path:
+    """The ``.ply`` of a capture, written once into ``cache``."""
+    out = cache / f"{scene.name}-{style}"
+    if not (out / "done").exists():
+        write_export(scene, out, style)
+        (out / "done").touch()
+    return next(out.rglob("*.ply"))
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Held-out photos: ``images [t,h,w,3]``, cameras, and the paper's visibility masks ``[t,h,w]`` (supplement A)."""
+
+    images: np.ndarray
+    cameras: Cameras
+    masks: np.ndarray
+
+
+def read_held_out(scene: Path) -> Targets:
+    """The target views of a capture; a pixel is visible if a context depth sample falls on it or on a neighbour."""
+    frames = [f for f in json.loads((scene / "transforms.json").read_text())["frames"] if f["role"] == "target"]
+    images = [cv2.imread(str(scene / f["file_path"]))[..., ::-1].astype(np.float32) / 255 for f in frames]
+    viewmats = np.stack([np.linalg.inv(np.array(f["transform_matrix"]) @ FLIP) for f in frames])
+    Ks = np.array([[[f["fl_x"], 0, f["cx"]], [0, f["fl_y"], f["cy"]], [0, 0, 1]] for f in frames])
+    points = np.concatenate([_points(view) for view in read_context(scene)])
+    height, width = images[0].shape[:2]
+    masks = np.stack([_visible(points, w2c, K, height, width) for w2c, K in zip(viewmats, Ks, strict=True)])
+    return Targets(np.stack(images), Cameras(viewmats, Ks, width, height), masks)
+
+
+def _points(view: dict[str, Any]) -> np.ndarray:
+    height, width = view["depth"].shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view["K"]).T
+    return (rays * view["depth"][..., None]).reshape(-1, 3) @ view["c2w"][:3, :3].T + view["c2w"][:3, 3]
+
+
+def _visible(points: np.ndarray, w2c: np.ndarray, K: np.ndarray, height: int, width: int) -> np.ndarray:
+    camera = points @ w2c[:3, :3].T + w2c[:3, 3]
+    image = camera[camera[:, 2] > 1e-6] @ K.T
+    x, y = np.floor(image[:, :2] / image[:, 2:]).astype(int).T
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    hit = np.zeros((height, width), np.uint8)
+    hit[y[inside], x[inside]] = 1
+    return cv2.dilate(hit, np.ones((3, 3), np.uint8)) > 0
+
+
+def score(gaussians: Gaussians, targets: Targets, perceptual: bool = False) -> tuple[float, ...]:
+    """Mean PSNR (dB) and SSIM over the visible pixels of all target views; LPIPS-VGG of some of them if asked."""
+    images = gsmerge.render(gaussians, targets.cameras).images.clip(0, 1)
+    values = [
+        (psnr(a, b, mask), ssim(a, b, mask)) for a, b, mask in zip(images, targets.images, targets.masks, strict=True)
+    ]
+    means = tuple(float(v) for v in np.mean(values, 0))
+    if not perceptual:
+        return means
+    chosen = range(0, len(images), math.ceil(len(images) / LPIPS_VIEWS))
+    return *means, float(np.mean([lpips(images[i], targets.images[i], "vgg", targets.masks[i]) for i in chosen]))
+
+
+def require_lpips() -> None:
+    """Stop if LPIPS has no weights."""
+    if not lpips_available("vgg"):
+        raise SystemExit(f"LPIPS needs weights: {INSTALL}")
+
+
+class Records:
+    """Finished measurements in a file, one JSON line each, so that an interrupted benchmark goes on."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+    def get(self, key: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> Record:
+        """The record with a key: a finished one, or that key with what is measured now."""
+        for row in self.rows:
+            if key.items() <= row.items():
+                return row
+        self.rows.append({**key, **measure()})
+        line = json.dumps(self.rows[-1])
+        print(line, file=sys.stderr, flush=True)
+        with self.path.open("a") as file:
+            file.write(f"{line}\n")
+        return self.rows[-1]
+
+
+def mean(records: Sequence[Mapping[str, Any]], name: str) -> float:
+    """The mean of a number over the records that have it; NaN for none."""
+    return float(np.mean([record[name] for record in records if name in record] or [np.nan]))
+
+
+def run_command(call: Sequence[str], tree: Path | None = None, threads: int | None = None) -> tuple[float, bytes]:
+    """Run a command, with the package of another checkout if asked; return its processor seconds and its output."""
+    env = dict(os.environ)
+    env |= {"PYTHONPATH": str(tree.resolve())} if tree else {}
+    env |= {"GSMERGE_THREADS": str(threads)} if threads else {}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(call, check=True, stdout=subprocess.PIPE, env=env, cwd=tempfile.gettempdir())
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done.stdout
+
+
+def make_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of Markdown."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join(f"|{'|'.join(line)}|" for line in lines)
+
+
+def setting(text: str) -> tuple[str, object]:
+    """A setting of compact, NAME=VALUE with the value as JSON or text, as an item of a dictionary."""
+    name, value = text.split("=", 1)
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def read_context(folder: Path, max_views: int | None = None) -> list[dict[str, Any]]:
     """Context views: image ``[h,w,3]`` 0 to 1, depth along z and conf ``[h,w]``, K ``[3,3]``, c2w ``[4,4]`` OpenCV."""
     frames = [f for f in json.loads((folder / "transforms.json").read_text())["frames"] if f["role"] == "context"]
     if max_views and max_views < len(frames):
@@ -120,27 +278,17 @@ def voxel_merge(rows: Rows, size: float) -> Rows:
     return merged | {"opacities": merged["opacities"][:, 0].clip(0, 1)}
 
 
-def ply_header(count: int, harmonics: int = 0) -> bytes:
-    """The header of a ``.ply`` of so many rows, with so many columns of higher harmonics."""
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(harmonics))]
-    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode()
-
-
-def ply_rows(rows: Rows, harmonics: np.ndarray | None = None, *, logits: bool = True) -> bytes:
-    """Rows of a ``.ply``; opacities as logits or as they are."""
+def write_ply(path: Path, rows: Rows, *, logits: bool = True) -> Path:
+    """Write rows; opacities as logits, or as they are."""
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows['means'])}"]
+    header = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode()
     opacities = rows["opacities"][:, None]
     opacities = np.log(opacities / (1 - opacities)) if logits else opacities
-    more = np.zeros((len(opacities), 0)) if harmonics is None else harmonics
-    zeros = np.zeros_like(rows["means"])
-    columns = [rows["means"], zeros, rows["sh0"], more, opacities, np.log(rows["scales"]), rows["quats"]]
-    return np.concatenate(columns, 1).astype("<f4").tobytes()
-
-
-def write_ply(path: Path, rows: Rows, *, logits: bool = True) -> Path:
+    columns = [rows["means"], np.zeros_like(rows["means"]), rows["sh0"], opacities, np.log(rows["scales"])]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(ply_header(len(rows["means"])) + ply_rows(rows, logits=logits))
+    path.write_bytes(header + np.concatenate([*columns, rows["quats"]], 1).astype("<f4").tobytes())
     return path
 
 
@@ -161,9 +309,11 @@ def frame_of(path: str, K: np.ndarray, c2w: np.ndarray, shape: Sequence[int]) ->
     return {**head, **{name: float(v) for name, v in values.items()}, "transform_matrix": (c2w @ FLIP).tolist()}
 
 
-def export(scene: Path, out: Path, style: str = "plain", max_views: int | None = None, nested: float = 1.0) -> Path:
+def write_export(
+    scene: Path, out: Path, style: str = "plain", max_views: int | None = None, nested: float = 1.0
+) -> Path:
     """Write a capture in a backbone's style, and return its ``.ply``; ``nested``: da3's cameras are so much larger."""
-    rng, views = np.random.default_rng(0), read_scene(scene, max_views)
+    rng, views = np.random.default_rng(0), read_context(scene, max_views)
     parts = [view_gaussians(view, rng) for view in views]
     return STYLES[style](out, views, parts, nested)
 
@@ -210,18 +360,12 @@ def _anysplat(out: Path, views: list[dict[str, Any]], parts: list[Rows], nested:
 STYLES = {"plain": _plain, "da3": _da3, "depthsplat": _depthsplat, "anysplat": _anysplat}
 
 
-def main() -> None:
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scene", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--style", choices=STYLES, default="plain")
-    parser.add_argument("--views", type=int, help="use this many context views, evenly spaced")
-    parser.add_argument("--nested", type=float, default=1.0, help="da3: cameras are so much larger than the Gaussians")
     args = parser.parse_args()
-    print(export(args.scene, args.out, args.style, args.views, args.nested))
-
-
-if __name__ == "__main__":
-    import one_line_errors  # noqa: F401
-
-    main()
+    if not (args.scene / "transforms.json").is_file():
+        raise SystemExit(f"{args.scene}: expected a capture, found none; {CAPTURES}")
+    print(write_export(args.scene, args.out, args.style))
