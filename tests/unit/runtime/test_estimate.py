@@ -29,7 +29,7 @@ def test_more_work_takes_longer() -> None:
     assert none < seconds(fit="none") < seconds(fit="none", checkpoint="none", segmentation="slic")
     assert none < seconds(fit_steps=55) < seconds() < seconds(fit_steps=1000)
     assert seconds(24, fit="none") == pytest.approx(2 * seconds(12, fit="none"))
-    assert seconds(method="voxel") < seconds() < seconds(method="unmerged-fit", num_drawn=12 * VIEW)
+    assert seconds(method="random") < seconds() < seconds(method="unmerged-fit", num_drawn=12 * VIEW)
     assert seconds(num_drawn=0) < seconds() < seconds(num_drawn=VIEW)
     assert seconds(fit="none", num_drawn=0) == seconds(fit="none", num_drawn=VIEW)
 
