@@ -22,7 +22,7 @@ import numpy as np
 from captures import Records, export, make_parser, make_table, require_lpips, scene_folders
 
 import gsmerge
-from gsmerge.facts.views import pick_views
+from gsmerge.facts.views import even_views, midpoint_views, pick_views, subset
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate, near_plane
 from gsmerge.measure.lpips import lpips
 from gsmerge.measure.sizes import shrink_cameras, shrink_views
@@ -30,7 +30,6 @@ from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint, save_checkpoint
 from gsmerge.networks.options import SLOTS
 from gsmerge.research.charts.lines import Interval, mean_interval
-from gsmerge.research.charts.measure_run import choose_views
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.held_out import HeldOutViews, read_held_out
 from gsmerge.scene.read import load_files
@@ -140,8 +139,11 @@ def load_case(ply: Path, targets: Path) -> tuple[gsmerge.Scene, HeldOutViews]:
 
 def measure(ply: Path, targets: Path, way: Way, views: int, settings: Mapping[str, Any] | None) -> dict[str, Any]:
     """Make a result of some views of a capture, and score it on the held-out ones between them, at the paper's size."""
-    scene, held_out = choose_views(*load_case(ply, targets), views)
-    assert held_out is not None
+    scene, held_out = load_case(ply, targets)
+    if views < len(scene):
+        ids = even_views(len(scene), views)
+        held_out = held_out[midpoint_views([held_out.context_places[i] for i in ids], held_out.places)]
+        scene = subset(scene, ids)
     held_out, images = shrink_views(held_out, PHOTO_SIDE), dict[int, np.ndarray]()
     gaussians, matched = scene.gaussians, 1.0
     if settings is not None:

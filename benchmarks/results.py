@@ -32,7 +32,7 @@ ASKS: tuple[Ask, ...] = (
     ("`greedy`", "greedy", {}, "budget", ("1%", "4.4%")),
     ("`splat-transform`", "splat-transform", {}, "budget", ("1%", "4.4%")),
     ("`moment-matching`", "moment-matching", {}, "budget", SIZES),
-    ("the input, 100%", INPUT, {}, "", SIZES[:1]),
+    ("the input", INPUT, {}, "", SIZES[:1]),
 )
 
 
@@ -63,7 +63,7 @@ def cell(records: Sequence[RunRecord], size: str) -> str:
         return ""
     names = ("psnr_target_visible", 2), ("lpips_vgg_target_visible", 3)
     scores = "/".join(f"{np.mean([r.value(name) or np.nan for r in records]):.{digits}f}" for name, digits in names)
-    share = float(np.mean([record.percent or 0.0 for record in records]))
+    share = float(np.mean([record.percent for record in records]))
     return scores + ("" if abs(share - float(size[:-1])) < 0.02 * share else f" ({share:.1f}%)")
 
 
@@ -85,7 +85,7 @@ def main() -> None:
     folders, out = scene_folders(args.scenes), args.cache / "results"
     run(folders, args.cache, out)
     names = {folder.name for folder in folders}
-    print(f"\n{results_table([r for r in read_runs(out)[0] if r.scene in names and r.error is None])}")
+    print(f"\n{results_table([r for r in read_runs(out) if r.scene in names and r.error is None])}")
 
 
 if __name__ == "__main__":

@@ -70,7 +70,7 @@ class CompactOptions(Settings):
     clean: CleanOptions = setting(CleanOptions(), "Gaussians to leave out of the result.")
     budget: BudgetOptions = setting(BudgetOptions(), "Number of Gaussians.")
     blocks: BlockOptions = setting(BlockOptions(), "Blocks of views, for scenes of many views.")
-    method: str = setting(OURS, "Method: gsmerge, or a baseline to compare it with, such as voxel or contribution.",
+    method: str = setting(OURS, "Method: gsmerge, or a baseline to compare it with, such as greedy or random.",
         "Baselines need a number of Gaussians.", choices=method_names)  # fmt: skip
     effort: str = setting("default", "Trade time for quality: best is sharper and takes two to three times as "
         "long; fast and draft take less than half.",

@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 import typer.main
-from browser import NO_BROWSER, needs_browser
 from scripts import load_script
 
 from gsmerge import __version__
@@ -102,80 +101,11 @@ def test_the_main_job_runs_as_a_whole(tmp_path: Path) -> None:
     assert calls == [["python3", "-m"], install, make, ["gsmerge", "compact"], ["gsmerge", "render"]]
 
 
-def test_blocks_are_found_by_their_words(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text("```bash\none \\\n  -m two\n```\n\n```bash\nthree\nfour\n```\n")
-    assert find_block("-m two", page=page) == "one \\\n  -m two\n"
-    assert find_block("four", page=page) == "three\nfour\n"
-    for words, count in (("five", 0), ("o", 2)):
-        with pytest.raises(ValueError, match=f"found {count}$"):
-            find_block(words, page=page)
-
-
 def test_ci_runs_that_block() -> None:
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     assert 'commands=$(python3 tools/readme_block.py "tasks.py setup tests")' in script
     assert 'bash -euo pipefail -c "$commands"' in script
     assert "run: .ci/run" in (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
-
-
-CHROMIUM = {
-    "there already": ({"chromium": "", "apt-get": "exit 1"}, "", ""),
-    "no apt-get": ({}, "no Chromium, and no apt-get to install one", ""),
-    "no rights": ({"id": "echo 1000", "sudo": "exit 1", "apt-get": ""}, "neither root nor sudo", ""),
-    "no network": ({"id": "echo 0", "apt-get": "exit 100"}, "apt-get could not install one", ""),
-    "root": ({"id": "echo 0", "apt-get": "{install}"}, "+ apt-get install chromium\n", "{bin}/chromium"),
-    "sudo": ({"id": "echo 1000", "sudo": 'shift; "$@"', "apt-get": "{install}"}, "+ apt-get", "{bin}/chromium"),
-}
-
-
-@pytest.mark.parametrize("ci", ["", "true"])
-@pytest.mark.parametrize("case", CHROMIUM)
-def test_a_browser_is_installed_where_that_is_allowed(case: str, ci: str, tmp_path: Path) -> None:
-    programs, said, made = CHROMIUM[case]
-    folder = tmp_path / "bin"
-    install = f'[[ "$*" != *install* ]] || {{ echo > "{folder}/chromium"; /bin/chmod +x "{folder}/chromium"; }}'
-    write_program(folder / "env", 'export "$1"; shift; "$@"')
-    for name, lines in programs.items():
-        write_program(folder / name, lines.replace("{install}", install) or "true")
-    command = [SHELL[0], str(ROOT / ".ci" / "chromium")]
-    env = {"PATH": str(folder), "CI": ci}
-    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
-    without = done.stdout.count("cannot run\n")
-    assert (done.returncode, done.stderr) == (without if ci else 0, "")
-    assert said in done.stdout
-    assert done.stdout.count("no Chromium") == without <= 1
-    assert without == (not (folder / "chromium").exists())
-    assert not made or Path(made.format(bin=folder)).exists()
-
-
-def test_without_a_browser_tests_are_skipped_aloud_and_fail_in_ci(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("CI", raising=False)
-    mark = needs_browser(None).mark
-    assert (mark.args, mark.kwargs["reason"]) == ((True,), NO_BROWSER)
-    monkeypatch.setenv("CI", "true")
-    with pytest.raises(RuntimeError, match=NO_BROWSER):
-        needs_browser(None)
-    assert needs_browser("/usr/bin/chromium").mark.args == (False,)
-
-
-def test_the_end_of_a_run_says_what_was_not_tried_in_a_browser() -> None:
-    said: list[str] = []
-    skipped = [
-        SimpleNamespace(longrepr=("a.py", 1, f"Skipped: {why}"), nodeid="tests/a.py::b") for why in (NO_BROWSER, "slow")
-    ]
-    reporter = SimpleNamespace(
-        stats={"skipped": skipped},
-        section=lambda line, **_: said.append(line),
-        line=lambda line, **_: said.append(line),
-    )
-    conftest = load_script(ROOT / "tests" / "conftest.py")
-    list(conftest.pytest_terminal_summary(reporter))
-    assert "NOT tested" in said[0]
-    assert said[1].startswith("1 tests were skipped")
-    assert said[1].endswith("tests/a.py")
-    list(conftest.pytest_terminal_summary(SimpleNamespace(stats={})))
-    assert len(said) == 2
 
 
 def test_badges_say_what_the_project_says() -> None:

@@ -13,9 +13,9 @@ from .conftest import Run
 
 @pytest.mark.slow
 def test_json_and_quiet(small_scene: Path, run: Run) -> None:
-    quick = ("--set", "fit=none", "--cases", "unchanged,threads")
+    quick = ("--set", "fit=none", "--cases", "unchanged,order")
     document = json.loads(run("lab", "stress", small_scene, *quick, "--json").out)
-    assert [case["case"] for case in document["cases"]] == ["unchanged", "threads"]
+    assert [case["case"] for case in document["cases"]] == ["unchanged", "order"]
     assert (document["held"], document["failed"]) == (2, 0)
     assert names(document["cases"][0]["wanted"], "0.1 dB")
     outcome = run("lab", "stress", small_scene, *quick, "--quiet")

@@ -8,7 +8,7 @@ from gsmerge.compaction.methods import Method
 from gsmerge.facts.prepare import prepare
 from gsmerge.fit import FitOptions
 from gsmerge.io.formats.splat_transform import find_program
-from gsmerge.research.baselines import greedy, simple, voxel
+from gsmerge.research.baselines import greedy, simple
 from gsmerge.settings.setting import flat_settings
 
 FULL_FIT_SETTINGS = ("effort", "poses", *(name for name in flat_settings(FitOptions) if name != "fit"))
@@ -17,11 +17,8 @@ _baseline = partial(Method, prepare=partial(prepare, fill=False))  # with only t
 
 UNMERGED = _baseline("unmerged", simple.unmerged, uses=())
 UNMERGED_FIT = _baseline("unmerged-fit", simple.unmerged_fit, needs=("photos",), uses=FULL_FIT_SETTINGS)
-MOMENT_MATCHING = _baseline("moment-matching", partial(simple.merge_superpixels, "bass-st", "paper"))
-VOXEL = _baseline("voxel", voxel.run)
-OPACITY = _baseline("opacity", partial(simple.prune, lambda gaussians, _: gaussians.opacities))
-CONTRIBUTION = _baseline("contribution", partial(simple.prune, simple.summed_weights))
+MOMENT_MATCHING = _baseline("moment-matching", simple.match_moments)
+OPACITY = _baseline("opacity", simple.prune_faintest)
 RANDOM = _baseline("random", simple.prune_at_random)
-BLOCKS = _baseline("blocks", partial(simple.merge_superpixels, "grid", "depth"), needs=("pixels",))
 GREEDY = _baseline("greedy", greedy.run)
 SPLAT_TRANSFORM = _baseline("splat-transform", simple.splat_transform, check=find_program)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -15,7 +13,6 @@ from gsmerge.fit import fit_scene
 from gsmerge.io import read_ply, write_ply
 from gsmerge.io.formats.splat_transform import run_program
 from gsmerge.plan import Plan
-from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import DecodeOptions
@@ -23,9 +20,7 @@ from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode
 from gsmerge.stages.encode import encode
 from gsmerge.stages.superpixels import superpixels
-from gsmerge.types import Cameras, Decoded, Gaussians, Groups
-
-MAX_TILED = 2_000_000  # Gaussians in all tiled views in memory; a tiled view is as large as its Gaussians
+from gsmerge.types import Decoded, Gaussians, Groups
 
 
 def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
@@ -43,32 +38,11 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     return fit_scene(start, prepared.scene, prepared.reference.fit_views, options, plan.seed).gaussians
 
 
-def prune(importance: Callable[[Gaussians, Cameras], np.ndarray], prepared: Prepared, _: Plan, count: int) -> Gaussians:
-    """Keep the ``count`` Gaussians with the largest ``importance [n]``, unchanged and in order.
-
-    Of Gaussians with equal importance the first are kept. The importance is, for example, the opacity or the
-    contribution to the views (Mini-Splatting).
-    """
+def prune_faintest(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Keep the ``count`` most opaque Gaussians, unchanged and in order; of equally opaque ones the first."""
     gaussians = prepared.scene.file_gaussians
     with stage("reduce"):
-        order = np.argsort(-importance(gaussians, prepared.scene.cameras), kind="stable")
-        return gaussians[np.sort(order[:count])]
-
-
-def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
-    """Sum each Gaussian's blending weights over the pixels of all views, ``[n]`` float64, independent of threads."""
-    splats = make_splats(gaussians)
-    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-
-    def view_weights(view: int) -> np.ndarray:
-        sums, _ = contributions(tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height))
-        return sums
-
-    total, num_tiled = np.zeros(len(splats)), max(1, MAX_TILED // max(len(splats), 1))
-    for start in range(0, len(cameras), num_tiled):
-        for sums in parallel_map(view_weights, range(start, min(start + num_tiled, len(cameras)))):
-            total += sums
-    return total
+        return gaussians[np.sort(np.argsort(-gaussians.opacities, kind="stable")[:count])]
 
 
 def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
@@ -79,24 +53,22 @@ def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
         return gaussians[np.sort(rng.choice(len(gaussians), min(count, len(gaussians)), replace=False))]
 
 
-def merge_superpixels(
-    segmentation: str, rule: Literal["depth", "paper"], prepared: Prepared, plan: Plan, count: int
-) -> Gaussians:
-    """Merge each superpixel into one Gaussian, without matching across views.
+def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
+    """Merge each superpixel into one Gaussian without matching across views: the paper's "Mom. Match.".
 
-    All views have equally many superpixels, up to one. Empty superpixels are left out. The ``rule`` "paper" is the
-    paper's baseline without a network ("Mom. Match."). It takes the opacity-weighted mean and covariance of the
-    members' means (eq. teacher_mean, teacher_cov). The paper states no opacity, so the members' mean opacity is used.
+    All views have equally many superpixels, up to one. Empty superpixels are left out. A Gaussian has the
+    opacity-weighted mean and covariance of the members' means (eq. teacher_mean, teacher_cov). The paper states no
+    opacity, so the members' mean opacity is used.
     """
     scene = prepared.scene
     quotient, remainder = divmod(count, len(scene))  # the first views have one superpixel more
     counts = [min(scene.pixels_per_view, quotient + (view < remainder)) for view in range(len(scene))]
     with stage("segment"):
         pictures, views = scene.images, range(len(scene))
-        labels = parallel_map(lambda view: superpixels(pictures[view], counts[view], segmentation), views)
+        labels = parallel_map(lambda view: superpixels(pictures[view], counts[view], "bass-st"), views)
     groups = Groups(np.stack(labels), tuple(counts))
     members = assign(scene, groups)
-    features = encode(scene, members, groups, rule=rule)
+    features = encode(scene, members, groups, rule="paper")
     with stage("decode"):
         return decode(features, members, DecodeOptions(min_opacity=0.0))
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_output
 from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results
 from gsmerge.research.charts.measure_run import INPUT
 
-MAX_LINES = 12  # most lines of a figure; with more lines, only one line for each method is drawn
 MAX_NAMED = 8  # most scenes that a caption names
 
 PANEL_WIDTH, SINGLE_WIDTH, HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
@@ -72,25 +70,29 @@ class Figure:
     head: tuple[str, ...]  # head of the table of its numbers
     rows: tuple[tuple[str, ...], ...]  # rows of this table
     panels: tuple[Panel, ...]  # side by side
-    log: bool  # True if x is logarithmic
-    labelled: bool = False  # True to write the sizes at the points of gsmerge's first line
 
 
 def make_figures(results: Results) -> list[Figure]:
-    """Make all figures for which there are data."""
+    """Make the figures for which there are data: quality against time, and against size."""
     time = "Quality against time", "the wall time of the merge (reading and writing not counted)", "Seconds"
     size = "Quality against size", "the share of the input's Gaussians that is kept", "Gaussians kept (%)"
     figures = [
-        _against(results, "seconds", "quality-seconds", time),
-        _against(results, "percent", "quality-ratio", size),
-        _over_views(results),
+        _against(results, "seconds", "quality-seconds", *time),
+        _against(results, "percent", "quality-ratio", *size),
     ]
     return [figure for figure in figures if figure is not None]
 
 
-def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[Panel], *, log: bool) -> Figure | None:
-    """Make a figure of panels with a table of all their points; None without lines."""
-    panels = [panel for panel in panels if panel.lines]
+def _against(results: Results, cost: str, name: str, title: str, described: str, label: str) -> Figure | None:
+    """Plot quality against a cost, with a panel for each metric and a table of all points; None without lines."""
+    panels = []
+    for metric in results.metrics:
+        score = f"{metric}_{results.part}"
+        lines = results.by_size(cost, score)
+        scenes = {scene for line in lines for point in line.points for scene in point.by_scene}
+        shape = METRICS[metric]
+        if lines:
+            panels.append(Panel(shape.label, shape.higher, tuple(lines), results.input_mean(score, scenes)))
     if not panels:
         return None
     rows = [
@@ -99,13 +101,9 @@ def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[
         for line in panel.lines
         for point in line.points
     ]
-    head = ("Panel", "Line", "Point", x_label, "Mean", "Low", "High")
-    description = _describe_scenes(panels[0])
-    names = choose_lines(panels[0])
-    if any(line.name not in names for panel in panels for line in panel.lines):
-        description += " One line for each method; the table has all."
-        panels = [replace(panel, lines=tuple(line for line in panel.lines if line.name in names)) for panel in panels]
-    return Figure(name, title, f"{caption} {description}", x_label, head, tuple(rows), tuple(panels), log)
+    head = ("Panel", "Line", "Point", label, "Mean", "Low", "High")
+    caption = f"{results.caveat}Quality against {described}. Measured on {PARTS[results.part]}."
+    return Figure(name, title, f"{caption} {_describe_scenes(panels[0])}", label, head, tuple(rows), tuple(panels))
 
 
 def _describe_scenes(panel: Panel) -> str:
@@ -124,49 +122,6 @@ def _numbers(interval: Interval) -> list[str]:
     """Write a mean, and the ends of its interval if there are enough scenes."""
     ends = [interval.low, interval.high] if interval.count >= MIN_SCENES else []
     return [f"{value:.5g}" for value in (interval.mean, *ends)] + [""] * (2 - len(ends))
-
-
-def choose_lines(panel: Panel) -> set[str]:
-    """Choose the lines to draw in a panel: all or, if there are many, the best line of each method."""
-    if len(panel.lines) <= MAX_LINES:
-        return {line.name for line in panel.lines}
-    sign = 1 if panel.higher else -1
-    quality = {line.name: sign * np.mean([point.y.mean for point in line.points]) for line in panel.lines}
-    order = sorted(panel.lines, key=lambda line: (len(line.points) > 1, quality[line.name]))
-    return set({line.name.split(", ")[0]: line.name for line in order}.values())  # a name begins with the method
-
-
-def _quality_panels(results: Results, lines_of: Callable[[str], list[Line]], *, level: bool) -> list[Panel]:
-    """Make a panel for each metric, with the value of the input at the typical number of views."""
-    panels = []
-    for name in results.metrics:
-        score, metric = f"{name}_{results.part}", METRICS[name]
-        lines = lines_of(score)
-        scenes = {scene for line in lines for point in line.points for scene in point.by_scene}
-        reference = results.input_mean(score, scenes) if level else None
-        panels.append(Panel(metric.label, metric.higher, tuple(lines), reference))
-    return panels
-
-
-def _against(results: Results, cost: str, name: str, words: tuple[str, str, str]) -> Figure | None:
-    """Plot quality against a cost; ``words`` are its title, description and label."""
-    title, described, label = words
-    panels = _quality_panels(results, lambda score: results.by_size(cost, score), level=True)
-    caption = f"{results.caveat}Quality against {described}. Measured on {PARTS[results.part]}."
-    figure = _curves(name, title, caption, label, panels, log=True)
-    return figure and replace(figure, labelled=cost == "seconds")
-
-
-def _over_views(results: Results) -> Figure | None:
-    """Plot quality against the number of input views."""
-    panels = _quality_panels(results, results.by_views, level=False)
-    panels = [panel for panel in panels if any(line.is_own for line in panel.lines)]
-    caption = (
-        f"{results.caveat}Quality against the number of input views, evenly spread; held-out views lie midway between"
-        f" them where their order is known. Measured on {PARTS[results.part]}. Size:"
-        f" {results.size or 'the default superpixels'}."
-    )
-    return _curves("quality-views", "Quality against views", caption, "Input views", panels, log=False)
 
 
 def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, bytes]:
@@ -216,29 +171,15 @@ def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
         if panel.reference is not None:
             axes.axhline(panel.reference, **{**styles[INPUT], "marker": ""})
         arrow = " ↑" if panel.higher else " ↓"
-        axes.set(xlabel=figure.x_label + ", log scale" * figure.log, ylabel=panel.y_label + arrow)
-        if figure.log:
-            axes.set(xscale="log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.9g}"))
-            axes.xaxis.set_minor_locator(NullLocator())
-        else:  # numbers of views
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        if figure.labelled:
-            _label_sizes(axes, panel)
+        axes.set(xlabel=f"{figure.x_label}, log scale", ylabel=panel.y_label + arrow, xscale="log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.9g}"))
+        axes.xaxis.set_minor_locator(NullLocator())
     drawing.legend(
         [Line2D([], [], markersize=4, **styles[name]) for name in names], [_plain(name) for name in names],
         loc="outside right center", handlelength=2.6, labelspacing=0.15, borderpad=0,
     )  # fmt: skip
     return drawing
-
-
-def _label_sizes(axes: Axes, panel: Panel) -> None:
-    """Write the sizes at the points of gsmerge's first line."""
-    for point in next((line.points for line in panel.lines if line.is_own and len(line.points) > 1), ()):
-        axes.annotate(
-            _plain(point.label), (point.x, point.y.mean), (0, -9), textcoords="offset points", ha="center", fontsize=6
-        )
 
 
 def _plain(name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,10 +17,7 @@ from gsmerge.settings.compact import OURS
 LEVEL = 0.95  # confidence of the intervals
 MIN_SCENES = 3  # least number of scenes of an interval; with two scenes an interval is too wide to be useful
 MIN_SHARE = 0.5  # share of the scenes that every point of a line must have
-MIN_SHARE_VIEWS = 0.4  # the same share in figures over the number of views, since some scenes have few views
-TYPICAL_RATIO = 0.044  # typical share of the Gaussians; the runs nearest to it represent all sizes
 SIZES = ("budget", "superpixels")  # settings that define the number of Gaussians
-ONE_SIZE = ("unmerged", "unmerged-fit")  # methods that keep all Gaussians
 PARTS = {  # views and pixels over which scores are averaged; the most meaningful first
     "target_visible": "held-out views, pixels that the input views see",
     "target": "held-out views",
@@ -61,9 +58,9 @@ class Interval:
 
 @dataclass(frozen=True)
 class Point:
-    """Values of one method at one size, or number of views, over all scenes."""
+    """Values of one method at one size over all scenes."""
 
-    label: str  # size or number of views
+    label: str  # size
     x: float  # mean cost over the scenes (geometric)
     y: Interval  # mean quality with its interval
     by_scene: ByScene
@@ -75,7 +72,7 @@ class Line:
 
     name: str  # method and settings
     is_own: bool  # True for gsmerge, False for a baseline
-    points: tuple[Point, ...]  # by ascending size or number of views
+    points: tuple[Point, ...]  # by ascending size
 
 
 def mean_interval(values: Sequence[float]) -> Interval:
@@ -132,14 +129,8 @@ def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
     for method, settings in keys:
         variants = [dict(other) for name, other in keys if name == method]
         differ = [(n, v) for n, v in settings if len(variants) == 1 or any(other.get(n) != v for other in variants)]
-        names[method, settings] = ", ".join([method, *(_setting_label(name, value) for name, value in differ)])
+        names[method, settings] = ", ".join([method, *(f"{name} {value}" for name, value in differ)])
     return names
-
-
-def _setting_label(name: str, value: Any) -> str:
-    if (name, value) == ("fit", "none"):
-        return "no fit"
-    return {"k": f"K = {value}", "segmentation": str(value)}.get(name, f"{name} {value}")
 
 
 def own_first(records: Iterable[RunRecord]) -> list[RunRecord]:
@@ -156,26 +147,16 @@ class Results:
         part: Key of ``PARTS``, which names views and pixels of the scores. It is the most meaningful part that nine of
             ten runs have.
         metrics: Names of the measured metrics, which are PSNR, SSIM and one LPIPS, VGG if possible.
-        views: Requested number of views in figures over other quantities. It is None (all views) or the largest number.
-        size: Size in figures over other quantities, which is nearest to the typical share of the input.
     """
 
     def __init__(self, records: Iterable[RunRecord]) -> None:
         self.runs = [record for record in records if record.error is None]
         keys = dict.fromkeys(map(line_key, own_first(self.runs)))
-        self.names = {key: INPUT for key in keys if key[0] == INPUT}
-        self.names |= line_names([key for key in keys if key[0] != INPUT])
+        self.names = line_names(list(keys))
         counts = {part: sum(r.value(f"psnr_{part}") is not None for r in self.runs) for part in PARTS}
         self.part = next((p for p in counts if self.runs and counts[p] >= 0.9 * len(self.runs)), "context")
         names = [m for m in METRICS if any(r.value(f"{m}_{self.part}") is not None for r in self.runs)]
         self.metrics = [m for m in names if m != "lpips_alex" or "lpips_vgg" not in names]
-        asked = {record.views_asked for record in self.runs}
-        self.views = None if None in asked else max((views for views in asked if views is not None), default=None)
-        ratios: dict[str, list[float]] = {}
-        for record in self.runs:
-            if record.method == OURS and record.ratio:
-                ratios.setdefault(size_label(record), []).append(math.log(record.ratio / TYPICAL_RATIO))
-        self.size = min(ratios, key=lambda size: (abs(float(np.mean(ratios[size]))), size), default="")
 
     @property
     def caveat(self) -> str:
@@ -186,47 +167,29 @@ class Results:
         """Return the name of a run's line."""
         return self.names[line_key(record)]
 
-    def is_typical(self, record: RunRecord) -> bool:
-        """Return True if a run has the typical size, or if its method has only one size."""
-        return record.method != INPUT and (size_label(record) == self.size or record.method in ONE_SIZE)
-
     def by_size(self, x: str, y: str) -> list[Line]:
-        """Make lines of value ``y`` against value ``x``, one point per size, at the typical number of views."""
-        merged = [r for r in self.runs if r.method != INPUT and r.views_asked == self.views]
-        return make_lines(merged, size_label, "ratio", x, y)
-
-    def by_views(self, y: str) -> list[Line]:
-        """Make lines of value ``y`` against the number of views at the typical size; a line has at least two points."""
-        chosen = [r for r in self.runs if r.method == INPUT or self.is_typical(r)]
-        lines = make_lines(chosen, lambda r: str(r.views), "views", "views", y, MIN_SHARE_VIEWS)
-        return [line for line in lines if len(line.points) > 1]
+        """Make lines of value ``y`` against value ``x``, one point per size."""
+        return make_lines([r for r in self.runs if r.method != INPUT], x, y)
 
     def input_mean(self, name: str, scenes: Iterable[str]) -> float | None:
         """Average a value of the unmerged input over ``scenes``; None if a scene lacks it."""
-        inputs = {r.scene: r.value(name) for r in self.runs if r.method == INPUT and r.views_asked == self.views}
+        inputs = {r.scene: r.value(name) for r in self.runs if r.method == INPUT}
         values = [inputs.get(scene) for scene in scenes]
         numbers = [value for value in values if value is not None]
         return float(np.mean(numbers)) if numbers and len(numbers) == len(values) else None
 
 
-def make_lines(
-    records: Sequence[RunRecord],
-    label: Callable[[RunRecord], str],
-    order: str,
-    x: str,
-    y: str,
-    min_share: float = MIN_SHARE,
-) -> list[Line]:
-    """Make lines from records; all points cover the same scenes, at least ``min_share`` of all scenes.
+def make_lines(records: Sequence[RunRecord], x: str, y: str) -> list[Line]:
+    """Make lines from records; all points cover the same scenes, at least ``MIN_SHARE`` of all scenes.
 
-    ``order``, ``x`` and ``y`` are names of values of a record. Costs x must be positive.
+    ``x`` and ``y`` are names of values of a record. Costs x must be positive.
     """
     cells: dict[tuple[LineKey, str], dict[str, tuple[float, float]]] = {}
-    for record in sorted(records, key=lambda record: record.value(order) or 0.0):
+    for record in sorted(records, key=lambda record: record.percent):
         cost, value = record.value(x), record.value(y)
         if cost and value is not None:
-            cells.setdefault((line_key(record), label(record)), {})[record.scene] = float(cost), value
-    common = keep_common({cell: set(points) for cell, points in cells.items()}, min_share)
+            cells.setdefault((line_key(record), size_label(record)), {})[record.scene] = float(cost), value
+    common = keep_common({cell: set(points) for cell, points in cells.items()})
     by_cell = {cell: {s: xy for s, xy in cells[cell].items() if s in scenes} for cell, scenes in common.items()}
     intervals = _intervals(list(by_cell.values()))
     points: dict[LineKey, list[Point]] = {}
@@ -237,13 +200,13 @@ def make_lines(
     return [Line(names[key], key[0] == OURS, tuple(points[key])) for key in keys]
 
 
-def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[str]]:
+def keep_common(scenes: Mapping[K, set[str]]) -> dict[K, set[str]]:
     """Restrict every key to the scenes that all keys share, so that means can be compared.
 
     Keys with too few scenes are left out first, so that a few failed runs do not remove the other keys. Without common
     scenes each key keeps its own.
     """
-    fewest = min_share * len(set().union(*scenes.values()))
+    fewest = MIN_SHARE * len(set().union(*scenes.values()))
     covering = {name: scene_names for name, scene_names in scenes.items() if len(scene_names) >= fewest}
     common = set.intersection(*covering.values()) if covering else set()
     return {name: common or scene_names for name, scene_names in covering.items()}

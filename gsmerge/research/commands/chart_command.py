@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.batch_command import check_failures, print_plan, run_jobs
+from gsmerge.cli.batch_command import check_failures
 from gsmerge.cli.before_after import lpips_networks
-from gsmerge.cli.console import print_document, say_notes
+from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import write_texts
 from gsmerge.errors import UsageError
 from gsmerge.frozen import dataclass
@@ -20,7 +21,8 @@ from gsmerge.settings.evaluate import NETS
 from gsmerge.settings.setting import Settings, flat_settings, setting
 
 if TYPE_CHECKING:
-    from gsmerge.batch import BatchOptions, Job
+    from gsmerge.measure.evaluate import EvaluateOptions
+    from gsmerge.research.charts.grid import Run
 
 CHARTS, PAGE, TABLE = "charts", "index.html", "runs.csv"  # in the folder
 
@@ -29,8 +31,6 @@ CHARTS, PAGE, TABLE = "charts", "index.html", "runs.csv"  # in the folder
 class ChartOptions(Settings):
     """Settings of a grid's measurements."""
 
-    target_images: str | None = setting(None, "Folder of the held-out photos, as `--targets` names their cameras.")
-    photo_side: int = setting(0, "Resize larger photos to so many pixels on the longer side; 0: not.", least=0)
     lpips: str | None = setting(None, "Networks of LPIPS; by default those installed.", choices=("both", *NETS, "none"))
     lpips_views: int = setting(2, "Measure LPIPS on at most so many views of each split.", least=1)
     rerun: bool = setting(False, "Repeat runs that are done.")
@@ -41,9 +41,8 @@ class ChartOptions(Settings):
                  "text files with one of these per line. None: draw the results in the folder.", default=None),
     *opt.panel(
         "Runs",
-        opt.option("grid", list[str], "Values to run, in every combination, such as budget=1%,4% or "
-                   "method=gsmerge,voxel; also of k, superpixels, segmentation, fit, effort, match and views; may be "
-                   "repeated.", metavar="NAME=A,B"),
+        opt.option("grid", list[str], "Values of a setting to run, in every combination with those of others, such as "
+                   "budget=1%,4% or method=gsmerge,random; may be repeated.", metavar="NAME=A,B"),
     ),
     opt.settings_option(CompactOptions, ChartOptions, example="lpips=none"),
     *opt.panel(
@@ -56,75 +55,83 @@ class ChartOptions(Settings):
 )  # fmt: skip
 def chart(args: opt.Args) -> None:
     """Run settings over scenes, and draw charts and a page of all results; a repeated call resumes the runs."""
+    from gsmerge.research.charts.measure_run import read_runs
+
     scenes, out = args.scenes or [], args.output
     if os.path.lexists(out) and not out.is_dir():
         raise UsageError(f"--output: expected a folder, found the file {out}")
-    if not scenes:
-        if args.dry_run:
-            raise UsageError("--dry-run: expected scenes to run, got none")
-        _draw(args, [], 0)
-        return
-    from gsmerge.batch.run import pending_jobs
-
-    jobs, options, notes = _make_jobs(args, scenes)
+    if not scenes and args.dry_run:
+        raise UsageError("--dry-run: expected scenes to run, got none")
+    fixed = args.values(CompactOptions, ChartOptions)
+    with opt.usage_errors():
+        own = ChartOptions(**{name: fixed.pop(name) for name in flat_settings(ChartOptions) if name in fixed})
+    measured, runs, notes = _plan_runs(args, scenes, own, fixed)
+    done = {record.key for record in read_runs(out) if record.error is None and not own.rerun}
+    pending = [run for run in runs if run[1].key not in done]
     if args.dry_run:
-        print_plan(args, jobs, options, "runs", notes)
+        labels = [f"{source.path} -> {out}: {record.label}" for source, record, _ in pending]
+        line = f"{out}: {len(pending)} of {len(runs)} runs"
+        document = {"runs": labels, "num_runs": len(runs), "notes": notes}
+        print_document(document, [*labels, line], as_json=args.json, quiet=args.quiet)
         return
     say_notes(notes, quiet=args.silent)
-    pending, failed = [job for job, _ in pending_jobs(jobs, out, options)], list[tuple[str, str]]()
-
-    def add(record: dict[str, Any]) -> None:
-        if record["error"] is not None:
-            failed.append((record["output"], record["error"]))
-
-    if pending:
-        run_jobs(args, pending, options, add, "output")
+    failed = _run_all(args, pending, measured)
     _draw(args, notes, len(pending))
     check_failures(failed, len(pending), "runs")
 
 
-def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchOptions, list[str]]:
-    """Make the jobs of the grid, the options of their batch, and notes."""
-    from gsmerge.batch import BatchOptions
+def _plan_runs(
+    args: opt.Args, scenes: Sequence[str], own: ChartOptions, fixed: dict[str, Any]
+) -> tuple[EvaluateOptions, list[Run], list[str]]:
+    """Make the options of all measurements, the runs of the grid, and notes."""
     from gsmerge.measure.evaluate import EvaluateOptions
-    from gsmerge.research.charts.grid import find_sources, make_jobs, parse_grid
+    from gsmerge.research.charts.grid import find_sources, make_runs, parse_grid
 
-    fixed = args.values(CompactOptions, ChartOptions)
-    with opt.usage_errors():
-        own = ChartOptions(**{name: fixed.pop(name) for name in flat_settings(ChartOptions) if name in fixed})
-    run: dict[str, Any] = {name: fixed.pop(name) for name in ("seed", "threads") if name in fixed}
-    nets, notes = lpips_networks(own.lpips, NETS)
-    grid = parse_grid(args.grid or (), fixed)
-    with opt.usage_errors():
-        measured = EvaluateOptions(nets, own.lpips_views, photo_side=own.photo_side)
-        settings = CompactOptions().with_settings(run)
-        options = BatchOptions(settings, jobs=1, overwrite=own.rerun)  # one job, so that no run slows another one
-    sources = find_sources(scenes, args.output, args.targets, own.target_images)
-    words = ["gsmerge", "lab", "chart", *scenes, "--output", str(args.output)]  # the equivalent command line
-    for name, value in args.given(("grid", "set", "targets")).items():
-        for element in value if isinstance(value, list) else [value]:
-            words += [f"--{name}", element]
-    jobs, left_out = make_jobs(sources, grid, measured, seed=settings.seed, command=shlex.join(words))
-    return jobs, options, [*notes, *left_out]
+    nets, notes = lpips_networks(own.lpips, NETS) if scenes else ((), [])
+    measured, grid = EvaluateOptions(nets, own.lpips_views), parse_grid(args.grid or ())
+    sources = find_sources(scenes, args.output, args.targets) if scenes else []
+    return measured, make_runs(sources, grid, fixed, measured), list(notes)
+
+
+def _run_all(args: opt.Args, runs: Sequence[Run], measured: EvaluateOptions) -> list[tuple[str, str]]:
+    """Run all, and append the record of each to the folder; return name and reason of those that failed."""
+    from gsmerge.io.jsonl import append_line
+    from gsmerge.research.charts.measure_run import RUNS, run_setting
+
+    failed = []
+    with stage_progress(quiet=args.silent) as progress:
+        for i, (source, record, options) in enumerate(runs):
+            name = f"{source.name}/{record.label}"
+            if progress is not None:
+                progress(name, i, len(runs))
+            try:
+                record = run_setting(source, record, options, measured)
+            except Exception as error:  # a run that fails does not end the others
+                record = replace(record, error=" ".join(f"{type(error).__name__}: {error}".split()))
+                failed.append((name, str(record.error)))
+            append_line(args.output / RUNS, asdict(record))
+    return failed
 
 
 def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     """Draw charts, page and table of all runs in the folder, and print a summary; ``notes`` were printed before."""
     from gsmerge.report import document_head
-    from gsmerge.research.charts.chart_page import make_page, make_table
+    from gsmerge.research.charts.chart_page import list_held_out_notes, make_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures
     from gsmerge.research.charts.lines import Results
-    from gsmerge.research.charts.measure_run import list_held_out_notes, read_runs
+    from gsmerge.research.charts.measure_run import read_runs
 
-    out = args.output
-    records, more = read_runs(out)
+    out, records = args.output, read_runs(args.output)
     if not records:
         raise UsageError(f"{out}: expected finished runs, found none; name scenes to run")
-    say_notes([*more, *list_held_out_notes(records)], quiet=args.silent)
+    say_notes(list_held_out_notes(records), quiet=args.silent)
     figures = make_figures(Results(records))
     drawings = draw_figures(figures, out / CHARTS)
-    command = shlex.join(["gsmerge", "lab", "chart", "--output", str(out)])
-    page = make_page(records, figures, drawings, out, command)
+    words = ["gsmerge", "lab", "chart", *(args.scenes or ()), "--output", str(out)]  # the equivalent command line
+    for name, value in args.given(("grid", "set", "targets")).items():
+        for element in value if isinstance(value, list) else [value]:
+            words += [f"--{name}", element]
+    page = make_page(records, figures, drawings, shlex.join(words))
     write_texts({out / PAGE: page, out / TABLE: make_table(records)}, overwrite=True)
     failed = sum(record.error is not None for record in records)
     document = {
@@ -135,8 +142,8 @@ def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
         "num_runs": len(records),
         "num_done": num_done,
         "num_failed": failed,
-        "runs": [record.to_dict() for record in records],
-        "notes": [*notes, *more],
+        "runs": [asdict(record) for record in records],
+        "notes": list(notes),
     }
     line = f"{out / PAGE}: {len(records)} runs ({num_done} new{f', {failed} failed' if failed else ''}),"
     print_document(document, f"{line} {len(figures)} charts", as_json=args.json, quiet=args.quiet)

@@ -63,7 +63,6 @@ class Example:
     images: np.ndarray  # [p,h,w,3] uint8, colours of the photos, sRGB
     covers: np.ndarray  # [v,p,h,w] uint8: coverage of photos by the Gaussians of each view, see scenes.coverage
     colors: ColorMap = ColorMap()  # change of the photos' colours; ``images`` are unchanged
-    drawn: bool = False  # True if its views are a random subset already, with Gaussians predicted from only them
 
     def mask(self, photo: int) -> np.ndarray:
         """Return the mask ``[h,w]`` of a photo's pixels that the views cover."""
@@ -149,16 +148,12 @@ def select_views(example: Example, ids: Sequence[int]) -> Example:
 
 def draw_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
     """Draw a random subset of an example's views by ``options.random_views`` (paper supplement C)."""
-    if example.drawn or not options.random_views:
+    if not options.random_views:
         return example
-    return select_views(example, draw_ids(len(example.cameras), options, rng))
-
-
-def draw_ids(num_views: int, options: TrainOptions, rng: np.random.Generator) -> list[int]:
-    """Draw the ascending ids of a random subset of views, with a size in the range ``options.random_views``."""
+    num_views = len(example.cameras)
     least, most = (min(count, num_views) for count in options.random_views)
     count = int(rng.integers(least, most + 1))
-    return sorted(rng.choice(num_views, count, replace=False).tolist())
+    return select_views(example, sorted(rng.choice(num_views, count, replace=False).tolist()))
 
 
 def recolor(example: Example, rng: np.random.Generator) -> Example:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +29,10 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.preview import save_picture, to_picture
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.corrections import LOGIT
-from gsmerge.research.captures import Capture
-from gsmerge.research.training.backbones import Backbone, bind_backbone
 from gsmerge.research.training.examples import Example, draw_views, recolor
 from gsmerge.research.training.losses import render_window, window_loss, window_psnr
 from gsmerge.research.training.modules import Head, Networks
-from gsmerge.research.training.shards import ExampleStreams, Shard, TrainingSource, open_streams, read_example
+from gsmerge.research.training.shards import Shard, read_shard
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Window, sample_window, whole_photo
 from gsmerge.runtime.threads import parallel_map, use_threads
@@ -46,7 +45,7 @@ FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
 
 
-def validate(networks: Networks, shards: Sequence[TrainingSource], options: TrainOptions, out: Path) -> Row:
+def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions, out: Path) -> Row:
     """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians.
 
     For each scene ``validation-NAME.png`` shows a photo, its render without networks, and its render with networks.
@@ -56,12 +55,10 @@ def validate(networks: Networks, shards: Sequence[TrainingSource], options: Trai
     return {"psnr_analytic": analytic, "psnr_learned": learned, "matched": matched}
 
 
-def _score(
-    networks: Networks, shards: Sequence[TrainingSource], number: int, options: TrainOptions, out: Path
-) -> Scores:
+def _score(networks: Networks, shards: Sequence[Shard], number: int, options: TrainOptions, out: Path) -> Scores:
     """Score a shard, and write a picture if it is the first shard of its scene."""
     rng = np.random.default_rng([options.seed, VALIDATION, number])
-    example = read_example(shards[number], options, rng)
+    example = read_shard(shards[number])
     windows = [
         sample_window(draw_views(example, options, rng), options.levels, options.window, options.most, 1, rng)
         for _ in range(options.validation_windows)
@@ -115,12 +112,11 @@ class TrainResult:
 
 
 def train(
-    shards: Sequence[Shard | Capture],
-    validation: Sequence[Shard | Capture],
+    shards: Sequence[Shard],
+    validation: Sequence[Shard],
     out: Path,
     options: TrainOptions | None = None,
     *,
-    backbone: Backbone | None = None,
     threads: int | None = None,
     device: str = "cpu",
     progress: Progress | None = None,
@@ -128,21 +124,18 @@ def train(
     """Train networks, or continue the run in the folder.
 
     Args:
-        shards: At least one example, or captures, whose examples are drawn and predicted as needed.
+        shards: At least one example.
         validation: Examples by which the best checkpoint is chosen; empty: other windows of ``shards``.
         out: Folder for ``best.safetensors``, ``last.safetensors``, ``losses.csv``, ``state.safetensors`` and a picture
             of each validation scene.
         options: Settings.
-        backbone: Predicts the Gaussians of captures. It is called with photos ``[v,h,w,3]``, sRGB in [0, 1], at most
-            ``photo_side`` pixels wide or high, and their cameras. It returns ``v·h·w`` Gaussians, view by view, in the
-            cameras' world. Its result must depend only on these arguments, or a run cannot be repeated.
         threads: Number of threads; None: all processors. The result does not depend on it.
         device: Device of the networks, see :func:`choose_device`. Windows are rendered on the CPU. On CUDA a run
             repeats up to rounding, not to the bit.
         progress: Called with (step, steps, loss) after every step.
 
     Raises:
-        ValueError: If there are no examples, captures have no backbone, or ``device`` is CUDA and torch finds none.
+        ValueError: If there are no examples, or ``device`` is CUDA and torch finds none.
         GsmergeError: If LPIPS has a weight in the loss, and its network weights are not installed.
         SceneError: If a shard is damaged, or the folder has another run or cannot be written.
     """
@@ -151,12 +144,10 @@ def train(
         raise ValueError("examples: expected at least one, got none")
     options.require_weights()
     out.mkdir(parents=True, exist_ok=True)
-    bound = bind_backbone([*shards, *validation], backbone)
-    sources = bound[: len(shards)]
-    validators = bound[len(shards) :] or sources
+    validators = validation or shards
     ids = even_views(len(validators), min(len(validators), options.validation_examples))
     with use_threads(threads):
-        return _train(options, sources, [validators[i] for i in ids], out, choose_device(device), progress)
+        return _train(options, shards, [validators[i] for i in ids], out, choose_device(device), progress)
 
 
 def choose_device(name: str) -> str:
@@ -174,8 +165,8 @@ def choose_device(name: str) -> str:
 
 def _train(
     options: TrainOptions,
-    shards: Sequence[TrainingSource],
-    validation: Sequence[TrainingSource],
+    shards: Sequence[Shard],
+    validation: Sequence[Shard],
     out: Path,
     device: str,
     progress: Progress | None,
@@ -190,18 +181,18 @@ def _train(
     head = {"options": options.to_dict(), **hashes}
     step, rows = _resume(out, state, head)
     resumed = step
-    with open_streams(shards, options) as streams:
-        while step < options.steps:
-            losses.append(_step(state, streams, options, step))
-            step += 1
-            if progress:
-                progress(step, options.steps, float(losses[-1]))
-            if step % options.save_every == 0 or step == options.steps:
-                scores = validate(state.smooth, validation, options, out)
-                mean = float(torch.stack(losses).mean())
-                rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
-                losses = []
-                _save(out, state, rows, head, options)
+    read = lru_cache(options.buffer)(read_shard)
+    while step < options.steps:
+        losses.append(_step(state, shards, read, options, step))
+        step += 1
+        if progress:
+            progress(step, options.steps, float(losses[-1]))
+        if step % options.save_every == 0 or step == options.steps:
+            scores = validate(state.smooth, validation, options, out)
+            mean = float(torch.stack(losses).mean())
+            rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
+            losses = []
+            _save(out, state, rows, head, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
     best_psnr = max(row["psnr_learned"] for row in rows)
     return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], best_psnr, resumed)
@@ -237,16 +228,16 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
     return int(facts["step"]), list(facts["rows"])
 
 
-def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, step: int) -> Tensor:
-    """Take one step on the mean gradient of all crops; return its loss."""
+def _step(
+    state: TrainingState, shards: Sequence[Shard], read: Callable[[Shard], Example], options: TrainOptions, step: int
+) -> Tensor:
+    """Take one step on the mean gradient of all crops, each of a random example; return its loss."""
     parameters = list(state.networks.parameters())
-    streams.move_to(step)
 
     def crop_gradients(crop: int) -> Tensor:
         """Compute the gradients of one crop in one vector, with the loss as its last element."""
         rng = np.random.default_rng([options.seed, step, crop])
-        example = streams.draw(step, crop, rng)
-        example = draw_views(example, options, rng)
+        example = draw_views(read(shards[int(rng.integers(len(shards)))]), options, rng)
         if options.recolor:
             example = recolor(example, rng)
         window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)

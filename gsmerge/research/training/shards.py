@@ -2,13 +2,7 @@
 
 A shard is a safetensors file with one example. The shards of a scene are listed in a record, a JSON file that is
 written after all of them. Its name is a hash of the scene's files and of the settings. So an interrupted call continues
-with the first missing example, and complete examples are not made again.
-
-Threads read ahead. Every crop of a step has its own stream: every ``crops``-th shard, in an order that is shuffled
-again for each pass. A stream has ``buffer`` examples in memory, and the crop draws one of them at random. Every
-``refresh`` steps the next example in the order replaces the oldest one. A capture can replace a shard; its backbone
-predicts a new example at every place in the order. All of this depends only on seed and step. So a resumed run
-continues as if it had not been interrupted.
+with the first scene that has no record.
 """
 
 from __future__ import annotations
@@ -16,10 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import fields
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +23,8 @@ from gsmerge.frozen import dataclass
 from gsmerge.io.atomic import atomic_output
 from gsmerge.pooling import Members
 from gsmerge.raster.photos import Photos
-from gsmerge.research.training.backbones import PredictedCapture
 from gsmerge.research.training.examples import Example, make_examples, scene_name
 from gsmerge.research.training.train_options import TrainOptions
-from gsmerge.runtime.threads import work_alone
 from gsmerge.scene.content_hash import content_hash, digest, list_files
 from gsmerge.scene.files import find_scene_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
@@ -48,8 +37,6 @@ REMEDY = "remove it; the next call makes it again"
 # Settings that an example depends on
 SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
 PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}
-# Each replaces the step in a seed of random numbers: of the order, and of the draws of a capture
-ORDER, DRAWN = 2**32 + 1, 2**32 + 2
 
 
 @dataclass(frozen=True)
@@ -86,19 +73,13 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shar
     record = folder / f"{key[:32]}.json"
     hashes = _read_record(record)
     if hashes is None:
-        hashes = _make_shards(scene, options, folder / key[:32])
+        hashes = {}
+        for label, make in make_examples(scene, options):
+            path = folder / f"{key[:32]}-{label}.safetensors"
+            hashes[path.name] = write_shard(path, make())
         with atomic_output(record, overwrite=True) as temporary:
             temporary.write_bytes(json.dumps(hashes, indent=1).encode() + b"\n")
     return [Shard(folder / file, name, sha256) for file, sha256 in hashes.items()]
-
-
-def _make_shards(scene: Path, options: TrainOptions, start: Path) -> dict[str, str]:
-    """Write the missing examples of a scene to files that begin with ``start``; return the hash of each by name."""
-    hashes = dict[str, str]()
-    for label, make in make_examples(scene, options):
-        path = start.with_name(f"{start.name}-{label}.safetensors")
-        hashes[path.name] = _content_hash(path) or write_shard(path, make())
-    return hashes
 
 
 def scene_key(scene: Path, options: TrainOptions) -> str:
@@ -115,17 +96,8 @@ def _read_record(path: Path) -> dict[str, str] | None:
     """Read the hash of each shard of a scene; None if the scene is not complete."""
     try:
         hashes = json.loads(path.read_text())
-        complete = all(_content_hash(path.with_name(file)) == sha256 for file, sha256 in hashes.items())
-    except (OSError, ValueError, AttributeError):
-        return None
-    return hashes if complete else None
-
-
-def _content_hash(path: Path) -> str | None:
-    """Read a shard's hash from its header; None if there is no complete shard."""
-    try:
-        return str(_read(path, "none")[1]["sha256"])
-    except (SceneError, KeyError, TypeError):
+        return hashes if all(path.with_name(file).is_file() for file in hashes) else None
+    except (OSError, ValueError, TypeError):
         return None
 
 
@@ -159,13 +131,18 @@ def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
     return state.hexdigest()
 
 
-def read_shard(shard: Shard, *, check: bool = True) -> Example:
-    """Read the example of a shard; with ``check`` compare the arrays with their hash.
+def read_shard(shard: Shard) -> Example:
+    """Read the example of a shard, and compare the arrays with their hash.
 
     Raises SceneError if the file is missing, damaged, or has changed since the run began.
     """
-    arrays, facts = _read(shard.path)
-    if facts["sha256"] != shard.sha256 or (check and hash_arrays(arrays) != shard.sha256):
+    try:
+        with safe_open(shard.path, "np") as file:
+            facts = json.loads((file.metadata() or {})[FORMAT])
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        raise SceneError(shard.path, "expected an example, found a damaged file or none", REMEDY) from error
+    if hash_arrays(arrays) != shard.sha256:
         raise SceneError(shard.path, "expected the example that was written, found a damaged file or another", REMEDY)
 
     def part(name: str) -> dict[str, Any]:
@@ -184,85 +161,3 @@ def read_shard(shard: Shard, *, check: bool = True) -> Example:
         images=arrays["images"],
         covers=arrays["covers"],
     )
-
-
-def _read(path: Path, prefix: str = "") -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read the arrays whose names begin with ``prefix``, and the facts in the header."""
-    try:
-        with safe_open(path, "np") as file:
-            facts = json.loads((file.metadata() or {})[FORMAT])
-            return {n: file.get_tensor(n) for n in file.keys() if n.startswith(prefix)}, facts  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        raise SceneError(path, "expected an example, found a damaged file or none", REMEDY) from error
-
-
-TrainingSource = Shard | PredictedCapture
-
-
-def read_example(
-    source: TrainingSource, options: TrainOptions, rng: np.random.Generator, *, check: bool = True
-) -> Example:
-    """Read the example of a shard as :func:`read_shard` does, or draw an example of a capture."""
-    if isinstance(source, Shard):
-        return read_shard(source, check=check)
-    return source.draw(options, rng)
-
-
-class ExampleStreams:
-    """Streams of examples, one stream for each crop of a step."""
-
-    def __init__(self, shards: Sequence[TrainingSource], options: TrainOptions) -> None:
-        self.shards, self.options = shards, options
-        self.pool = ThreadPoolExecutor(options.workers, "gsmerge-read", initializer=work_alone)
-        # Examples in memory, or being read, by number of the shard and, for a capture, place in the order (else 0)
-        self.examples: dict[tuple[int, int], Future[Example]] = {}
-        self.checked: set[int] = set()
-
-    def move_to(self, step: int) -> None:
-        """Load the shards that ``step`` may draw from and the next ones; release all others."""
-        ahead = self.options.buffer + 1
-        keys = [self._key(step, crop, slot) for slot in range(ahead) for crop in range(self.options.crops)]
-        for key in self.examples.keys() - set(keys):
-            self.examples.pop(key).cancel()
-        for key in keys:
-            if key not in self.examples:
-                self.examples[key] = self.pool.submit(self._read, *key)
-
-    def draw(self, step: int, crop: int, rng: np.random.Generator) -> Example:
-        """Return a random example for crop number ``crop`` of the current step."""
-        slot = int(rng.integers(self.options.buffer))
-        return self.examples[self._key(step, crop, slot)].result()
-
-    def shard_id(self, step: int, crop: int, slot: int) -> int:
-        """Return the number of the shard in one slot of a crop's stream; slot 0 is the oldest."""
-        epoch, index = divmod(self._position(step, crop, slot), len(self.shards))
-        return int(_order(self.options.seed, epoch, len(self.shards))[index])
-
-    def _position(self, step: int, crop: int, slot: int) -> int:
-        return (step // self.options.refresh + slot) * self.options.crops + crop
-
-    def _key(self, step: int, crop: int, slot: int) -> tuple[int, int]:
-        number = self.shard_id(step, crop, slot)
-        return number, 0 if isinstance(self.shards[number], Shard) else self._position(step, crop, slot)
-
-    def _read(self, number: int, position: int) -> Example:
-        rng = np.random.default_rng([self.options.seed, DRAWN, position])
-        example = read_example(self.shards[number], self.options, rng, check=number not in self.checked)
-        self.checked.add(number)
-        return example
-
-
-@contextmanager
-def open_streams(shards: Sequence[TrainingSource], options: TrainOptions) -> Iterator[ExampleStreams]:
-    """Open streams of examples; their threads end at the end of the block."""
-    streams = ExampleStreams(shards, options)
-    try:
-        yield streams
-    finally:
-        streams.pool.shutdown(cancel_futures=True)
-
-
-@lru_cache(maxsize=4)
-def _order(seed: int, epoch: int, count: int) -> np.ndarray:
-    """Shuffle all shards for one pass over them, ``[count]``."""
-    return np.random.default_rng([seed, ORDER, epoch]).permutation(count)

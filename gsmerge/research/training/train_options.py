@@ -48,9 +48,8 @@ class TrainOptions(Settings):
         filled=True, unique=True)  # fmt: skip
     joint: bool = setting(False, "Train the heads of all levels on every window, as in the paper; otherwise that of "
         "a random level.")  # fmt: skip
-    buffer: int = setting(4, "Examples in memory for each window of a step; the window is of one of them.", **COUNT)
-    refresh: int = setting(4, "Steps after which the next example replaces the oldest one in memory.", **COUNT)
-    workers: int = setting(1, "Threads that read examples ahead.", **COUNT)
+    buffer: int = setting(10, "Examples that stay in memory. Every window is of a random one, and others are read.",
+        **COUNT)  # fmt: skip
     steps: int = setting(6000, "Steps of the training.", **COUNT)
     warmup: int = setting(200, "Steps over which the learning rate increases.", **FROM_0)
     rate: float = setting(1e-3, "Highest learning rate.", **RATE)

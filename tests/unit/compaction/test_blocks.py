@@ -151,7 +151,7 @@ def test_large_scenes_are_cut(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> 
     ("settings", "problem"),
     [
         ({"quality": "30dB"}, "quality 30dB"), ({"budget": "auto"}, "budget auto"), ({"levels": 2}, "levels"),
-        ({"method": "voxel"}, "method voxel"), ({"poses": "free"}, "poses free"), ({"drop": "sky"}, "drop sky"),
+        ({"method": "greedy"}, "method greedy"), ({"poses": "free"}, "poses free"), ({"drop": "sky"}, "drop sky"),
         ({"crop": "sphere:0,0,3,2"}, "crop"),
     ],
 )  # fmt: skip

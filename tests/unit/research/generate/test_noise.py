@@ -6,13 +6,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from messages import refuses
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.geometry import project, quat_to_rotmat
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.raster.sh import view_colors
-from gsmerge.research.generate import GenerateOptions, NoiseOptions
+from gsmerge.research.generate import NoiseOptions
 from gsmerge.research.generate.noise import (
     ERRORS,
     Noise,
@@ -157,15 +156,3 @@ def test_what_is_drawn_lies_in_the_ranges() -> None:
     assert doubled.grain == pytest.approx(2 * drawn[0].grain)
     assert doubled.scale == drawn[0].scale
     assert all(getattr(draw_noise(options, np.random.default_rng(0), 0.0), name) == 0 for name in ERRORS)
-
-
-@pytest.mark.parametrize(
-    ("kind", "name", "value"),
-    [
-        (NoiseOptions, "grain", (0.2, 0.1)), (NoiseOptions, "drift", (0.0, 0.1)), (NoiseOptions, "sh_degrees", (7,)),
-        (NoiseOptions, "constant_opacity", 1.5), (GenerateOptions, "noise", -1),
-    ],
-)  # fmt: skip
-def test_settings_that_make_no_sense_are_refused(kind: type, name: str, value: object) -> None:
-    with refuses(ValueError, name, value):
-        kind(**{name: value})

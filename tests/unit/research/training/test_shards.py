@@ -1,8 +1,7 @@
-"""Examples in files, and streams of them."""
+"""Examples in files."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from gsmerge.research.generate import GenerateOptions, generate
 from gsmerge.research.training import (
     Example,
     Shard,
+    TrainOptions,
     make_example,
     make_training_scene,
     prepare_shards,
@@ -26,7 +26,7 @@ from gsmerge.research.training import (
     train,
 )
 from gsmerge.research.training.examples import make_examples as make_each
-from gsmerge.research.training.shards import ExampleStreams, open_streams, scene_key
+from gsmerge.research.training.shards import scene_key
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -72,9 +72,8 @@ def test_a_damaged_shard_is_named_in_one_line(example: Example, tmp_path: Path) 
     shard.path.write_bytes(bytes(data))
     with pytest.raises(SceneError, match="damaged"):
         read_shard(shard)
-    read_shard(shard, check=False)
     with pytest.raises(SceneError, match="damaged"):
-        read_shard(replace(shard, sha256="0"), check=False)
+        read_shard(replace(shard, sha256="0"))
     shard.path.write_bytes(bytes(data[:1000]))
     with refuses(SceneError, shard.path, "example"):
         read_shard(shard)
@@ -83,43 +82,32 @@ def test_a_damaged_shard_is_named_in_one_line(example: Example, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_preparing_goes_on_where_it_was(scenes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[str] = []
+def test_complete_scenes_are_not_made_again(
+    scenes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Path] = []
 
-    class StoppedError(Exception):
-        pass
-
-    def watch(*arguments: object) -> Iterator[object]:
-        for label, make in make_each(*arguments):
-
-            def counted(label: str = label, make: object = make) -> Example:
-                if len(made) == stop:
-                    raise StoppedError
-                made.append(label)
-                return make()
-
-            yield label, counted
+    def watch(path: Path, options: TrainOptions) -> Iterator[object]:
+        made.append(path)
+        if len(made) == stop:
+            raise KeyboardInterrupt
+        yield from make_each(path, options)
 
     monkeypatch.setattr("gsmerge.research.training.shards.make_examples", watch)
-    options, stop = replace(PAPER, densities=(0.05, 0.1)), 3
-    with pytest.raises(StoppedError):
+    options, stop = replace(PAPER, densities=(0.05, 0.1)), 2
+    with pytest.raises(KeyboardInterrupt):
         prepare_shards(scenes, options, tmp_path)
-    assert len(made) == 3
-    stop = 99
     moves: list[tuple[str, int, int]] = []
     shards = prepare_shards(scenes, options, tmp_path, report=lambda *move: moves.append(move))
-    assert len(made) == len(shards) == 4
-    assert [move[1:] for move in moves] == [(i, len(scenes)) for i in range(len(scenes))]
-    assert all(text.startswith("examples: ") for text, _, _ in moves)
-    times = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert (len(shards), made) == (4, [scenes[0], scenes[1], scenes[1]])
+    assert moves == [(f"examples: {scene.name}", i, len(scenes)) for i, scene in enumerate(scenes)]
     assert prepare_shards(scenes, options, tmp_path) == shards
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == times
-    shards[0].path.write_bytes(b"cut")
-    assert prepare_shards(scenes, options, tmp_path) == shards
-    assert len(made) == 5
     assert prepare_shards(scenes, replace(options, steps=7, lpips_weight=0.5), tmp_path) == shards  # not of examples
+    assert len(made) == 3
+    shards[0].path.unlink()
+    assert prepare_shards(scenes, options, tmp_path) == shards
     assert prepare_shards(scenes[:1], replace(options, densities=(0.05,)), tmp_path)[0].sha256 == shards[0].sha256
-    assert len(made) == 6
+    assert len(made) == 5
 
 
 @pytest.mark.slow
@@ -147,54 +135,6 @@ def test_a_photo_that_is_held_out_makes_other_shards(scenes: list[Path], tmp_pat
     last = max((copy / "images").iterdir())
     last.rename(copy / "targets" / last.name)
     assert scene_key(copy, OPTIONS) != before
-
-
-def shard_numbers(streams: ExampleStreams, steps: int) -> dict[int, list[int]]:
-    """Of every crop, the oldest shard at each step."""
-    return {crop: [streams.shard_id(step, crop, 0) for step in range(steps)] for crop in range(streams.options.crops)}
-
-
-def test_every_pass_visits_every_shard_once_in_another_order() -> None:
-    shards = [Shard(Path(str(i)), str(i), str(i)) for i in range(10)]
-    options = replace(PAPER, crops=2, refresh=3)
-    with open_streams(shards, options) as streams:
-        seen = shard_numbers(streams, 60)
-    assert all(seen[crop][3 * i] == seen[crop][3 * i + 2] for crop in (0, 1) for i in range(20))
-    order = [seen[crop][3 * i] for i in range(20) for crop in (0, 1)]
-    passes = [order[i : i + 10] for i in range(0, 40, 10)]
-    assert [sorted(part) for part in passes] == [list(range(10))] * 4
-    assert len(set(map(tuple, passes))) == 4
-    with open_streams(shards, replace(options, seed=1)) as streams:
-        assert shard_numbers(streams, 60) != seen
-
-
-def test_few_examples_are_in_memory_and_draws_are_spread(monkeypatch: pytest.MonkeyPatch) -> None:
-    reads: Counter[int] = Counter()
-
-    def read(shard: Shard, *, check: bool) -> int:
-        number = int(shard.sha256)
-        assert check == (reads[number] == 0)  # compared with its hash once
-        reads[number] += 1
-        return number
-
-    monkeypatch.setattr("gsmerge.research.training.shards.read_shard", read)
-    shards = [Shard(Path(str(i)), str(i), str(i)) for i in range(100)]
-    options, rng, drawn = replace(PAPER, buffer=4, refresh=2), np.random.default_rng(0), Counter[int]()
-    with open_streams(shards, options) as streams:
-        for step in range(100):
-            streams.move_to(step)
-            assert len(streams.examples) <= 2 * (options.buffer + 1)
-            for crop in (0, 1):
-                drawn[int(streams.draw(step, crop, rng))] += 1
-    assert len(drawn) > 75
-    assert max(reads.values()) <= 2
-    reads.clear()
-    with open_streams(shards[:3], options) as streams:  # all of few stay
-        for step in range(50):
-            streams.move_to(step)
-            for crop in (0, 1):
-                streams.draw(step, crop, rng)
-    assert set(reads.values()) == {1}
 
 
 @pytest.fixture(scope="module")
