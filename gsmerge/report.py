@@ -108,18 +108,6 @@ def wrap_line(line: str, columns: int | None, hang: int = 0) -> list[str]:
     return [part.replace("\N{NO-BREAK SPACE}", " ") for part in wrapped]
 
 
-def html_table(rows: Sequence[Sequence[str]]) -> str:
-    """Format rows as an HTML table for notebooks, with the first column left-aligned and others right-aligned."""
-
-    from html import escape
-
-    def cell(text: str, side: str) -> str:
-        return f'<td style="text-align:{side}">{escape(text)}</td>'
-
-    lines = [cell(row[0], "left") + "".join(cell(text, "right") for text in row[1:]) for row in rows]
-    return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
-
-
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:
     """Return the wall time by stage and in total, as all reports contain it."""
     total = round(sum(seconds.values()), 4)

@@ -12,7 +12,7 @@ from typing import Any
 from gsmerge.compaction.new_views import NewViews
 from gsmerge.frozen import dataclass
 from gsmerge.raster.metrics import psnr_words
-from gsmerge.report import document_head, file_sha256, html_table, seconds_document, seconds_line, text_table, wrap_line
+from gsmerge.report import document_head, file_sha256, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.words import count_words
 
@@ -116,10 +116,6 @@ class CompactReport:
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON types, by the names of its fields."""
         return asdict(self)
-
-    def _repr_html_(self) -> str:
-        notes = [("note", text) for text in self.notes]
-        return html_table([*self._facts(), *notes])
 
     def _facts(self) -> list[tuple[str, str]]:
         """List the main facts, each with its name."""
@@ -262,15 +258,6 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     last = {"cameras": document.get("viewer_cameras"), "next": next_step}
     shown = [f"  {name:9}  {text}" for name, text in last.items() if text is not None]
     return [document["output"]["path"], *wrapped, *shown]
-
-
-def summary_line(document: Mapping[str, Any]) -> str:
-    """Describe the result in one line: the figures of the table."""
-    parts = []
-    for name, before, after, about in result_facts(document):
-        change = f"{before} -> {after}" if before else after
-        parts.append(" ".join(filter(None, (name, change, about and f"({about})"))))
-    return f"{document['output']['path']}: {'; '.join(parts)}"
 
 
 def _describe_views(fidelity: Mapping[str, Any]) -> str:

@@ -47,7 +47,6 @@ OTHER_OPTIONS = {
     "--help",
     "--help-all",
     "--debug",
-    "--progress",
     "--only",
     "--no-deps",
     "--force-reinstall",
@@ -346,6 +345,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "engine",
         "address",
         "dry-run",
+        "progress",
         "json",
         "quiet",
     }

@@ -72,10 +72,6 @@ def test_means_keep_their_precision(kind: type, scene: Scene) -> None:
     assert result.gaussians.means.dtype == kind
 
 
-def test_a_notebook_shows_before_and_after(result: gsmerge.CompactResult) -> None:
-    assert result._repr_html_().count("<img") == 2
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "said"),
     [
