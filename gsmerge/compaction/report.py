@@ -125,10 +125,6 @@ class CompactReport:
             facts += [("PSNR of new views, expected", f"{new.low:+.1f} to {new.high:+.1f} dB from {new.before:.1f} dB")]
         if self.psnr_before is not None and self.psnr_after is not None:
             facts += [("PSNR of its own views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
-        if files := self.photo_files:
-            facts += [("PSNR of unchanged photos", f"{files.before:.2f} -> {files.after:.2f} dB")]
-        if protected := self.protected:
-            facts += [("PSNR of protected pixels", f"{protected.before:.2f} -> {protected.after:.2f} dB")]
         if fidelity := self.choices.get("fidelity"):
             facts += [("PSNR", f"{psnr_words(fidelity['psnr'])} {_describe_views(fidelity)}")]
         return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
@@ -253,7 +249,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     figures = text_table([row[:3] for row in rows], "  ")
     hang = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
     lines = [(f"{left}  {row[3]}".rstrip(), hang) for left, row in zip(figures, rows, strict=True)]
-    lines += [(line, 0) for line in (*level_lines(document), *curve_lines(document))]
+    lines += [(line, 2) for line in (*level_lines(document), *curve_lines(document))]
     wrapped = [part for line, hang in lines for part in wrap_line(line, columns, hang)]
     last = {"cameras": document.get("viewer_cameras"), "next": next_step}
     shown = [f"  {name:9}  {text}" for name, text in last.items() if text is not None]

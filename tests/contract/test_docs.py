@@ -42,16 +42,7 @@ MADE = ("docs/reference/commands", "docs/reference/settings")
 GENERATED = {page for page in PAGES if page.startswith(MADE)}
 WRITTEN = [page for page in PAGES if page not in GENERATED]
 # options of tools that pages name beside our own
-OTHER_OPTIONS = {
-    "--version",
-    "--help",
-    "--help-all",
-    "--debug",
-    "--only",
-    "--no-deps",
-    "--force-reinstall",
-    "--check",
-}
+OTHER_OPTIONS = {"--version", "--help", "--help-all", "--debug", "--only", "--no-deps", "--force-reinstall", "--check"}
 
 
 def options(command: Any) -> set[str]:
