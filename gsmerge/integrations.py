@@ -7,15 +7,14 @@ None of these libraries is imported. Each function returns keyword arguments, so
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from gsmerge.arrays import Array, as_array, like
 from gsmerge.errors import SceneError
-from gsmerge.geometry import normalize, rotmat_to_quat
-from gsmerge.kernels.elementary import exp
+from gsmerge.geometry import rotmat_to_quat
 from gsmerge.kernels.matrices import eigh, invert
 
 _OTHER_SIZE = 0.1  # intrinsics are of another image size if all principal points differ by more than this share
@@ -159,36 +158,6 @@ def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]
     photos = as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1)
     columns["sh0"] = columns.pop("sh")
     return {**columns, "images": _as_floats(photos), "viewmats": invert(c2w), "Ks": Ks, "order": "none"}
-
-
-def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) -> dict[str, Any]:
-    """Convert the Gaussians of gsplat's ``simple_trainer.py`` and its training views, in the frame of the trainer.
-
-    Args:
-        splats: The trainer's ``splats``, or those of one of its checkpoints: ``means``, ``quats`` wxyz of any length,
-            ``scales`` as logarithms, ``opacities`` as logits, ``sh0``, ``shN``.
-        dataset: The trainer's ``trainset``. Each view has ``camtoworld [4,4]``, ``K [3,3]`` in pixels, and ``image
-            [H,W,3]`` in [0, 255].
-
-    Raises:
-        SceneError: If an entry is missing, such as ``sh0`` if colours depend on the photo, or if photos differ in size.
-    """
-    columns = {name: as_array(_get("splats", splats, name)) for name in ("means", "quats", "scales", "opacities")}
-    columns |= {name: as_array(_get("splats", splats, name)) for name in ("sh0", "shN")}
-    columns["quats"] = normalize(columns["quats"].astype(np.float64)).astype(np.float32)
-    columns["scales"], columns["opacities"] = exp(columns["scales"]), 1 / (1 + exp(-columns["opacities"]))
-    names = ("camtoworld", "K", "image")
-    views = [[as_array(_get("dataset", view, name)) for name in names] for view in dataset]
-    num_sizes = len({image.shape[:2] for _, _, image in views})
-    if num_sizes > 1:
-        problem = f"expected photos of one size, found {num_sizes} sizes"
-        raise SceneError("dataset", problem, "pass photos of one size")
-    c2w, Ks, photos = (np.stack(arrays) for arrays in zip(*views, strict=True))
-    return {
-        **{name: like(column, splats["means"]) for name, column in columns.items()},
-        "images": (photos / np.float32(_BYTES)).astype(np.float32), "Ks": Ks.astype(np.float64),
-        "viewmats": invert(c2w.astype(np.float64)), "order": "none",
-    }  # fmt: skip
 
 
 def _only(name: str, values: Any) -> Any:

@@ -6,7 +6,6 @@ import csv
 import hashlib
 import io
 import json
-import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +15,6 @@ from gsmerge.version import __version__
 
 SCHEMA_VERSION = 1
 MAX_WIDTH = 10_000  # columns of a table that is not printed on a terminal
-SPACE_BEFORE_UNIT = r"(?<=\d) (?=(?:%|[kMG]?B|dB|px|m?s|min|h)(?:\W|$))"
 MIN_NAME = 12  # least width of a table's first column in a narrow terminal
 
 
@@ -93,31 +91,12 @@ def _cut(text: str, width: int) -> str:
     return text if len(text) <= width else f"{text[: width - 3 - half]}...{text[-half:]}"
 
 
-def wrap_line(line: str, columns: int | None, hang: int = 0) -> list[str]:
-    """Break a line between words at ``columns`` (None: never), and indent all but its first part.
-
-    The indent is ``hang``, or else the column of the line's first value. It is two columns if neither fits.
-    """
+def wrap_line(line: str, columns: int | None, hang: int = 2) -> list[str]:
+    """Break a line between words at ``columns`` (None: never), and indent all but its first part by ``hang``."""
     if columns is None or len(line) <= columns:
         return [line]
-    label = re.match(r" *\S+(?: \S+)?  +|(?:note|warning|error): ", line)
-    indents = (hang, len(label[0]) if label else 2)
-    indent = " " * next((indent for indent in indents if 0 < indent < columns // 2), 2)
-    whole = re.sub(SPACE_BEFORE_UNIT, "\N{NO-BREAK SPACE}", line)  # numbers stay with their units
-    wrapped = textwrap.wrap(whole, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
-    return [part.replace("\N{NO-BREAK SPACE}", " ") for part in wrapped]
-
-
-def html_table(rows: Sequence[Sequence[str]]) -> str:
-    """Format rows as an HTML table for notebooks, with the first column left-aligned and others right-aligned."""
-
-    from html import escape
-
-    def cell(text: str, side: str) -> str:
-        return f'<td style="text-align:{side}">{escape(text)}</td>'
-
-    lines = [cell(row[0], "left") + "".join(cell(text, "right") for text in row[1:]) for row in rows]
-    return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+    indent = " " * (hang if hang < columns // 2 else 2)
+    return textwrap.wrap(line, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:

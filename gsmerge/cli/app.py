@@ -261,9 +261,5 @@ def run(args: Sequence[str] | None = None) -> int:
             return fail(DAMAGED_OPENCV, 1)
         if is_torch_missing(error):
             return fail(NO_TORCH, UsageError.exit_code)
-        try:
-            _check_working_directory()  # it may have vanished meanwhile
-        except SceneError as vanished:
-            return fail(str(vanished), vanished.exit_code)
         first = f"{type(error).__name__}: {error}".splitlines()[0]
         return fail(f"unexpected error: {first}; run again with --debug", 1)

@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
 
 MAX_LISTED = 20  # rows of the table, failures, and results that are worse than their input
-# Kinds of reasons at the end of a run, in order, with the word before their lines
-KINDS = {"worse": "worse", "left out": "note", "lacking": "note", "failed": "failed"}
+HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
+# Key of a reason -> word before it
+REASONS = {"worse": "worse", "left_out": "note", "lacking": "note", "error": "failed"}
 
 
 def parse_jobs(text: str) -> int:
@@ -119,19 +120,20 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     finally:
         if (totals.counts or interrupted) and not args.silent:
             print_document({}, totals.lines(terminal_columns(sys.stdout)), as_json=False)
-    doubts = []
-    for kind, text in (
-        ("worse", "results show their photos worse than the input"),
-        ("left out", "scenes have cameras or photos that do not belong to them"),
-    ):
-        if reasons := totals.reasons[kind]:
-            first = _first_reason(reasons, listed=not args.silent)
-            doubts.append(f"{len(reasons)} of {totals.total} {text}{first}")
+    kinds = {
+        "worse": "results show their photos worse than the input",
+        "left_out": "scenes have cameras or photos that do not belong to them",
+    }
+    doubts = [
+        f"{len(reasons)} of {totals.total} {words}{_first_reason(reasons, listed=not args.silent)}"
+        for name, words in kinds.items()
+        if (reasons := totals.reasons[name])
+    ]
     if totals.reasons["worse"] and not args.strict:
         say(doubts[0], kind="warning", quiet=args.silent)
-    check_failures(totals.reasons["failed"], len(jobs), "scenes", listed=not args.silent)
-    if totals.unmet:
-        raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
+    check_failures(totals.reasons["error"], len(jobs), "scenes", listed=not args.silent)
+    if totals.counts["unmet"]:
+        raise TargetError(f"{totals.counts['unmet']} of {totals.total} results miss the target")
     if doubts and args.strict:
         raise TargetError("; ".join(doubts))
 
@@ -184,33 +186,27 @@ class Totals:
     """Results of a run, for the lines at its end."""
 
     total: int  # scenes
-    counts: Counter[str] = field(default_factory=Counter)  # scenes by status
-    num_input: int = 0  # Gaussians in the scenes that were compacted
-    num_output: int = 0  # Gaussians in their results
-    unmet: int = 0  # results that miss their target
+    counts: Counter[str] = field(default_factory=Counter)  # scenes by status; Gaussians in and out; missed targets
     rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results
-    reasons: dict[str, list[tuple[str, str]]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
+    # Scenes and reasons: worse than the input, also of skipped results; files of another scene; lacking files; failed
+    reasons: dict[str, list[tuple[str, str]]] = field(default_factory=lambda: {name: [] for name in REASONS})
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Count the record of one scene."""
-        self.counts[record["status"]] += 1
         report = record["report"]
-        doubts = report or record  # a result that was done before has a record of its doubts alone
-        left_out = report["input"].get("left_out") if report else record.get("left_out")
-        lacks = report and not left_out and not report["input"].get("num_photos", 1)
-        found = {
-            "worse": doubts.get("worse"),
-            "left out": left_out,
-            "lacking": _describe_lack(report) if lacks else None,
-            "failed": record["error"],
-        }
-        for kind, reason in found.items():
-            if reason is not None:
-                self.reasons[kind].append((record["scene"], reason))
+        found: dict[str, Any] = {**record}
         if report:
-            self.num_input += report["input"]["num_gaussians"]
-            self.num_output += report["output"]["num_gaussians"]
-            self.unmet += bool(report["unmet"])
+            found |= {"worse": report["worse"], **report["input"]}
+        if report and not found.get("left_out") and not found.get("num_photos", 1):
+            found["lacking"] = _describe_lack(report)
+        for name in REASONS:
+            if found.get(name):
+                self.reasons[name].append((record["scene"], found[name]))
+        self.counts[record["status"]] += 1
+        if report:
+            self.counts["in"] += report["input"]["num_gaussians"]
+            self.counts["out"] += report["output"]["num_gaussians"]
+            self.counts["unmet"] += bool(report["unmet"])
             if len(self.rows) < MAX_LISTED:
                 self.rows.append(_row(record["output"], report))
 
@@ -221,26 +217,23 @@ class Totals:
         from gsmerge.report import text_table
         from gsmerge.runtime.memory import human_share
 
-        header = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
-        rows = [header, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
-        omitted_first = [header.index(name) for name in OMITTED_FIRST]
-        lines = text_table(rows, columns=columns, least=omitted_first) if self.rows else []
-        if self.counts[DONE] > len(self.rows):
-            lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
-        for kind, reasons in self.reasons.items():
-            grouped = _list_reasons(reasons)
-            lines += [f"{KINDS[kind]}: {line}" for line in grouped[:MAX_LISTED]]
-            lines += [f"... and {len(grouped) - MAX_LISTED:,} more {kind}"] if len(grouped) > MAX_LISTED else []
+        rows = [HEADER, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
+        lines = text_table(rows, columns=columns, least=list(map(HEADER.index, OMITTED_FIRST))) if self.rows else []
+        lines += [f"... and {self.counts[DONE] - len(self.rows):,} more"] * (self.counts[DONE] > len(self.rows))
+        for name, status in REASONS.items():
+            grouped = _list_reasons(self.reasons[name])
+            lines += [f"{status}: {line}" for line in grouped[:MAX_LISTED]]
+            lines += [f"... and {len(grouped) - MAX_LISTED:,} more {status}"] * (len(grouped) > MAX_LISTED)
         statuses = [status for status in (DONE, SKIPPED, FAILED) if self.counts[status] or status == DONE]
-        counts = [f"{self.counts[status]:,} {status}" for status in statuses]
-        num_left = self.total - self.counts.total()
-        line = f"{count_words(self.total, 'scene')}: {', '.join(counts)}" + (f", {num_left:,} left" if num_left else "")
-        if self.num_input:
-            share = human_share(self.num_output / self.num_input)
-            line += f"; {self.num_input:,} -> {self.num_output:,} Gaussians ({share})"
-        line += f"; {self.unmet:,} missed the target" if self.unmet else ""
-        line += f"; {len(self.reasons['worse']):,} worse than the input" if self.reasons["worse"] else ""
-        return [*lines, line]
+        parts = [f"{self.counts[status]:,} {status}" for status in statuses]
+        num_left = self.total - sum(self.counts[status] for status in statuses)
+        line = f"{count_words(self.total, 'scene')}: {', '.join([*parts, *[f'{num_left:,} left'] * (num_left > 0)])}"
+        if num_input := self.counts["in"]:
+            share = human_share(self.counts["out"] / num_input)
+            line += f"; {num_input:,} -> {self.counts['out']:,} Gaussians ({share})"
+        line += f"; {self.counts['unmet']:,} missed the target" if self.counts["unmet"] else ""
+        num_worse = len(self.reasons["worse"])
+        return [*lines, line + (f"; {num_worse:,} worse than the input" if num_worse else "")]
 
 
 def _list_reasons(reasons: Sequence[tuple[str, str]]) -> list[str]:

@@ -164,19 +164,19 @@ def _check_outputs(
 
 def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
     """Print the report of a run, and how to view it unless a page is ``shown``; TargetError if a target is missed."""
-    from gsmerge.compaction.report import curve_lines, level_lines, result_table, summary_line
+    from gsmerge.compaction.report import result_table
     from gsmerge.io.formats.table import VIEWED, find_format
 
     doubts = [document["worse"], document["input"]["left_out"] if args.strict else None]
     notes = [note for note in document["notes"] if note not in doubts]
     say_notes(notes, document["doubts"], quiet=args.silent)
-    lines = [summary_line(document), *level_lines(document), *curve_lines(document)]
-    if sys.stdout.isatty():
+    columns, next_step = terminal_columns(sys.stdout), None
+    if columns is not None:
         words = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
         words = ["python", "-m", "http.server", "-d", str(out.parent)] if out.name == find_format(out).site else words
         # A file name that begins with a dash would be taken for an option
         next_step = shlex.join([f"./{word}" if word.endswith(out.name) and word[0] == "-" else word for word in words])
-        lines = result_table(document, next_step or None, columns=terminal_columns(sys.stdout))
+    lines = result_table(document, next_step or None, columns=columns)
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     unchecked = document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]
     if args.strict and unchecked and not document["worse"]:

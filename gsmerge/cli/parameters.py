@@ -378,7 +378,7 @@ def parse_path(word: str) -> Path:
 def share_list(text: str) -> list[str]:
     """Parse shares that are separated by commas: "1,4.4%" -> ["1%", "4.4%"]."""
     shares = [f"{number.strip().removesuffix('%')}%" for number in text.split(",")]
-    if len({parse_share(share) for share in shares}) < len(shares):
+    if "%" in shares or len({parse_share(share) for share in shares}) < len(shares):
         raise ValueError(f"expected different shares in %, such as 1,2,4.4,10, got {text!r}")
     return shares
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
@@ -25,14 +24,13 @@ from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import can_try, try_new_views
 from gsmerge.compaction.report import CompactReport
 from gsmerge.compaction.result import CompactResult, make_result
-from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, meet, search_count
+from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, search_count
 from gsmerge.errors import DoubtWarning
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
-from gsmerge.frozen import dataclass
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan, choose_for_scene, note_surplus
 from gsmerge.runtime.record import (
@@ -53,9 +51,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians, Scene, StrPath
 
-# The requested count has to remain after clean-up. So the scene is built with SURPLUS times this count, at most
-# MAX_BUILDS times
-MAX_BUILDS, SURPLUS = 3, 1.05
+SURPLUS = 1.05  # The requested count has to remain after clean-up, so this many times more are built
 
 
 @check_arguments
@@ -187,50 +183,35 @@ def clean_best(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
     return score(None, replace(candidate.fitted, gaussians=gaussians), prepared, plan)
 
 
-@dataclass(frozen=True, eq=False)
-class CleanedBuild:
-    """Gaussians that were built for a count and cleaned up."""
-
-    count: int | None  # Gaussians that were built; None: as many as `superpixels` and K give
-    fitted: Fitted  # The fit, with the Gaussians that remain after clean-up
-    dropped: dict[str, int]  # Numbers of dropped Gaussians by reason
-    record: Record  # Seconds, choices and notes
-
-
 def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build Gaussians and clean them up, so that exactly ``count`` remain if the scene has that many.
 
-    More Gaussians than ``count`` are built. Of those that remain after clean-up, the faintest surplus is dropped.
+    More Gaussians than ``count`` are built. If fewer remain after clean-up, they are built once more, with a surplus by
+    the share that remained. The faintest surplus is dropped.
     """
-    options = plan.clean
-    if not options.asked:
+    if not plan.clean.asked:
         return build(prepared, plan, count)
     from gsmerge.stages.clean import faintest_dropped
 
-    max_count = len(prepared.scene.gaussians)
-
-    def build_once(built_count: int | None) -> CleanedBuild:
+    def build_once(built_count: int | None) -> tuple[Fitted, dict[str, int], Record]:
         with record_part() as record:
             fitted = build(prepared, plan, built_count)
             gaussians, dropped = _clean(fitted, prepared, plan)
         add_seconds(record.seconds)
-        return CleanedBuild(built_count, replace(fitted, gaussians=gaussians), dropped, record)
+        return replace(fitted, gaussians=gaussians), dropped, record
 
-    def choose_next(built: Sequence[CleanedBuild]) -> int | None:
-        last_count, remaining = built[-1].count, len(built[-1].fitted.gaussians)
-        if count is None or last_count in (None, max_count) or remaining >= count or len(built) == MAX_BUILDS:
-            return None
-        return min(max_count, math.ceil(SURPLUS * last_count * count / max(1, remaining)))
-
+    max_count = len(prepared.scene.gaussians)
     first_count = None if count is None else min(max_count, math.ceil(SURPLUS * count))
-    built = meet(build_once, build_once(first_count), choose_next)
-    best = max(built, key=lambda cleaned: len(cleaned.fitted.gaussians))
-    gaussians, dropped = best.fitted.gaussians, best.dropped
+    fitted, dropped, record = build_once(first_count)
+    if count is not None and first_count is not None and len(fitted.gaussians) < count and first_count < max_count:
+        share = SURPLUS * count / max(1, len(fitted.gaussians))
+        fitted, dropped, record = build_once(min(max_count, math.ceil(share * first_count)))
+    gaussians = fitted.gaussians
     if count is not None and len(gaussians) > count:
         gaussians, dropped = faintest_dropped(gaussians, count), dropped | {"surplus": len(gaussians) - count}
-    adopt(best.record)
+    adopt(record)
     _note_clean(dropped, len(gaussians), count, prepared)
-    return replace(best.fitted, gaussians=gaussians)
+    return replace(fitted, gaussians=gaussians)
 
 
 def _clean(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gaussians, dict[str, int]]:

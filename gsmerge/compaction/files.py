@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.outputs import add_views, name_photos, named_cameras, other_cameras
+from gsmerge.compaction.outputs import add_views, name_photos
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import DoubtWarning, SceneError, UsageError
@@ -76,9 +76,6 @@ def compact_files(
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras if len(load.scene) else None
-        keeps_cameras = cameras_path is not None and cameras_path.exists() and not outputs.overwrite
-        if cameras_path is not None and keeps_cameras and named_cameras(cameras_path, names) is None:
-            raise other_cameras(cameras_path)  # before the long work
         read = perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DoubtWarning)  # the report has them

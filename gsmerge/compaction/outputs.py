@@ -33,30 +33,19 @@ def add_views(add: AddOutput, path: Path, cameras: Cameras, names: Sequence[str]
     if overwrite or not path.exists():
         add(path).write_bytes(viewer_cameras(cameras, names).encode())
     elif not _has_cameras(path, cameras, names):
-        raise other_cameras(path)
-
-
-def named_cameras(path: Path, names: Sequence[str]) -> Cameras | None:
-    """Read the cameras of a file if they have these names; None for any other file."""
-    with suppress(SceneError):
-        stored = read_cameras(path)
-        return to_cameras(stored) if list(stored.names) == list(names) else None
-    return None
+        remedy = "name another output, or pass --overwrite to replace it"
+        raise UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
 
 def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> bool:
     """Return whether a file holds these cameras under these names, to within rounding."""
-    stored, farthest = named_cameras(path, names), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
-    if stored is None or (stored.width, stored.height) != (cameras.width, cameras.height):
-        return False
-    same_poses = np.allclose(stored.viewmats, cameras.viewmats, rtol=0, atol=SAME * farthest)
-    return same_poses and np.allclose(stored.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME)
-
-
-def other_cameras(path: Path) -> UsageError:
-    """Return the error for an existing file of cameras that belongs to another result."""
-    remedy = "name another output, or pass --overwrite to replace it"
-    return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
+    with suppress(SceneError):
+        file, farthest = read_cameras(path), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
+        stored = to_cameras(file)
+        same_views = [*file.names, stored.width, stored.height] == [*names, cameras.width, cameras.height]
+        same_poses = same_views and np.allclose(stored.viewmats, cameras.viewmats, rtol=0, atol=SAME * farthest)
+        return bool(same_poses and np.allclose(stored.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME))
+    return False
 
 
 def name_photos(photos: Path | None, names: Sequence[str]) -> NamedPhotos:

@@ -12,7 +12,7 @@ from typing import Any
 from gsmerge.compaction.new_views import NewViews
 from gsmerge.frozen import dataclass
 from gsmerge.raster.metrics import psnr_words
-from gsmerge.report import document_head, file_sha256, html_table, seconds_document, seconds_line, text_table, wrap_line
+from gsmerge.report import document_head, file_sha256, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.words import count_words
 
@@ -117,10 +117,6 @@ class CompactReport:
         """Return the report as plain JSON types, by the names of its fields."""
         return asdict(self)
 
-    def _repr_html_(self) -> str:
-        notes = [("note", text) for text in self.notes]
-        return html_table([*self._facts(), *notes])
-
     def _facts(self) -> list[tuple[str, str]]:
         """List the main facts, each with its name."""
         share = human_share(self.num_output / max(1, self.num_input))
@@ -129,10 +125,6 @@ class CompactReport:
             facts += [("PSNR of new views, expected", f"{new.low:+.1f} to {new.high:+.1f} dB from {new.before:.1f} dB")]
         if self.psnr_before is not None and self.psnr_after is not None:
             facts += [("PSNR of its own views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
-        if files := self.photo_files:
-            facts += [("PSNR of unchanged photos", f"{files.before:.2f} -> {files.after:.2f} dB")]
-        if protected := self.protected:
-            facts += [("PSNR of protected pixels", f"{protected.before:.2f} -> {protected.after:.2f} dB")]
         if fidelity := self.choices.get("fidelity"):
             facts += [("PSNR", f"{psnr_words(fidelity['psnr'])} {_describe_views(fidelity)}")]
         return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
@@ -257,20 +249,11 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     figures = text_table([row[:3] for row in rows], "  ")
     hang = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
     lines = [(f"{left}  {row[3]}".rstrip(), hang) for left, row in zip(figures, rows, strict=True)]
-    lines += [(line, 0) for line in (*level_lines(document), *curve_lines(document))]
+    lines += [(line, 2) for line in (*level_lines(document), *curve_lines(document))]
     wrapped = [part for line, hang in lines for part in wrap_line(line, columns, hang)]
     last = {"cameras": document.get("viewer_cameras"), "next": next_step}
     shown = [f"  {name:9}  {text}" for name, text in last.items() if text is not None]
     return [document["output"]["path"], *wrapped, *shown]
-
-
-def summary_line(document: Mapping[str, Any]) -> str:
-    """Describe the result in one line: the figures of the table."""
-    parts = []
-    for name, before, after, about in result_facts(document):
-        change = f"{before} -> {after}" if before else after
-        parts.append(" ".join(filter(None, (name, change, about and f"({about})"))))
-    return f"{document['output']['path']}: {'; '.join(parts)}"
 
 
 def _describe_views(fidelity: Mapping[str, Any]) -> str:

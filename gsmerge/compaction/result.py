@@ -21,7 +21,6 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.frozen import dataclass
 from gsmerge.plan import Plan
-from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_distance, describe_loss
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record
@@ -109,24 +108,6 @@ class CompactResult:
     def __repr__(self) -> str:
         levels = f", {count_words(len(self.coarser), 'coarser level')}" if self.coarser else ""
         return f"CompactResult({self.gaussians!r}, {self.cameras!r}{levels})"
-
-    def _repr_html_(self) -> str:
-        """Show the report and, where cameras are known, a render of the middle view."""
-        report = self.report._repr_html_()
-        if len(self.cameras) == 0:
-            return report
-        from gsmerge.measure.preview import picture_html, to_picture
-
-        middle = self.cameras.numpy()[[len(self.cameras) // 2]]
-        given = self.scene() if isinstance(self.scene, ReferenceType) else None  # a path is not read again for this
-        drawn = {"after": self.gaussians}
-        if given is not None:
-            drawn = {"before": given.file_gaussians, **drawn}
-        pictures = [
-            picture_html(to_picture(render(gaussians.numpy(), middle).images[0]), f"the middle view {name}")
-            for name, gaussians in drawn.items()
-        ]
-        return "".join(pictures) + report
 
     def to_single(self) -> CompactResult:
         """Return the same result with means in float32; it has to be of arrays."""

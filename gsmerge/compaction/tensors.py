@@ -43,8 +43,6 @@ ORDERS = ("view-major", "none")
 _NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may exceed it
 _EXACT = 1e-5  # the same difference from which on quaternions are normalised
 _MAX_COLOR = 2.0  # largest colour; harmonics may take colours a little beyond 1
-# Offset (pixels) up to which Gaussians lie at the corners of their pixels, if Ks take the corners for the centres
-_CORNER = 0.1
 _REMEDIES = {
     C2W_OPENCV: "pass their inverse, torch.linalg.inv(viewmats)",
     W2C_OPENGL: "negate the second and the third row of each",
@@ -324,10 +322,7 @@ def _check_pixels(
     pairs = sample_pixels(gaussians, cameras, valid)
     alignment = check_pairs(pairs, cameras)
     if alignment.ok:
-        shifted = check_pairs(replace(pairs, pixels=pairs.pixels - 0.5), cameras)
-        corners = np.median(shifted.median_px) < _CORNER and np.median(alignment.median_px) > 0.5 - _CORNER
-        text = "the Gaussians project onto the corners of their pixels: if Ks take these for centres, add 0.5 to cx, cy"
-        return cameras, [text] if corners else []
+        return cameras, []
     for poses in other_conventions(cameras.viewmats, W2C_OPENCV):
         if check_pairs(pairs, replace(cameras, viewmats=poses.viewmats)).ok:
             raise _convention_error(poses.convention, poses.description, "the means project into their own pixels")

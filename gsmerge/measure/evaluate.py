@@ -24,7 +24,6 @@ from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
 from gsmerge.raster.photos import COVERED, NEAR_PLANE, WHOLE
-from gsmerge.report import html_table
 from gsmerge.runtime.record import Note, Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.input import check_scene
@@ -148,9 +147,6 @@ class Evaluation:
     def __repr__(self) -> str:
         scores = ", ".join(f"{row[0]} {row[2]} dB" if len(row) > 2 else row[0] for row in self._rows()[1:])
         return f"Evaluation({scores}; against {self.reference})"
-
-    def _repr_html_(self) -> str:
-        return html_table(self._rows())
 
     def _rows(self) -> list[list[str]]:
         """List the mean scores over the pixels that the input views have seen, of held-out views if there are any."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,12 +47,6 @@ def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool =
     _, data = cv2.imencode(path.suffix, np.ascontiguousarray(stored), settings)
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(data.tobytes())
-
-
-def picture_html(picture: Picture, text: str) -> str:
-    """Convert a picture to an HTML element for notebooks; ``text`` is its description."""
-    data = base64.b64encode(cv2.imencode(".png", picture[..., ::-1])[1].tobytes()).decode("ascii")
-    return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
 
 
 def label(picture: Picture, text: str) -> Picture:

@@ -183,7 +183,7 @@ def note(text: str, *, doubt: bool = False) -> None:
     record = current_record()
     if text not in record.notes:
         record.entries.append(Note(text, doubt))
-        logging.getLogger("gsmerge").log(logging.WARNING if doubt else logging.INFO, text)
+        logging.getLogger("gsmerge").info(text)
 
 
 def choose(**choices: Any) -> None:

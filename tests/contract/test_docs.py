@@ -41,17 +41,7 @@ MADE = ("docs/reference/commands", "docs/reference/settings")
 GENERATED = {page for page in PAGES if page.startswith(MADE)}
 WRITTEN = [page for page in PAGES if page not in GENERATED]
 # options of tools that pages name beside our own
-OTHER_OPTIONS = {
-    "--version",
-    "--help",
-    "--help-all",
-    "--debug",
-    "--progress",
-    "--only",
-    "--no-deps",
-    "--force-reinstall",
-    "--check",
-}
+OTHER_OPTIONS = {"--version", "--help", "--help-all", "--debug", "--only", "--no-deps", "--force-reinstall", "--check"}
 
 
 def options(command: Any) -> set[str]:
@@ -329,6 +319,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "engine",
         "address",
         "dry-run",
+        "progress",
         "json",
         "quiet",
     }

@@ -44,7 +44,7 @@ def test_compact_needs_no_hint(bare: Path, tmp_path: Path, run: Any) -> None:
     said = run("compact", bare, "-o", tmp_path / "b.ply", "--budget", "20%", "--hint", "order=none", code=0)
     assert (tmp_path / "small.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     assert all(note in said.err for note in report["notes"])
-    assert "dB from the input in 8 held-out views" in said.out
+    assert "dB  from the input in 8 held-out views" in said.out
 
 
 @sweep(

@@ -29,11 +29,9 @@ def test_compact_writes_beside_the_input_and_says_what_it_did(smallest_copy: Pat
     out = smallest_copy / "scene.compact.ply"
     count = len(gsmerge.read_ply(out).gaussians)
     assert 0 < count <= 3 * 200 * 2
-    line = outcome.out
-    assert line.count("\n") == 1
-    assert f"Gaussians 1,152 -> {count:,} (" in line
-    assert "dB" in line
-    assert re.search(r"; time \d+\.\d s \(", line)  # the time of each stage is in the report
+    said = " ".join(outcome.out.split())
+    assert f"Gaussians 1,152 {count:,} " in said
+    assert re.search(r" dB .* time \d+\.\d s most in", said)  # the time of each stage is in the report
 
 
 def test_json_report(smallest_copy: Path, run: Run) -> None:

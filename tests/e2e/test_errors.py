@@ -6,7 +6,6 @@ import ctypes
 import errno
 import itertools
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from messages import ERROR, says
+from messages import ERROR
 from sweeps import sweep
 
 import gsmerge
@@ -250,14 +249,3 @@ def test_odd_places_to_write_to_and_run_in(case: str, smallest_copy: Path, root:
     if line:
         assert done.stderr.startswith(ERROR)
         assert done.stderr.count("\n") == 1
-
-
-def test_a_working_directory_that_vanishes_meanwhile(
-    smallest_scene: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "gone").mkdir()
-    monkeypatch.chdir(tmp_path / "gone")
-    monkeypatch.setattr("gsmerge.cli.render_command.say_notes", lambda *_, **__: shutil.rmtree(tmp_path / "gone"))
-    outcome = run("render", smallest_scene, "-o", "a.png", code=3)
-    monkeypatch.chdir(tmp_path)
-    assert says(outcome.err.splitlines()[-1], f"{ERROR}.", "working directory"), outcome.err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -131,9 +132,7 @@ def test_a_loss_is_read_off_a_curve(scene: Scene) -> None:
 
 def test_auto_without_a_fit_reports_its_curve(small_scene: Path, tmp_path: Path, run: Run) -> None:
     said = run("compact", small_scene, "-o", tmp_path / "a.ply", "--budget", "auto", "--fit", "none", code=0)
-    lines = said.out.splitlines()
-    assert "PSNR" in lines[2]
-    assert len(lines) == 7
+    assert len(re.findall(r"^ *[\d,]+  +\d+\.\d\d  \d\.\d{3}", said.out, re.MULTILINE)) == 4
 
 
 def test_a_device_is_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -95,9 +95,9 @@ def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callab
 
 
 def test_wrong_settings_are_refused_in_one_line(small_scene: Path, run: Run, tmp_path: Path) -> None:
-    for name, value in (("steps", 0), ("width", 50)):
+    for place, name, value in (("--set steps", "steps", 0), ("width", "width", 50)):
         said = run("lab", "train", "--data", small_scene, "--output", tmp_path / "run", "--set", f"{name}={value}")
-        assert_refused(said, 2, name, value)
+        assert_refused(said, 2, place, value)
 
 
 def test_data_may_be_a_folder_of_scenes(small_copy: Path, tmp_path: Path, run: Run) -> None:

@@ -56,7 +56,7 @@ def test_a_result_compacted_again_looks_as_it_did(
     cameras = compacted_scene / "small.cameras.json"
     shutil.copy(cameras, tmp_path / ("small.cameras.json" if beside == "cameras" else "elsewhere.cameras.json"))
     said = run("compact", small, "-o", again, code=0)
-    assert "dB from the input in" in said.out
+    assert "dB  from the input in" in said.out
     assert "looks different" not in said.err
     before, after = (gsmerge.read_ply(path).gaussians for path in (small, again))
     views = read_scene(compacted_scene / "small.ply").cameras

@@ -23,7 +23,7 @@ QUICK = ("--set", "superpixels=40", "--fit", "none", "--set", "checkpoint=none")
 
 def test_the_views_are_written_and_named(smallest_copy: Path, run: Run) -> None:
     done = run("compact", smallest_copy, "-o", smallest_copy / "small.ply", *QUICK, code=0)
-    assert done.out.splitlines()[-1].endswith(" small.cameras.json")
+    assert done.out.splitlines()[-1].endswith("small.cameras.json")
     scene = gsmerge.read_scene(smallest_copy)
     entries = json.loads((smallest_copy / "small.cameras.json").read_text())
     assert [entry["img_name"] for entry in entries] == list(scene.names)
@@ -86,7 +86,7 @@ def test_a_second_format_shares_them(smallest_copy: Path, run: Run, tmp_path: Pa
     run("compact", smallest_copy, "-o", out / "a.ply", *QUICK, "-q", code=0)
     before = (out / "a.cameras.json").read_bytes()
     done = run("compact", smallest_copy, "-o", out / "a.spz", *QUICK, code=0)
-    assert done.out.splitlines()[-1].endswith(" a.cameras.json")
+    assert done.out.splitlines()[-1].endswith("a.cameras.json")
     assert (out / "a.cameras.json").read_bytes() == before
     run("compact", smallest_copy, "-o", out / "a.cameras.json", *QUICK, code=2)
     entries = json.loads(before)

@@ -224,18 +224,6 @@ def trainer_of(scene: Scene) -> tuple[dict[str, torch.nn.Parameter], list[dict[s
     return {name: torch.nn.Parameter(torch.tensor(column)) for name, column in columns.items()}, views
 
 
-def test_gsplat(scene: Scene) -> None:
-    """Parameters before their activations, with gradients."""
-    splats, views = trainer_of(replace_opaque(scene))
-    given = integrations.gsplat(splats, views)
-    assert_holds(given, replace_opaque(scene))
-    assert given["order"] == "none"
-    with refuses(SceneError, "splats", "sh0"):
-        integrations.gsplat({name: splats[name] for name in ("means", "quats", "scales", "opacities")}, views)
-    with refuses(SceneError, "dataset", "one size", 2):
-        integrations.gsplat(splats, [*views, views[0] | {"image": views[0]["image"][1:]}])
-
-
 def replace_opaque(scene: Scene) -> Any:
     """A stand-in for a scene whose opacities have logits."""
     gaussians = replace(scene.gaussians, opacities=scene.gaussians.opacities.clip(0.01, 0.99))

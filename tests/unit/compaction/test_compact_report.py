@@ -56,17 +56,9 @@ def test_document_is_strict_json(files: tuple[Path, Path]) -> None:
 def test_what_the_input_covers_stands_beside_all_pixels(files: tuple[Path, Path]) -> None:
     document = make_document(files, covered=Covered(0.79, 26.1, 25.9))
     assert document["psnr_covered"] == {"share": 0.79, "before": 26.1, "after": 25.9}
-    for text in (report.summary_line(document), "\n".join(report.result_table(document))):
+    for text in ["\n".join(report.result_table(document))]:
         assert all(part in text for part in ("79 %", "26.10", "25.90", "20.00", "24.50"))
     assert make_document(files)["psnr_covered"] is None
-
-
-def test_summary_line(files: tuple[Path, Path]) -> None:
-    line = report.summary_line(make_document(files))
-    assert line == (
-        f"{files[1]}: Gaussians 1,000 -> 25 (2.50 %); file 2.5 MB -> 700 B; its own photos 20.00 dB -> 24.50 dB"
-        " (a sample, of 4 of its views); time 1.9 s (most in segment 1.0, encode 0.5)"
-    )
 
 
 def test_result_table(files: tuple[Path, Path]) -> None:
@@ -97,7 +89,7 @@ def test_new_views_come_first(files: tuple[Path, Path]) -> None:
 def test_photos_as_their_files_have_them_are_left_out_if_all_is_equal(files: tuple[Path, Path]) -> None:
     for before, is_shown in ((20.0, False), (20.1, True)):
         document = make_document(files, photo_files=PhotoFiles(before, 24.5001))
-        for text in (report.summary_line(document), "\n".join(report.result_table(document))):
+        for text in ["\n".join(report.result_table(document))]:
             assert ("photos as their files have them" in text) == is_shown
 
 

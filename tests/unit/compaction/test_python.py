@@ -72,10 +72,6 @@ def test_means_keep_their_precision(kind: type, scene: Scene) -> None:
     assert result.gaussians.means.dtype == kind
 
 
-def test_a_notebook_shows_before_and_after(result: gsmerge.CompactResult) -> None:
-    assert result._repr_html_().count("<img") == 2
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "said"),
     [
@@ -94,7 +90,7 @@ def test_wrong_settings_say_what_is_meant(
 def test_wrong_kinds_say_what_is_expected(result: gsmerge.CompactResult, tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="expected Scene or a path, got Gaussians"):
         gsmerge.compact(result.gaussians)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match=r"pass its \.gaussians"):
+    with pytest.raises(TypeError, match=r"pass the \.gaussians"):
         gsmerge.write_ply(tmp_path / "a.ply", result)  # type: ignore[arg-type]
 
 

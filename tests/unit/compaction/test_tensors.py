@@ -235,13 +235,6 @@ def test_w_first_with_a_last_column_that_is_never_negative_gets_no_note(scene: S
     assert [noted(some, "w", "last") for some in notes] == [False, False, False, True]
 
 
-def test_centres_at_corners_get_a_note(scene: Scene) -> None:
-    shifted = changed(scene, "Ks", lambda K: K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]))
-    notes = compact_tensors(**shifted, **FAST).report.notes
-    assert noted(notes, 0.5, "cx, cy")
-    assert not any("0.5" in note for note in compact_tensors(**tensors_of(scene), **FAST).report.notes)
-
-
 def test_cameras_stay_where_they_fit(scene: Scene) -> None:
     """The result has them, so that it can be written with :func:`gsmerge.write_gaussians` and shown from them."""
     small = compact_tensors(**tensors_of(scene), names=[f"photo {i}" for i in range(3)], **FAST)
