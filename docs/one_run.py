@@ -26,7 +26,7 @@ import numpy as np
 from skimage.segmentation import find_boundaries
 
 import gsmerge
-from gsmerge.geometry import covariances, project
+from gsmerge.geometry import IDENTITY, covariances, project
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
 DOCS = Path(__file__).parent
@@ -230,7 +230,7 @@ def align_section(run: Run) -> str:
     """Say which row is which pixel."""
     ply, camera_file = run.given["align"][:2]
     made = run.made["align"]
-    recovery, best = made.recovery, made.recovery.best
+    recovery = made.recovery
     return "\n\n".join([
         "## 1. align: which row is which pixel",
         text(
@@ -247,10 +247,10 @@ def align_section(run: Run) -> str:
             "A `.ply` does not say which pixel a row belongs to, and exporters differ. `align` assumes an order,",
             "projects every Gaussian into the camera of its pixel, and measures the distance from the pixel's centre.",
             say(
-                f'Here the first reading, "{best.description}", decides: the median distance is',
-                best.layout.is_plain and best.effort == 0,
+                f'Here the first reading, "{recovery.layout.description}", decides: the median distance is',
+                recovery.layout.ids is None and recovery.frame is IDENTITY,
             ),
-            f"{best.alignment.middle_px:.2f} pixels, {recovery.margin:.0f} times less than with shuffled pixels.",
+            f"{recovery.alignment.middle_px:.2f} pixels.",
             say(
                 f"So row {ROW} is pixel ({VIEW} · {HEIGHT} + {Y}) · {WIDTH} + {X}, and each view has Gaussians of",
                 int(made.pixel_ids[ROW]) == ROW and run.prepared.input_scene.has_own_pixels,

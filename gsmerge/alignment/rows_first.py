@@ -11,12 +11,14 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsmerge.alignment.cameras import max_pixels, move_cameras, other_conventions
 from gsmerge.alignment.dropped_rows import follow_rows
+from gsmerge.alignment.estimate import estimate_cameras
 from gsmerge.alignment.frames import exporter_frames, fit_frame, own_poses, scale_by
 from gsmerge.alignment.grids import Grid, PlacedGrid, file_grids, photo_grid, with_photo_size, with_poses
 from gsmerge.alignment.layouts import ESTIMATED, Layout
@@ -34,6 +36,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Similarity, median
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
+from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import NO_IMAGES, PhotoArrays, PhotoTransform, Size, as_floats, photo_size
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
@@ -67,6 +70,11 @@ class RowSource:
     def images(self) -> np.ndarray:
         """Photos at their own size, ``[c,h,w,3]`` float32."""
         return as_floats(self.photos)
+
+    @cached_property
+    def own_cameras(self) -> CameraFile | None:
+        """Cameras that the rows themselves show; None if they are no grid."""
+        return estimate_cameras(Path(self.ply.info.path), self.ply.gaussians.means, self.ply.valid)
 
     def inputs(self, grid: Grid, *, photos: bool = True) -> AlignmentInput:
         """Return rows, cameras and photos at the size of a grid; without ``photos`` if only positions matter."""
@@ -170,9 +178,14 @@ def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
         layouts = [replace(layout, ids=source.camera_file.pixel_ids)]
     elif count != layers * num_pixels or source.order == "view-fastest":
         return _follow_order(source, grid)
+    elif layers == 1:  # views are in the order of the camera file, or of the names
+        names = source.camera_file.names
+        by_name = np.array(sorted(range(len(names)), key=lambda view: natural_key(names[view])))
+        pixels = np.arange(num_pixels).reshape(len(names), -1)
+        layouts = [layout, replace(layout, ids=pixels[by_name].reshape(-1))]
     else:  # several Gaussians of a pixel follow each other, or there are several layers of all pixels
         rows = np.arange(count)
-        layouts = [layout] if layers == 1 else [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
+        layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
     if int(source.ply.valid.sum()) < min(_MIN_ROWS, _MIN_SHARE * count):
         return None
     return next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
@@ -231,7 +244,7 @@ def _move_cameras(source: RowSource, grid: Grid, layout: Layout) -> Grid:
 
 
 def _follow_order(source: RowSource, grid: Grid) -> Recovery | None:
-    """Take rows as pixels in order of which some have no row, in an exporter's frame; None for rows in another order.
+    """Take rows as pixels in order of which some have no row, in any likely frame; None for rows in another order.
 
     The rows of a view follow each other, or else those of a pixel.
     """
@@ -240,7 +253,7 @@ def _follow_order(source: RowSource, grid: Grid) -> Recovery | None:
         return None
     orders = [order for order in ("view-major", "view-fastest") if source.order in ("auto", order)]
     points = np.ascontiguousarray(source.ply.gaussians.means[rows], np.float32)
-    for frame in exporter_frames(grid.cameras, source.scale):
+    for frame in _list_frames(source, grid):
         place = PlacedGrid(grid, frame, _EVIDENCE)
         for order in orders:
             ids = _follow(points, place.cameras, mixed=order == "view-fastest")
@@ -251,6 +264,13 @@ def _follow_order(source: RowSource, grid: Grid) -> Recovery | None:
                 pairs = source.inputs(grid, photos=False).pairs(layout)
                 return Recovery(place, layout, check_pairs(pairs, place.cameras))
     return None
+
+
+def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
+    """Yield the frames of exporters, and the frame in which cameras lie where the rows themselves show them."""
+    yield from exporter_frames(grid.cameras, source.scale)
+    if source.own_cameras is not None and len(source.own_cameras) == len(grid.cameras):
+        yield fit_frame(grid.cameras, source.own_cameras.viewmats, source.scale)
 
 
 def _follow(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:

@@ -85,7 +85,7 @@ def inspect(
         ``views``). About the rows: ``count``, ``num_nonfinite``, ``num_empty``, ``num_clipped_scales``,
         ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255), ``num_saturated``
         (within 1e-6 of 0 or 1), ``extents``. About the views: ``cameras``, ``camera_format``, ``images``,
-        ``num_views``, ``width``, ``height``, ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows``
+        ``num_views``, ``width``, ``height``, ``num_missing`` (pixels without a Gaussian), ``rows``
         (order of the rows), ``alignment`` or ``alignment_problem``, ``num_unseen`` (Gaussians of a result that no view
         shows), ``sight``, ``coverage``, ``num_sky_views``. ``agreement``: shares of the pixels whose depth other views
         confirm or contradict, or that no other view sees (``confirmed``, ``contradicted``, ``alone``). ``new_views`` of
@@ -158,7 +158,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         "images": files.images and str(files.images),
         "exporter": _OWN if is_result else "not known before the cameras fit",
         "notes": file_notes(ply.info),
-        **dict.fromkeys(("num_views", "width", "height", "per_pixel", "num_missing", "num_sky_views"), 0),
+        **dict.fromkeys(("num_views", "width", "height", "num_missing", "num_sky_views"), 0),
         **dict.fromkeys(_UNKNOWN_KEYS),
         "coverage": [],
         "new_views": None if expected is None else asdict(expected),
@@ -296,11 +296,10 @@ def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
     if alignment is None:
         return []
     worst = max(m for m in alignment["median_px"] if m is not None)
-    number = "one Gaussian" if scene["per_pixel"] == 1 else f"{scene['per_pixel']} Gaussians"
     missing = f", none for {scene['num_missing']:,} of them" if scene["num_missing"] else ""
     return [
         f"rows       {scene['rows']}",
-        f"alignment  {number} per pixel, {scene['num_views']} x {scene['height']} x {scene['width']} (views x height x"
+        f"alignment  pixels of {scene['num_views']} x {scene['height']} x {scene['width']} (views x height x"
         f" width){missing}; median offset {worst:.2f} px in the worst view,"
         f" {100 * alignment['share_within_1px']:.1f} % within 1 px",
     ]

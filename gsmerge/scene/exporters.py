@@ -61,11 +61,6 @@ class Exporter:
     comment: str = ""  # part of a comment in the header that it always writes
     cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: it writes none, and any may be given
 
-    def may_have_written(self, info: FileInfo, order: str, cameras: str) -> bool:
-        """Return whether this exporter may have written a file; see :func:`choose_exporters` for the arguments."""
-        is_order = self.is_marked or order == self.order
-        return is_order and self.writes_columns(info) and (not self.cameras or cameras in self.cameras)
-
     def writes_columns(self, info: FileInfo) -> bool:
         """Return whether a file has the header and the opacities that this exporter writes."""
         return (
@@ -404,14 +399,17 @@ def find_exporter(name: str) -> Exporter | None:
 def choose_exporters(name: str, info: FileInfo, order: str, cameras: str) -> tuple[Exporter, ...]:
     """Return the exporter with a name; for "auto", all exporters that may have written the file.
 
-    Exporters that leave a mark in the header precede exporters that leave none. ``order`` is the order of the rows,
-    "none" if they belong to no pixels, and ``cameras`` the format of the cameras, "" without any.
+    Exporters that leave a mark in the header precede exporters that leave none, and those of the same order precede
+    those of another one. ``order`` is the order of the rows, "none" if they belong to no pixels, and ``cameras`` the
+    format of the cameras, "" without any.
     """
     exporter = find_exporter(name)
     if exporter is not None:
         return (exporter,)
-    possible = [entry for entry in EXPORTERS.values() if entry.may_have_written(info, order, cameras)]
-    return tuple([entry for entry in possible if entry.is_marked] or possible)
+    possible = [entry for entry in EXPORTERS.values() if entry.writes_columns(info)]
+    possible = [entry for entry in possible if not entry.cameras or cameras in entry.cameras]
+    marked = [entry for entry in possible if entry.is_marked]
+    return tuple([entry for entry in marked or possible if entry.order == order] or marked)
 
 
 def find_cameras_of_model(info: FileInfo) -> str:

@@ -17,7 +17,7 @@ from scripts import load_script
 import gsmerge
 from gsmerge import plan, types
 from gsmerge.alignment import cameras as cameras_off
-from gsmerge.alignment import layouts, rows_first, score
+from gsmerge.alignment import rows_first, score
 from gsmerge.alignment.registration import register
 from gsmerge.compaction import blocks, curve, left_out, new_views, partition, seams, search
 from gsmerge.evidence import colors
@@ -25,7 +25,7 @@ from gsmerge.facts import compare_photos, confirm_depths, exposure, holes, move_
 from gsmerge.fit import outside, photo_sizes, schedule, stage
 from gsmerge.fit import report as fit_report
 from gsmerge.io import bounds, photo_files
-from gsmerge.io.formats import depth_maps, ply
+from gsmerge.io.formats import ply
 from gsmerge.kernels.raster import blend
 from gsmerge.kernels.superpixels import bass
 from gsmerge.measure import drawings, error_maps, fog
@@ -202,14 +202,11 @@ CLAIMS: dict[str, tuple[str, ...]] = {
     ),
     EXPORTERS: (
         f"is at most {part(rows_first._PLAIN_PX)} a pixel in every view",
-        f"{', '.join(map(str, layouts.PER_PIXEL[:-1]))} or {layouts.PER_PIXEL[-1]} Gaussians per pixel",
-        f"the nearest {percent(layouts.DEPTH_SHARE)} of each view",
         f"lie within {score.MAX_MEDIAN_PX:g} pixels of their pixels (median), and {word(int(score.SHUFFLED_MARGIN))}"
         " times as close as with shuffled pixels",
         f"up to {cameras_off.MAX_PX:g} pixels off (median; {percent(cameras_off.MAX_SHARE)} of the side",
     ),
     FORMATS: (
-        f"a ball of {depth_maps.SIGMA:g} pixels and opacity {depth_maps.OPACITY:g}",
         f"harmonics of degree 0 to {ply.MAX_READ_DEGREE}",
         f"which is {ply.THIN:g} of the smaller one",
         f"may hold {bounds.MAX_FILES:,} files and folders",

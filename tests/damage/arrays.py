@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .case import Change, Damage, accept, allow, refuse
-from .changes import add_bomb, change_beside, cut, edit_bytes, edit_member, pack_members, read_members, write_file
+from .changes import add_bomb, edit_bytes, edit_member, pack_members, read_members, write_file
 from .sounds import TINY
 
 MARKER = "executed"
@@ -127,48 +127,12 @@ def relabel(**said: Any) -> Callable[[bytes], bytes]:
     return lambda data: npy(load_array(data), **said)
 
 
-def of_depth_maps() -> dict[str, Damage]:
-    """Arrays that do not belong together."""
-    depths = np.ones((VIEWS, TINY.height, TINY.width), np.float32)
-    wide = {"extrinsics": np.eye(4)[None], "intrinsics": np.eye(3)[None], "depth": np.ones((1, 2000, 3000), "i1")}
-
-    def no_pixels(path: Path) -> None:
-        put_array("image", None)(path)
-        put_array("depth", np.empty((VIEWS, 0, 0), np.float32))(path)
-
-    def large(path: Path) -> None:
-        np.savez_compressed(path, **wide)
-
-    return {
-        "depths of another size": refuse(put_array("depth", depths[:, 1:]), "images", "size"),
-        "depths of fewer views": refuse(put_array("depth", depths[:2]), "[3,h,w]"),
-        "depths without pixels": refuse(no_pixels, "0 x 0"),
+DAMAGES = {
+    "views.npz": of_cameras("c2w", "K", "images") | {"an order of objects": refuse(put_objects("order"))},
+    "results.npz": {
+        **of_cameras("extrinsics", "intrinsics", "image"),
         "intrinsics of zeros": refuse(edit_array("intrinsics", np.zeros_like), "focal"),
         "intrinsics of ones": refuse(edit_array("intrinsics", np.ones_like), "0 0 1"),
         "poses of zeros": refuse(edit_array("extrinsics", np.zeros_like), "orthonormal"),
-        "six million pixels": refuse(large, "memory"),
-    }
-
-
-def of_frames() -> dict[str, Damage]:
-    return {
-        "depths of another size": refuse(put_array("depth", np.ones((5, 5), np.float32)), "size"),
-        "depths of two channels": refuse(put_array("depth", np.ones((5, 5, 2), np.float32)), "[h,w]"),
-        "intrinsics of two rows": refuse(put_array("intrinsics", np.ones((2, 3))), "intrinsics"),
-        "intrinsics of zeros": refuse(put_array("intrinsics", np.zeros((3, 3))), "focal"),
-        "an image of text": refuse(put_array("image", np.array(["text"])), "images"),
-        "a pose of three numbers": refuse(
-            change_beside("../camera_poses.txt", lambda path: write_file(path, "1 2 3\n")), "12 or 16",
-            place="camera_poses.txt: line 1",
-        ),
-        "the first 200 bytes": refuse(edit_bytes(lambda data: data[:200]), "readable"),
-        "another frame that is cut": accept(change_beside("frame_1.npz", cut(0.5))),
-    }  # fmt: skip
-
-
-DAMAGES = {
-    "views.npz": of_cameras("c2w", "K", "images") | {"an order of objects": refuse(put_objects("order"))},
-    "results.npz": of_cameras("extrinsics", "intrinsics", "image"),
-    "depth maps": of_depth_maps(),
-    "depth frames": of_frames(),
+    },
 }

@@ -41,7 +41,6 @@ from gsmerge.cli.parameters import parse_pairs
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io import read_cameras, read_gaussians, read_images
 from gsmerge.io.cameras.dataparser import read_dataparser
-from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.crop_file import read_crop
 from gsmerge.io.formats.spz import spz_bytes
@@ -185,7 +184,6 @@ def check_colmap(path: Path) -> None:
 
 
 def check_arrays(path: Path) -> None:
-    read_depths(path)
     check_cameras(path)
 
 
@@ -389,17 +387,6 @@ def write_vggt(folder: Path) -> None:
     np.savez(folder / "predictions.npz", extrinsic=TINY.w2c[None, :, :3], intrinsic=Ks[None])
 
 
-def write_depth_frames(folder: Path) -> None:
-    """Write what DA3-Streaming leaves, its array names and poses as text."""
-    place = folder / "results_output"
-    place.mkdir(parents=True)
-    depth = np.random.default_rng(1).uniform(1, 3, (TINY.height, TINY.width)).astype(np.float32)
-    for view, image in enumerate(TINY.images):
-        arrays = {"image": image, "depth": depth, "conf": depth, "intrinsics": TINY.K.astype(np.float32)}
-        np.savez_compressed(place / f"frame_{view}.npz", **arrays)
-    write_pose_list(folder)
-
-
 # Makers of other files
 
 
@@ -454,9 +441,6 @@ SOUNDS: dict[str, Sound] = {
     "levels": Sound("lod-meta.json", write_levels, check_gaussians, packed=True),
     "levels of a tree": Sound("lod-meta.json", partial(write_levels, leaves=2), check_gaussians, rare=True,
                               packed=True),
-    "depth maps": Sound("results.npz", lambda folder: write_npz(folder / "results.npz", TINY), check_gaussians),
-    "depth frames": Sound("results_output/frame_0.npz", write_depth_frames, check_gaussians, (), rare=True,
-                          packed=True),
     # Cameras beside the rows and photos of their scene
     "transforms": Sound("transforms.json", lambda folder: write_transforms(folder / "transforms.json", TINY),
                         check_cameras, scene=OF_CAMERAS),

@@ -50,7 +50,7 @@ def test_render_moves_the_cameras(moved_scene: Path, tmp_path: Path, run: Run) -
     photos = moved_scene / "images"
     for name, key in (("scene.ply", "before"), ("scene.compact.ply", "after")):
         outcome = run("render", moved_scene / name, "-o", tmp_path / key, "--json", code=0)
-        assert noted(json.loads(outcome.out)["notes"], "read as")
+        assert noted(json.loads(outcome.out)["notes"], "cameras are", "scaled")
         assert psnr(tmp_path / key, photos) == pytest.approx(expected[key], abs=0.2)
 
 

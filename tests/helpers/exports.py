@@ -103,8 +103,8 @@ def turned(rows: np.ndarray, turn: np.ndarray, *, scale: float = 1.0, shift: np.
     return out
 
 
-def with_surface_rotations(tiny: Tiny, *, relative_to_camera: bool = False) -> Tiny:
-    """Discs that lie in the surface, with rotations to the world or to each view's camera."""
+def with_surface_rotations(tiny: Tiny) -> Tiny:
+    """Discs that lie in the surface."""
     h, w = tiny.height, tiny.width
     grid = tiny.gaussians.means.astype(np.float64).reshape(-1, h, w, 3)
     across, down = np.gradient(grid, axis=2), np.gradient(grid, axis=1)
@@ -115,8 +115,6 @@ def with_surface_rotations(tiny: Tiny, *, relative_to_camera: bool = False) -> T
     first = across - (across * normal).sum(-1, keepdims=True) * normal
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     frames = np.stack([first, np.cross(normal, first), normal], -1)
-    if relative_to_camera:
-        frames = matmul(tiny.c2w[:, None, None, :3, :3].swapaxes(-1, -2), frames)
     quats = rotmat_to_quat(frames.reshape(-1, 3, 3)).astype(np.float32)
     scales = np.tile(np.array([0.04, 0.03, 0.005], np.float32), (len(quats), 1))
     return replace(tiny, gaussians=replace(tiny.gaussians, quats=quats, scales=scales))

@@ -196,7 +196,7 @@ def vica_splat(folder: Path) -> Export:
 def re_splat(folder: Path) -> Export:
     """Write ReSplat's: a grid of a quarter of the photos' size, degree 3, turned into the middle camera."""
     scene = made()
-    export = save_pixels(Saver("gaussians.ply", frame="middle", quats="camera", rest=45), scene, folder)
+    export = save_pixels(Saver("gaussians.ply", frame="middle", rest=45), scene, folder)
     larger = as_photos(scene, 4)
     write_images(folder / "input", larger)
     return replace(export, options=data_set(folder, larger, "cameras"))
@@ -356,7 +356,7 @@ SCRIPT = "point_clouds/000000_room/gaussians.ply"  # of the figure scripts of pi
 _UPRIGHT_SCRIPT = Saver(SCRIPT, "view-fastest", 8, frame="upright", raw=True)
 _BOTH, _SQUARE, _PAIR = ("cameras", "images"), (64, 64, 3), (64, 64, 2)
 _FULL = Saver("gaussians.ply", frame="camera", raw=True)
-_YONO = Saver("debug_info/room_gaussians.ply", "view-fastest", 8, raw=True, quats="camera", least=0.01)
+_YONO = Saver("debug_info/room_gaussians.ply", "view-fastest", 8, raw=True, least=0.01)
 _VIEWS_14 = Saver("output.ply", normals="", least=0.005)
 
 MODELS: dict[str, Callable[[Path], Export]] = {
@@ -379,17 +379,17 @@ MODELS: dict[str, Callable[[Path], Export]] = {
     "MVSplat's script": partial(dataset_model, _UPRIGHT_SCRIPT, _BOTH, _PAIR),
     "MVSplat's script with its far cut": partial(dataset_model, _UPRIGHT_SCRIPT, _BOTH, _PAIR, far=0.9),
     "pixelSplat": partial(
-        dataset_model, Saver("outputs/gaussians/run/010000.ply", layers=3, frame="upright", raw=True, quats="camera"),
+        dataset_model, Saver("outputs/gaussians/run/010000.ply", layers=3, frame="upright", raw=True),
         _BOTH, (48, 48, 2),
     ),
-    "pixelSplat's script": partial(dataset_model, replace(_UPRIGHT_SCRIPT, quats="camera"), _BOTH, _PAIR),
+    "pixelSplat's script": partial(dataset_model, _UPRIGHT_SCRIPT, _BOTH, _PAIR),
     "SPFSplat": spfsplat,
     "FreeSplat": free_splat,
     "NoPoSplat": partial(dataset_model, _FULL, ("images",), (48, 48, 2)),
     "NoPoSplat with the user's own photos": partial(dataset_model, _FULL, ("images",), (48, 48, 2), factor=2, border=8),
-    "Splatt3R": partial(dataset_model, replace(_FULL, quats="xyzw-root"), ("images",), (64, 48, 2)),
+    "Splatt3R": partial(dataset_model, _FULL, ("images",), (64, 48, 2)),
     "Splatt3R with the user's own photos": partial(
-        dataset_model, replace(_FULL, quats="xyzw-root"), ("images",), (64, 48, 2), factor=2
+        dataset_model, _FULL, ("images",), (64, 48, 2), factor=2
     ),
     "YoNoSplat": partial(dataset_model, _YONO, _BOTH, _SQUARE, faint=True),
     "YoNoSplat with the user's own photos": partial(dataset_model, _YONO, ("images",), _SQUARE, factor=2, border=8),

@@ -11,7 +11,7 @@ import numpy as np
 from exports import Smooth, export_rows, save_export, smooth_scene, turned, with_surface_rotations
 from tiny_scene import save_json, write_images, write_transforms
 
-from gsmerge.geometry import multiply_quats, normalize, rotmat_to_quat
+from gsmerge.geometry import normalize
 from gsmerge.kernels import elementary
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians, Scene
@@ -65,7 +65,6 @@ class Saver:
     layers: int = 1  # Gaussians per pixel
     frame: str = "same"
     raw: bool = False  # opacities as they are in place of logits
-    quats: str = "wxyz"
     rest: int = 0
     normals: str = "f4"
     least: float = 0.0  # opacity of the rows that it keeps
@@ -179,21 +178,13 @@ def pixel_rows(saver: Saver, scene: Smooth, keep: np.ndarray | None = None) -> E
 
 
 def finish_rows(saver: Saver, layered: Smooth, pixels: np.ndarray, world: World, scene: Smooth) -> Export:
-    """Make the rows of some Gaussians in a world, as a saver encodes opacities and rotations."""
+    """Make the rows of some Gaussians in a world, as a saver encodes opacities."""
     rows = export_rows(layered, pixels, rest=saver.rest, normals=saver.normals)
     rows = turned(rows, world.turn, scale=world.scale, shift=world.shift)
-    true = stored = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
-    if saver.quats == "camera":  # that of the view, turned with the world as if it were one to the world
-        size = scene.width * scene.height * saver.layers
-        turns = rotmat_to_quat(matmul(matmul(world.turn, scene.w2c[:, :3, :3]), world.turn.T))[pixels // size]
-        stored = multiply_quats(turns, true)
-    elif saver.quats == "xyzw-root":
-        stored = multiply_quats(true, true)[:, [1, 2, 3, 0]]
-    for i in range(4):
-        rows[f"rot_{i}"] = stored[:, i]
+    quats = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
     if saver.raw:
         rows["opacity"] = layered.gaussians.opacities[pixels]
-    truth = {"opacities": layered.gaussians.opacities[pixels], "quats": true}
+    truth = {"opacities": layered.gaussians.opacities[pixels], "quats": quats}
     return Export(Path(saver.place), scene, rows, world, pixels, **truth)
 
 
@@ -250,8 +241,8 @@ def check_cameras(scene: Scene, export: Export) -> None:
         assert np.abs(image - expected / 255).mean() < 0.02
 
 
-def check_pixels(scene: Scene, export: Export, *, quats: bool = True) -> None:
-    """Check that a scene has every row of a file at its pixel, with its opacity, and its rotation unless without."""
+def check_pixels(scene: Scene, export: Export) -> None:
+    """Check that a scene has every row of a file at its pixel, with its opacity and its rotation."""
     assert export.pixels is not None
     drawn = export.opacities >= 1 / 255
     assert scene.num_gaussians == int(drawn.sum())
@@ -260,5 +251,5 @@ def check_pixels(scene: Scene, export: Export, *, quats: bool = True) -> None:
     at_home = drawn & np.isclose(g.means, stored, rtol=1e-4, atol=1e-6).all(1)
     assert at_home.sum() > 0.999 * drawn.sum()
     assert np.abs(g.opacities - export.opacities)[at_home].max() < 1e-4
-    if quats and export.quats is not None:
+    if export.quats is not None:
         assert np.median(np.abs((g.quats * export.quats).sum(1))[at_home]) > 0.999

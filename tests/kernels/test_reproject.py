@@ -8,15 +8,7 @@ import pytest
 from gsmerge.geometry import motion_matrices, project_points
 from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.pictures import sample_bilinear
-from gsmerge.kernels.reproject import (
-    add_photo_errors,
-    follow_pixels,
-    linearise,
-    mark_pixels,
-    nearest_centres,
-    pixel_errors,
-    see_points,
-)
+from gsmerge.kernels.reproject import add_photo_errors, follow_pixels, linearise, mark_pixels, pixel_errors, see_points
 
 K = np.array([[300.0, 0, 150], [0, 310, 110], [0, 0, 1]])
 STEP = 1e-6
@@ -119,25 +111,6 @@ def test_points_are_seen_by_the_formula_bit_for_bit(seed: int) -> None:
     assert np.array_equal(seen, expected & (z <= behind * grid))
     assert 0.1 < seen.sum() / inside.sum() < 0.9
     assert 0.02 < inside.mean() < 0.5
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_nearest_centres_are_those_of_all_views(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    points, poses = rng.normal(0, 3, (400, 3)).astype(np.float32), make_poses(7, rng)
-    points[0], points[1] = np.nan, np.inf
-    ids, squares, seen = np.empty(400, np.int64), np.empty(400), np.empty(400, np.int32)
-    nearest_centres(points, poses, np.tile(K, (7, 1, 1)), ids, squares, seen, 300, 220)
-    places, shown = places_of(points, poses)
-    with np.errstate(invalid="ignore"):
-        cells = np.floor(places)
-        expected = np.where(shown, ((places - (cells + 0.5)) ** 2).sum(-1), np.inf)
-    assert np.array_equal(squares, expected.min(0))
-    assert np.array_equal(seen, shown.sum(0))
-    for i in np.flatnonzero(shown.any(0)):
-        view = expected[:, i].argmin()
-        assert ids[i] == (view * 220 + cells[view, i, 1]) * 300 + cells[view, i, 0]
-    assert (ids[~shown.any(0)] == -1).all()
 
 
 def longest_series(choices: list[list[int]]) -> int:

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from exports import smooth_scene
 from messages import noted, refuses
 from sweeps import sweep
@@ -93,18 +92,6 @@ def test_one_pose_without_turn_has_fewer_readings() -> None:
     assert [p.description for p in other_conventions(np.eye(4)[None], W2C_OPENCV)] == [
         "world-to-camera matrices with OpenGL axes"
     ]
-
-
-def test_two_readings_that_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = SMOOTH.save(tmp_path / "scene")
-    rewrite_poses(folder, SMOOTH, W2C_OPENCV)
-    true = other_conventions(SMOOTH.w2c, C2W_OPENGL)[0]
-    same = replace(true, viewmats=SMOOTH.w2c)
-    monkeypatch.setattr(
-        "gsmerge.alignment.match.other_conventions", lambda *_: [same, replace(same, convention=("another", "way"))]
-    )
-    with refuses(SceneError, "transforms.json", "world-to-camera", "OpenCV", "another"):
-        load_scene(folder, order="view-major", cameras=folder / "transforms.json")
 
 
 def test_rows_without_finite_positions_are_not_looked_at(tmp_path: Path, tiny: Tiny) -> None:

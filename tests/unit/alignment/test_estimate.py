@@ -36,13 +36,10 @@ def export(folder: Path, tiny: Smooth, kept: np.ndarray) -> Loaded:
     return load_scene(folder)
 
 
-def pixels_of(loaded: Loaded, count: int) -> np.ndarray:
+def pixels_of(loaded: Loaded) -> np.ndarray:
     """The pixel that each row was put to."""
     assert loaded.recovery is not None
-    layout, out = loaded.recovery.best.layout, np.full(count, -1)
-    for view, rows, pixels in zip(layout.views, layout.rows, layout.pixels, strict=True):
-        out[rows] = view * layout.width * layout.height + pixels
-    return out
+    return loaded.recovery.layout.pixel_ids()
 
 
 @sweep("fy", [171.5, 170.0])
@@ -50,14 +47,14 @@ def test_cameras_and_pixels_from_photos(tmp_path: Path, fy: float) -> None:
     tiny = textured(fy=fy)
     kept = da3_rows(tiny)
     loaded = export(tmp_path, tiny, kept)
-    assert (pixels_of(loaded, len(kept)) == kept).mean() > 0.999
+    assert (pixels_of(loaded) == kept).mean() > 0.999
     cameras = loaded.pixel_scene().cameras
     assert np.allclose(cameras.Ks[:, 0, 0], 170, rtol=0.01)
     assert np.allclose(cameras.Ks[:, 1, 1], fy, rtol=0.01)
     assert np.allclose(cameras.centres, tiny.c2w[:, :3, 3], atol=0.03)
     assert loaded.cameras is not None
     assert loaded.cameras.source == "estimated from the grid"
-    assert any("from the Gaussians' own order" in note for note in loaded.notes)
+    assert any("from the Gaussians' own grid" in note for note in loaded.notes)
     assert not any("resized" in note for note in loaded.notes)  # photos have the grid's size
     assert [exporter.name for exporter in loaded.exporters] == ["da3"]
     assert int((~loaded.scene.pixels.shown).sum()) == tiny.depths.size - len(kept)
@@ -71,18 +68,3 @@ def test_every_other_view(tmp_path: Path) -> None:
     loaded = export(tmp_path, tiny, np.concatenate(kept[::2]))
     assert loaded.scene.names == (tiny.names[0], tiny.names[2])
     assert np.allclose(loaded.scene.cameras.centres, tiny.c2w[::2, :3, 3], atol=0.03)
-
-
-@pytest.mark.parametrize(("step", "drops"), [(3, True), (2, False), (7, True)])
-def test_rows_of_every_nth_pixel(tmp_path: Path, step: int, drops: bool) -> None:
-    """Every n-th row dropped, or only every n-th one kept: the views have the photos' size, not a narrower one."""
-    tiny = textured()
-    ids = np.arange(tiny.depths.size)
-    kept = ids[(ids % step != 1) if drops else (ids % step == 0)]
-    loaded = export(tmp_path, tiny, kept)
-    shift = pixels_of(loaded, len(kept)) - kept
-    assert (shift == shift[0]).all()
-    assert abs(shift[0]) < step
-    assert loaded.pixel_scene().cameras.width == WIDTH
-    assert np.allclose(loaded.scene.cameras.Ks[:, (0, 1), (0, 1)], 170, rtol=0.01)
-    assert not any("resized" in note for note in loaded.notes)

@@ -8,11 +8,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from batches import touch
 from messages import refuses
-from tiny_scene import Tiny, write_npz
 
 from gsmerge.batch.find import find_scenes, main_file, scene_plys
 from gsmerge.errors import SceneError, UsageError
@@ -37,16 +35,6 @@ def test_what_is_no_scene_is_passed_by() -> None:
     touch("all/a.ply", "all/a.compact.ply", "all/a.compact.level1.ply", "all/.a-00112233.ply", "all/.hidden/b.ply")
     touch("all/points3D.ply", "all/c/scene.ply", "all/c/images/mask.ply", "all/input/d.ply")
     assert actual("all") == ["all/a.ply", "all/c", "all/input/d.ply"]
-
-
-def test_depth_maps_are_scenes(tiny: Tiny) -> None:
-    """Also beside a result that was made of them, or a point cloud; and a .ply of Gaussians goes before them."""
-    for name in ("a/results.npz", "b/predictions.npz", "c/predictions.npz", "d/results_output/frame_0.npz"):
-        write_npz(Path("all", name), tiny, depth=np.ones((3, tiny.height, tiny.width)))
-    touch("all/b/predictions.compact.ply", "all/b/points3D.ply", "all/c/x.ply")
-    Path("all/d/camera_poses.txt").touch()
-    assert actual("all") == ["all/a", "all/b", "all/c/x.ply", "all/d"]
-    assert actual("all/d/results_output") == ["all/d/results_output"]
 
 
 def test_a_scene_s_own_folders_are_no_scenes_of_their_own() -> None:

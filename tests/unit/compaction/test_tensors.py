@@ -14,7 +14,7 @@ from messages import noted, refuses
 from scenes import FIELDS, arc, make_scene, move, room
 
 from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate
-from gsmerge.geometry import multiply_quats, normalize, sh0_to_rgb
+from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels import elementary
 from gsmerge.scene.input import check_scene
 
@@ -125,7 +125,6 @@ WRONG: list[tuple[str, Change, list[object]]] = [
     ("scales", elementary.log, ["100 %", "scales.exp()"]),
     ("opacities", lambda o: elementary.log(o / (1 - o)), ["[0, 1]", "torch.sigmoid(opacities)"]),
     ("quats", lambda q: 3 * q, ["wxyz", "100 %", "3 to 3"]),
-    ("quats", lambda q: q[:, [1, 2, 3, 0]], ["quats[:, [3, 0, 1, 2]]"]),
     ("quats", lambda q: q[:, :3], ["[n, 4]", [5184, 3]]),
     ("viewmats", invert, ["camera-to-world", "OpenCV", "inverse"]),
     ("viewmats", flip, ["world-to-camera", "OpenGL", "row"]),
@@ -204,35 +203,10 @@ def test_wrong_sizes_are_named(scene: Scene) -> None:
         compact_tensors(**tensors_of(scene), order="layers", **FAST)
 
 
-def test_rotations_may_be_left_unchecked(scene: Scene) -> None:
-    given = changed(scene, "quats", lambda q: q[:, [1, 2, 3, 0]])
-    notes = compact_tensors(**given, check_rotations=False, **FAST).report.notes
-    signed = changed(scene, "quats", lambda q: (q * np.where(q[:, :1] < 0, -1, 1))[:, [1, 2, 3, 0]])
-    warned = compact_tensors(**signed, check_rotations=False, **FAST).report.notes
-    assert [noted(some, "w", "last") for some in (notes, warned)] == [
-        bool((scene.gaussians.quats[:, 0] >= 0).all()), True
-    ]  # fmt: skip
-
-
-def test_a_last_column_that_is_never_negative_decides_with_rough_surfaces(scene: Scene) -> None:
-    """Surfaces alone would not: other readings follow them by less than .15 worse."""
-    tilt = np.random.default_rng(0).normal(size=(len(scene.gaussians), 3)) * np.deg2rad(45) / 2
-    off = normalize(np.concatenate([np.ones((len(tilt), 1)), tilt], 1)).astype(np.float32)
-    rough = multiply_quats(off, scene.gaussians.quats)
-    signed = rough * np.where(rough[:, :1] < 0, -1, 1)
-    with refuses(SceneError, "quats", "quats[:, [3, 0, 1, 2]]"):
-        compact_tensors(**tensors_of(scene, quats=signed[:, [1, 2, 3, 0]]), **FAST)
-    for fine in (-signed[:, [1, 2, 3, 0]], signed, rough * np.where(rough[:, 3:] < 0, -1, 1)):
-        compact_tensors(**tensors_of(scene, quats=fine), **FAST)
-
-
-def test_w_first_with_a_last_column_that_is_never_negative_gets_no_note(scene: Scene) -> None:
-    """As Depth Anything 3 has it; without pixels it takes the caller's word."""
-    signed = changed(scene, "quats", lambda q: q * np.where(q[:, 3:] < 0, -1, 1))
-    assert signed["quats"][:, 0].min() < 0
-    given = [(True, {}), (False, {}), (False, {"order": "none"}), (True, {"order": "none"})]
-    notes = [compact_tensors(**signed, check_rotations=check, **more, **FAST).report.notes for check, more in given]
-    assert [noted(some, "w", "last") for some in notes] == [False, False, False, True]
+def test_quaternions_whose_last_column_is_never_negative_get_a_note(scene: Scene) -> None:
+    last = changed(scene, "quats", lambda q: (q * np.where(q[:, :1] < 0, -1, 1))[:, [1, 2, 3, 0]])
+    notes = [compact_tensors(**given, **FAST).report.notes for given in (last, tensors_of(scene))]
+    assert [noted(some, "w", "last") for some in notes] == [True, False]
 
 
 def test_cameras_stay_where_they_fit(scene: Scene) -> None:

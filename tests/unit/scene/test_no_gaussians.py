@@ -44,19 +44,19 @@ def leave(folder: Path, tiny: Tiny, name: str) -> None:
 @pytest.mark.parametrize(
     ("left", "found", "said"),
     [
-        (("exports/npz/results.npz", "scene.glb"), "exports/npz/results.npz", ("depth maps", "infer_gs=True")),
+        (("exports/npz/results.npz", "scene.glb"), "exports/npz/results.npz", ("npz-gs_ply", "infer_gs=True")),
         (("exports/mini_npz/results.npz",), "exports/mini_npz/results.npz", ("npz-gs_ply", "giant")),
         (("scene.glb", "scene.jpg"), "scene.glb", ("Depth Anything 3", "npz-gs_ply")),
         (("results.npz",), "results.npz", ("Depth Anything 3", "npz-gs_ply")),
-        (("sparse/cameras.bin", "sparse/points.ply"), "sparse/points.ply", ("MapAnything", "predictions.npz")),
-        (("predictions.npz", "glbscene_50.glb"), "glbscene_50.glb", ("VGGT", "intrinsic")),
+        (("sparse/cameras.bin", "sparse/points.ply"), "sparse/points.ply", ("MapAnything", "--cameras")),
+        (("predictions.npz", "glbscene_50.glb"), "glbscene_50.glb", ("VGGT", "--cameras")),
         (("sparse/0/cameras.bin",), "sparse/0/cameras.bin", ("COLMAP", "--cameras")),
         (("cameras.bin",), "cameras.bin", ("COLMAP", "--cameras")),
         (("cfg.yml", "ckpts/ckpt_29999_rank0.pt"), "ckpts/ckpt_29999_rank0.pt", ("gsplat", "save_ply")),
         (("config.yml", "nerfstudio_models/step-000029999.ckpt"), "nerfstudio_models", ("ns-export",)),
         (("pred.npz",), "pred.npz", ("FLARE",)),
-        (("camera_poses.txt", "pcd/0_pcd.ply"), "camera_poses.txt", ("DA3-Streaming", "save_depth_conf_result")),
-        (("output.glb",), "output.glb", ("depth", "Depth Anything 3")),
+        (("camera_poses.txt", "pcd/0_pcd.ply"), "camera_poses.txt", ("DA3-Streaming", "--cameras")),
+        (("output.glb",), "output.glb", ("points", "--cameras")),
         (("mesh.ply",), "mesh.ply", ("points", "name")),
         (("notes.txt",), "photos", ("Depth Anything 3", "AnySplat")),
     ],
@@ -82,10 +82,10 @@ def test_a_folder_without_gaussians(
     ("name", "said"),
     [
         ("results.npz", ("Depth Anything 3", "npz-gs_ply")),
-        ("predictions.npz", ("VGGT", "extrinsic")),
-        ("any.npz", ("depth", "Depth Anything 3")),
+        ("predictions.npz", ("VGGT", "--cameras")),
+        ("any.npz", ("points", "--cameras")),
         ("scene.glb", ("Depth Anything 3", "infer_gs=True")),
-        ("OUTPUT.GLB", ("depth", "Depth Anything 3")),
+        ("OUTPUT.GLB", ("points", "--cameras")),
     ],
 )
 def test_a_file_that_holds_no_gaussians(tmp_path: Path, tiny: Tiny, name: str, said: tuple[str, ...]) -> None:
@@ -94,24 +94,6 @@ def test_a_file_that_holds_no_gaussians(tmp_path: Path, tiny: Tiny, name: str, s
         write_points_glb(tmp_path / name)
     with refuses(SceneError, name, "Gaussians", *said):
         find_scene_files(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    ("arrays", "lacks"),
-    [
-        (("depth", "c2w", "images"), "add K to"),
-        (("depth", "K", "images"), "add c2w to"),
-        (("depth", "c2w"), "add K and images to"),
-        (("depths", "extrinsic"), "add intrinsics to"),
-        (("depth", "image"), "add extrinsics and intrinsics to"),
-    ],
-)
-def test_what_depth_maps_lack_is_named(tmp_path: Path, arrays: tuple[str, ...], lacks: str) -> None:
-    np.savez(tmp_path / "views.npz", **dict.fromkeys(arrays, np.zeros(1)))
-    for path in (tmp_path, tmp_path / "views.npz"):
-        with refuses(SceneError, path) as raised:
-            find_scene_files(path)
-        assert lacks in str(raised.value)
 
 
 @pytest.mark.parametrize("ending", [".spz", ".sog", ".splat", ".glb"])

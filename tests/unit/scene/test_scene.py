@@ -126,14 +126,14 @@ def test_rows_with_nan_keep_the_order(tmp_path: Path, tiny: Tiny) -> None:
     assert not scene.pixels.shown[1, 1, 1]  # 301 = 280 + 20 + 1
 
 
-def test_views_in_the_order_of_their_names(tiny_folder: Path, tiny: Tiny) -> None:
+def test_rows_in_the_order_of_the_names_of_views(tiny_folder: Path, tiny: Tiny) -> None:
+    """2, 10, 11: numbers, not letters; cameras are in another order."""
     rewrite(tiny_folder / "transforms.json", lambda data: data["frames"].reverse())
-    loaded = load_scene(tiny_folder)
-    assert loaded.scene.names == tuple(f"images/{n}" for n in tiny.names)  # 2, 10, 11: numbers, not letters
-    assert loaded.cameras.names == loaded.scene.names
-    assert np.allclose(loaded.scene.cameras.viewmats, tiny.w2c)
-    assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)
-    assert loaded.notes == ("views are in the order of the image names, not of the camera file",)
+    scene = load_scene(tiny_folder).pixel_scene()
+    assert scene.names == tuple(f"images/{n}" for n in tiny.names[::-1])
+    assert np.allclose(scene.cameras.viewmats, tiny.w2c[::-1])
+    assert np.array_equal((scene.images * 255).round(), tiny.images[::-1])
+    assert np.array_equal(scene.gaussians.means.reshape(3, -1), tiny.gaussians.means.reshape(3, -1)[::-1])
 
 
 def test_cameras_of_a_resized_image_are_scaled(tiny_folder: Path, tiny: Tiny) -> None:
@@ -186,7 +186,7 @@ def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder
     strange = tiny.c2w.copy()
     strange[:, :3, 3] += np.array([[0.3], [-0.2], [0.4]])
     write_transforms(tiny_folder / "transforms.json", replace(tiny, c2w=strange))
-    with refuses(SceneError, "transforms.json", "median", "1.5 px", "convention"):
+    with refuses(SceneError, "scene.ply", "as far from the photos", "--cameras none"):
         read_scene(tiny_folder, order="view-major", cameras=tiny_folder)
 
 

@@ -148,18 +148,6 @@ def test_photos_are_undistorted_and_it_is_said(tmp_path: Path, kind: str) -> Non
     assert after < 0.4 * before
 
 
-def test_larger_photos_are_undistorted_and_resized(tmp_path: Path) -> None:
-    large = replace(SMOOTH, images=np.stack([cv2.resize(i, (120, 90), interpolation=cv2.INTER_CUBIC)
-                                             for i in SMOOTH.images]))  # fmt: skip
-    SMOOTH.save(tmp_path, cameras=False, images=False)
-    write_images(tmp_path / "images", large)
-    twice = replace(SMOOTH, K=np.diag([2.0, 2, 1]) @ SMOOTH.K, width=120, height=90)
-    as_transforms(tmp_path, twice, [0.0, 0.0, 0.0, 1e-5])
-    loaded = load_scene(tmp_path)
-    assert np.allclose(loaded.pixel_scene().cameras.Ks, SMOOTH.K)
-    assert len(loaded.notes) == 2
-
-
 def test_no_photos_or_others_are_refused(tmp_path: Path) -> None:
     SMOOTH.save(tmp_path, cameras=False, images=False)
     as_transforms(tmp_path, SMOOTH, [0.1, 0, 0, 0])
