@@ -26,7 +26,7 @@ def seconds(views: int = 12, *, fit_steps: int = 240, num_drawn: float = 0.3 * V
 
 def test_more_work_takes_longer() -> None:
     none = seconds(fit="none", checkpoint="none")
-    assert none < seconds(fit="none") < seconds(fit="none", checkpoint="none", segmentation="slic")
+    assert none < seconds(fit="none") < seconds(fit="none", checkpoint="none", method="greedy")
     assert none < seconds(fit_steps=55) < seconds() < seconds(fit_steps=1000)
     assert seconds(24, fit="none") == pytest.approx(2 * seconds(12, fit="none"))
     assert seconds(method="voxel") < seconds() < seconds(method="unmerged-fit", num_drawn=12 * VIEW)

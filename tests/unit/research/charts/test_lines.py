@@ -30,11 +30,11 @@ def test_lines_are_methods_with_their_settings() -> None:
 def test_names_tell_only_what_differs() -> None:
     records = [
         make_record("fern", "gsmerge", {"k": 2, "effort": "fast"}),
-        make_record("fern", "gsmerge", {"k": 2, "effort": "best", "segmentation": "slic"}),
+        make_record("fern", "gsmerge", {"k": 2, "effort": "best", "segmentation": "bass"}),
         make_record("fern", "voxel"),
     ]
     names = line_names([line_key(r) for r in records])
-    assert list(names.values()) == ["gsmerge, effort fast", "gsmerge, effort best, slic", "voxel"]
+    assert list(names.values()) == ["gsmerge, effort fast", "gsmerge, effort best, bass", "voxel"]
     alone = line_names([line_key(records[0])])
     assert list(alone.values()) == ["gsmerge, effort fast, K = 2"]
 
