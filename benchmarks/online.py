@@ -31,7 +31,7 @@ from shared_scenes import Targets, export, read_held_out, scene_folders
 
 from gsmerge import Compactor, Gaussians, read_scene
 from gsmerge.measure.lpips import INSTALL, lpips_available
-from gsmerge.measure.speed import measure_costs
+from gsmerge.measure.speed import time_render
 
 KS = (1, 2, 4)  # Gaussians of each group
 NAIVE = "naive"
@@ -107,13 +107,12 @@ def measure(plys: Sequence[Path], targets: Targets, settings: dict[str, Any]) ->
             ways = {f"K = {k}": compactor.decode(k=k) for k in KS}
             step |= {way: len(gaussians) for way, gaussians in ways.items()}
     ways = {NAIVE: Gaussians.concat([read_scene(ply).gaussians for ply in plys]), **ways}
-    costs = measure_costs(ways, targets.cameras, (1,), NEAR)
     ends = {}
     for way, gaussians in ways.items():
         scores = (*score(gaussians, targets, lpips_available("vgg")), float("nan"))[:3]
         shares = {"count": len(gaussians), "share": 100 * len(gaussians) / len(ways[NAIVE])}
-        frames = {"frames": 1 / costs[way]["speeds"][0]["seconds"], "overdraw": costs[way]["overdraw"]}
-        ends[way] = shares | dict(zip(QUALITY, scores, strict=True)) | frames
+        seconds = [time_render(gaussians, targets.cameras[[view]], NEAR) for view in range(len(targets.cameras))]
+        ends[way] = shares | dict(zip(QUALITY, scores, strict=True)) | {"frames": 1 / float(np.median(seconds))}
     return growth, ends
 
 
@@ -137,8 +136,8 @@ def end_table(ends: dict[str, dict[str, Figures]]) -> str:
         for way, end in ways.items():
             quality = [f"{end[name]:.{digits}f}" for name, digits in zip(QUALITY, (2, 3, 3), strict=True)]
             counts = [f"{end['count']:,.0f}", f"{end['share']:.1f}%"]
-            rows.append([scene, way, *counts, *quality, f"{end['frames']:.3g}", f"{end['overdraw']:.1f}"])
-    return make_table(["scene", "way", "Gaussians", "share", *QUALITY, "frames a second", "overdraw"], rows)
+            rows.append([scene, way, *counts, *quality, f"{end['frames']:.3g}"])
+    return make_table(["scene", "way", "Gaussians", "share", *QUALITY, "frames a second"], rows)
 
 
 def draw(growth: Growth, path: Path) -> None:
