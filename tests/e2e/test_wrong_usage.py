@@ -88,7 +88,7 @@ USAGE = {
     "render room -o sheet.xyz": "sheet.xyz*.png*folder",
     "render room -o a.gif --size 1920": "--size*1920x1080",
     "render room -o a.gif --size 1920x8": "--size*16 to 16384",
-    "render room --path spiral -o a.mp4": "--path spiral*orbit*turntable*spline",
+    "render room --path spiral -o a.mp4": "--path spiral*orbit*spline",
     "render room --path orbit:120 -o a.mp4": "path, orbit*'120'",
     "render room --path orbit -o a.png": "a.png*.gif*--path",
     "render room --path orbit --frames 1 -o a.mp4": "--frames*2",
