@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import BeforeAfter, lpips_networks, read_before_after
 from gsmerge.cli.console import print_document, say_notes, stage_progress, terminal_columns
-from gsmerge.cli.paths import check_folder, check_outputs, check_replaced, input_files, write_texts
+from gsmerge.cli.paths import check_outputs, check_replaced, input_files, write_texts
 from gsmerge.errors import UsageError
 from gsmerge.frozen import dataclass
 from gsmerge.settings.evaluate import EvaluateOptions
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from gsmerge.pages.data import Stills
 
 PAGE = ".html"
-SUFFIXES = (".json", ".csv", ".md", PAGE)
-SPEED_ZOOMS = (1.0, 2.0)  # picture sizes for render times, unless `zoom` is given
+SUFFIXES = (".json", ".csv", PAGE)
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,6 @@ class MeasuringOptions(Settings):
         "held-out views midway between them are the targets.", least=1)  # fmt: skip
     masks: str | None = setting(None, "Folder of masks with the names of the photos, dark where a photo does not "
         "count.")  # fmt: skip
-    speed: bool = setting(False, "Also measure the render time, at the sizes of `zoom` or at 1 and 2, and the "
-        "Gaussians per pixel.")  # fmt: skip
 
 
 @opt.command(
@@ -42,13 +39,11 @@ class MeasuringOptions(Settings):
     opt.AFTER,
     f"{opt.READING} {opt.TARGETS}",
     "lpips",
-    opt.settings_option(EvaluateOptions, MeasuringOptions, example="context=false, photo_side=476 or speed=true"),
+    opt.settings_option(EvaluateOptions, MeasuringOptions, example="context=false or photo_side=476"),
     *opt.panel(
         opt.OUTPUT,
-        opt.option("output", list[Path], "File to write: .json, .csv (a row for each result and view), .md, or .html "
+        opt.option("output", list[Path], "File to write: .json, .csv (a row for each result and view), or .html "
                    "(the page of gsmerge view with these scores); may be repeated.", "--output", "-o"),
-        opt.option("maps", Path, "Folder for a picture of each result and view: photo, result, and a map of the likely "
-                   "error of new views, estimated by the photos of other views.", metavar="DIR"),
     ),
 )  # fmt: skip
 def evaluate(args: opt.Args) -> None:
@@ -60,11 +55,9 @@ def evaluate(args: opt.Args) -> None:
         raise UsageError("context=false: expected held-out views to measure instead; name them with --targets")
     args.views, args.masks = measuring.views, None if measuring.masks is None else opt.named_or_none(measuring.masks)
     files, outputs = args.files(args.before), args.output or []
-    if args.quiet and not (outputs or args.json or args.maps):
-        raise UsageError("--quiet: expected -o, --maps or --json with it, since otherwise nothing is shown or written")
+    if args.quiet and not (outputs or args.json):
+        raise UsageError("--quiet: expected -o or --json with it, since otherwise nothing is shown or written")
     _check_files(args, outputs, input_files(files))
-    if args.maps is not None:
-        check_folder(args.maps, tuple(input_files(files)), overwrite=True)
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
     from gsmerge.measure.scores import evaluation_document, evaluation_lines
     from gsmerge.pages.data import still_keeper
@@ -72,10 +65,6 @@ def evaluate(args: opt.Args) -> None:
     with stage_progress(quiet=args.silent) as progress:
         progress("read", 0, 0)
         pair = read_before_after(args, files)
-    if args.maps is not None:
-        from gsmerge.measure.error_maps import require_photos
-
-        require_photos(pair.scene, pair.load.files.ply)
     notes = [*pair.notes, *lpips_notes]
     if pair.plys and len(pair.scene) < len(pair.load.scene):
         notes.append(
@@ -88,14 +77,9 @@ def evaluate(args: opt.Args) -> None:
         evaluation = evaluate_scene(
             pair.scene, pair.gaussians, pair.held_out, options, cameras=pair.cameras, progress=progress, **hooks
         )
-        facts = _facts(pair, options, measuring)
-    document = evaluation_document(evaluation, facts, notes)
+    document = evaluation_document(evaluation, _facts(pair), notes)
     _write(outputs, document, pair, evaluation, stills)
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
-    document["maps"] = []
-    if args.maps is not None:
-        document["maps"] = [str(path) for path in _write_maps(args.maps, pair, context=options.context)]
-        lines.append(f"maps: {len(document['maps'])} pictures in {args.maps}")
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     say_notes(evaluation.notes, evaluation.doubts, quiet=args.silent)
 
@@ -109,35 +93,25 @@ def _check_files(args: opt.Args, outputs: Sequence[Path], inputs: Sequence[Path]
     check_replaced(outputs)
 
 
-def _facts(pair: BeforeAfter, options: EvaluateOptions, measuring: MeasuringOptions) -> dict[str, dict[str, Any]]:
-    """Collect facts about each file by name, with the cost of rendering if requested."""
-    from gsmerge.measure.evaluate import INPUT, near_plane
-    from gsmerge.measure.sizes import shrink_cameras
-    from gsmerge.measure.speed import measure_costs
+def _facts(pair: BeforeAfter) -> dict[str, dict[str, Any]]:
+    """Collect facts about each file by name."""
+    from gsmerge.measure.evaluate import INPUT
 
     infos = {INPUT: pair.load.info, **{name: ply.info for name, ply in pair.plys.items()}}
-    facts: dict[str, dict[str, Any]] = {
+    return {
         name: {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
         for name, info in infos.items()
     }
-    if measuring.speed:
-        scenes = {INPUT: pair.scene.file_gaussians, **pair.gaussians}
-        cameras = shrink_cameras(pair.scene.cameras, options.photo_side)
-        zooms = SPEED_ZOOMS if options.zoom == EvaluateOptions().zoom else options.zoom
-        near = near_plane(pair.scene)
-        costs = measure_costs(scenes, cameras, zooms, near, threads=options.threads)
-        facts = {name: facts[name] | costs[name] for name in facts}
-    return facts
 
 
 def _write(
     outputs: Sequence[Path], document: Mapping[str, Any], pair: BeforeAfter, evaluation: Evaluation, stills: Stills
 ) -> None:
     """Write the reports, each in the format of its ending."""
-    from gsmerge.measure.scores import evaluation_csv, evaluation_markdown
+    from gsmerge.measure.scores import evaluation_csv
     from gsmerge.report import to_json
 
-    writers = {".json": to_json, ".csv": evaluation_csv, ".md": evaluation_markdown}
+    writers = {".json": to_json, ".csv": evaluation_csv}
     texts: dict[Path, str | bytes] = {}
     texts |= {path: writers[path.suffix](document) for path in outputs if path.suffix in writers}
     if stills:
@@ -150,23 +124,3 @@ def _write(
         )
         texts |= {path: view_page(data) for path in outputs if path not in texts}
     write_texts(texts, overwrite=True)
-
-
-def _write_maps(folder: Path, pair: BeforeAfter, *, context: bool) -> list[Path]:
-    """Write a sheet of each result and view into a folder, named after both; return the paths."""
-    from gsmerge.measure.drawings import picture_stems
-    from gsmerge.measure.error_maps import draw_sheets
-    from gsmerge.measure.evaluate import INPUT
-    from gsmerge.measure.preview import save_picture
-
-    views = picture_stems([*pair.scene.names, *(() if pair.held_out is None else pair.held_out.names)])
-    results, paths = pair.gaussians or {INPUT: pair.scene.file_gaussians}, list[Path]()
-    stems = dict(
-        zip(results, picture_stems([Path(name).with_suffix(".png").as_posix() for name in results]), strict=True)
-    )
-    sheets = draw_sheets(pair.scene, results, pair.held_out, pair.cameras, context=context)
-    for name, view, sheet in sheets:
-        paths.append(folder / f"{stems[name]}.{views[view]}.map.png")
-        folder.mkdir(parents=True, exist_ok=True)
-        save_picture(paths[-1], sheet)
-    return paths

@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from gsmerge.budget import largest_count
 from gsmerge.compaction.costs import RunCosts, expected_parts, mean_inside
 from gsmerge.compaction.files import Outputs, check_cameras, sized
 from gsmerge.compaction.make_plan import load_networks
@@ -51,7 +50,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     choices = choose_for_scene(size, options)
     limits, settings = choices.limits, choices.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)
-    max_count = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
+    max_count = pixels if options.method.startswith("unmerged") else limits.count or limits.default
     count = min(scene.num_gaussians or pixels, max_count)
     at_once, num_rest = gaussians_at_once(pixels, choices.blocks), 3 * scene.gaussians.shN.shape[1]
     drawn = pixels if options.method == "unmerged-fit" else count

@@ -43,11 +43,6 @@ class PhotoOffsets:
         return int((self.distances <= self.tolerance).sum())
 
     @property
-    def num_displaced(self) -> int:
-        """Number of parts out of their places."""
-        return len(self.offsets) - self.num_in_place
-
-    @property
     def num_moved_together(self) -> int:
         """Largest number of displaced parts with about the same offset."""
         displaced = self.offsets[self.distances > self.tolerance]
@@ -57,13 +52,11 @@ class PhotoOffsets:
     def verdict(self) -> bool | None:
         """True if the photo was taken from the view, False if it was taken from elsewhere, None in doubt.
 
-        The photo was taken from the view if more parts are in place than moved together. It was taken from elsewhere if
-        more parts are displaced than in place. Both differences must exceed the standard error of a fair coin.
+        The photo was taken from the view if more parts are in place than moved together, and from elsewhere if fewer
+        are. The difference must exceed the standard error of a fair coin.
         """
-        in_place, displaced, together = self.num_in_place, self.num_displaced, self.num_moved_together
-        if in_place - together > np.sqrt(in_place + together):
-            return True
-        return False if displaced - in_place > np.sqrt(displaced + in_place) else None
+        in_place, together = self.num_in_place, self.num_moved_together
+        return in_place > together if abs(in_place - together) > np.sqrt(in_place + together) else None
 
 
 def correlate_parts(shown: ViewPictures, view: int, photo: np.ndarray) -> np.ndarray:

@@ -28,7 +28,6 @@ from gsmerge.evidence.colors import (
     tone_blocks,
 )
 from gsmerge.evidence.pictures import SIDE, Pairs, ViewPictures, pair_photos, show_views
-from gsmerge.evidence.rays import find_on_rays
 from gsmerge.evidence.scores import stands_out
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
@@ -141,14 +140,11 @@ def find_matching_views(
 
     assigner = Assigner(show, candidates)
     confirmed_photos, _ = assigner.confirm(range(len(ids)), exact=True)
-    is_confirmed, on_rays = np.array([photo is not None for photo in confirmed_photos]), np.zeros(len(ids), bool)
-    if not is_confirmed.all():
-        on_rays = find_on_rays(scene, ids, [photos[view] for view in ids])
-    if not (assigner.match_together(confirmed_photos) or on_rays.any()):
+    if not assigner.match_together(confirmed_photos):
         return []
     # views without contrast cannot be compared, so they count as matching
-    is_matching = is_confirmed | on_rays | ~np.asarray(assigner.has_contrast, bool)
-    matching = {kinds[view] for view, matches in zip(ids, is_matching, strict=True) if matches}
+    rows = zip(ids, confirmed_photos, assigner.has_contrast, strict=True)
+    matching = {kinds[view] for view, photo, has_contrast in rows if photo is not None or not has_contrast}
     return [view for view in views if kinds[view] in matching]
 
 

@@ -7,12 +7,9 @@ these Gaussians, leave them out, or show them faintly.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from gsmerge.frame import scene_frame
-from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.composite import list_contributions
 from gsmerge.raster.photos import blank_photos
@@ -22,8 +19,6 @@ from gsmerge.types import Cameras, Gaussians, make_scene
 
 LEAST = FitOptions().min_contribution  # a view shows a Gaussian from this blending weight in a pixel on, as in a fit
 LEVEL, SIDE = 2, 480  # pictures are smaller by at least this factor, as in a fit's survey; largest side of pictures
-# Colours (sRGB) of Gaussians that no view or one view shows, and the weight of these colours; others keep their own
-TINTS, TINT = {0: (230, 40, 40), 1: (255, 190, 0)}, 0.7
 
 
 def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
@@ -49,13 +44,3 @@ def count_views_in_world(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """Count the views that show each of n Gaussians in their own world, ``[n]`` int32; there is at least one view."""
     frame = scene_frame(make_scene(gaussians, cameras))
     return count_views(frame.enter(gaussians), frame.enter_cameras(cameras))
-
-
-def tint(gaussians: Gaussians, counts: np.ndarray) -> Gaussians:
-    """Tint the Gaussians that one view or no view shows, by the ``counts [n]`` of :func:`count_views`."""
-    sh0, shN = gaussians.sh0.copy(), gaussians.shN.copy()
-    for count, color in TINTS.items():
-        rows = counts == count
-        own = (1 - TINT) * sh0_to_rgb(sh0[rows])
-        sh0[rows], shN[rows] = rgb_to_sh0(own + TINT * np.array(color, np.float32) / 255), 0
-    return replace(gaussians, sh0=sh0, shN=shN)

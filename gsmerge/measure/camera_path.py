@@ -18,11 +18,11 @@ from gsmerge.geometry import (
     step_outside,
 )
 from gsmerge.kernels.elementary import arctan2, cos, sin
-from gsmerge.kernels.matrices import matmul, solve
+from gsmerge.kernels.matrices import matmul
 from gsmerge.measure.fog import CAMERAS
 from gsmerge.types import Cameras
 
-PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline|turntable)(?:,back:(?P<back>[^,]*))?")
+PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*))?")
 MAX_TURN, MAX_BACK = 90.0, 10.0  # degrees to each side of an orbit; shares of the depth
 CURVE_PIECES = 64  # straight pieces between two cameras; the length of a curve is measured along them
 ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
@@ -40,7 +40,7 @@ class CameraPath:
     """Path of a camera for a video.
 
     Args:
-        kind: "orbit", "spline" or "turntable".
+        kind: "orbit" or "spline".
         turn: Degrees that an orbit turns to each side; None: by the scene's cameras, see :func:`orbit`.
         back: Distance behind the path, as a share of the viewing depth.
     """
@@ -57,7 +57,7 @@ def parse_path(text: str) -> CameraPath | None:
         ValueError: If the text begins with the kind of a path but is no path, or if a number is out of range.
     """
     kind = re.split("[:,]", text, maxsplit=1)[0]
-    if kind not in ("orbit", "spline", "turntable"):
+    if kind not in ("orbit", "spline"):
         return None
     match = PATH.fullmatch(text)
     if match is None:
@@ -97,8 +97,7 @@ def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) ->
         raise ValueError(f"frames: expected at least 2, got {count}")
     if path.kind == "spline":
         return spline(step_back(cameras, depth, path.back), (1 + path.back) * depth, count)
-    placed = turntable(cameras, depth, count) if path.kind == "turntable" else orbit(cameras, depth, count, path.turn)
-    return step_back(placed, depth, path.back)
+    return step_back(orbit(cameras, depth, count, path.turn), depth, path.back)
 
 
 def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
@@ -154,52 +153,6 @@ def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None)
     angles = np.linspace(0, 2 * np.pi, ORBIT_PIECES + 1)
     even = _at_equal_steps(camera_centres(turn_middle(angles)), angles, np.arange(count) / count)
     return replace(cameras[[middle] * count], viewmats=turn_middle(even))
-
-
-def turntable(cameras: Cameras, depth: float, count: int) -> Cameras:
-    """Turn once about the centre of the scene, which stays in the middle of the picture, with a level horizon.
-
-    Height and distance are the medians over the cameras. The first frame is on the side of the middle camera.
-    Frames are evenly spaced and form a loop.
-    """
-    middle, up, towards = _axis(cameras, depth)
-    offsets = camera_centres(cameras.viewmats) - middle
-    heights = (offsets * up).sum(1)
-    radius = max(float(np.median(_lengths(offsets - heights[:, None] * up))), MIN_RADIUS * depth)
-    angles = 2 * np.pi * np.arange(count)[:, None] / count
-    eyes = radius * (cos(angles) * towards + sin(angles) * np.cross(up, towards)) + np.median(heights) * up
-    forward = normalize(-eyes)
-    right = normalize(np.cross(forward, up))
-    rotations = np.stack([right, np.cross(forward, right), forward], 1)
-    return replace(cameras[[median_camera(cameras)] * count], viewmats=_viewmats(rotations, middle + eyes))
-
-
-def turned_degrees(cameras: Cameras, depth: float) -> float:
-    """Measure the smallest arc of a :func:`turntable`, in degrees, that contains all cameras."""
-    middle, up, towards = _axis(cameras, depth)
-    offsets = camera_centres(cameras.viewmats) - middle
-    angles = np.sort(arctan2((offsets * np.cross(up, towards)).sum(1), (offsets * towards).sum(1)))
-    gaps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
-    return float(np.degrees(2 * np.pi - gaps.max()))
-
-
-def _axis(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the axis of a turntable: a point on it, its upward direction, and a level direction, ``[3]`` each.
-
-    The point is the median of the points ``depth`` in front of the cameras. Up is the mean of the cameras' upward
-    directions; if the cameras turn, it is made perpendicular to their horizons. The level direction points backwards
-    from the middle camera.
-    """
-    axes = cameras.viewmats[:, :3, :3].astype(np.float64)
-    middle = lower_median(camera_centres(cameras.viewmats) + depth * axes[:, 2])
-    right, down, forward = axes[median_camera(cameras)]
-    rights = axes[:, 0]
-    # Add a little of the middle camera's up, since the directions of all may cancel each other
-    mean_up = -axes[:, 1].mean(0) - SAME * down
-    up = normalize(solve(matmul(rights.T, rights) / len(axes) + LEVEL * np.eye(3), mean_up))
-    back = (forward * up).sum() * up - forward
-    # The middle camera may look straight down
-    return middle, up, normalize(back if _lengths(back) > MIN_LEVEL else np.cross(right, up))
 
 
 def spline(cameras: Cameras, depth: float, count: int) -> Cameras:

@@ -22,24 +22,18 @@ from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_output
 from gsmerge.io.image_names import CLIP_ENDS
 from gsmerge.kernels.elementary import sin
-from gsmerge.measure.preview import BLUE_FIRST, FACE, Picture, shorten_text
+from gsmerge.measure.preview import FACE, Picture, shorten_text
 from gsmerge.settings.pictures import GIF
 from gsmerge.types import StrPath
 
 # Code and name of the encoders for each ending; the first encoder that OpenCV has is used. Browsers play all but
 # MPEG-4. VP8 takes a third of the time of VP9 and 1.6 times the space.
 ENCODERS = {".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")), ".webm": (("VP80", "VP8"), ("VP90", "VP9"))}
-# Name, encoder, container and options of the program ffmpeg by the number of channels. Nearly every program plays
-# H.264; browsers and editors read the alpha of VP9
-BY_FFMPEG = {
-    3: ("H.264", "libx264", "mp4", (
-        "-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709",  # as players expect of large frames
-        "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
-    )),
-    4: ("VP9 with alpha", "libvpx-vp9", "webm", (
-        "-crf", "24", "-b:v", "0", "-pix_fmt", "yuva420p", "-deadline", "realtime", "-cpu-used", "6",
-    )),
-}  # fmt: skip
+# Name, encoder, container and options of the program ffmpeg. Nearly every program plays H.264
+H264 = ("H.264", "libx264", "mp4", (
+    "-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709",  # as players expect of large frames
+    "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
+))  # fmt: skip
 MAX_VIDEO_PIXELS = 1 << 23  # per frame, a little more than 3840 x 2160; encoders take 150 bytes per pixel
 MAX_GIF_PIXELS = 1 << 27  # of all frames together; more take over 400 MB of memory, and files too large to send
 GIF_SAMPLE = 1 << 20  # pixels from which the palette of a GIF is made
@@ -133,18 +127,17 @@ def draw_swipe(pictures: Sequence[Picture], borders: Sequence[int], captions: Se
 
 
 class FfmpegWriter:
-    """Write frames of three or four channels with the program ffmpeg; has the methods of :class:`cv2.VideoWriter`."""
+    """Write frames with the program ffmpeg; has the methods of :class:`cv2.VideoWriter`."""
 
     def __init__(self, program: str, path: Path, shape: tuple[int, ...], fps: float) -> None:
-        height, width, channels = shape
-        order = {3: "bgr24", 4: "bgra"}[channels]
-        frames = ("-f", "rawvideo", "-pix_fmt", order, "-s", f"{width}x{height}", "-r", str(fps), "-i", "-")
-        _, encoder, container, encoding = BY_FFMPEG[channels]
+        height, width, _ = shape
+        frames = ("-f", "rawvideo", "-pix_fmt", "bgr24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-")
+        _, encoder, container, encoding = H264
         command = (program, "-v", "quiet", "-y", *frames, "-c:v", encoder, *encoding, "-f", container, str(path))
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
 
     def write(self, frame: np.ndarray) -> None:
-        """Add a frame ``[h,w,c]`` in the order blue, green, red, alpha."""
+        """Add a frame ``[h,w,c]`` in the order blue, green, red."""
         assert self.process.stdin is not None
         with suppress(BrokenPipeError):  # ffmpeg has ended; missing frames are noticed later
             self.process.stdin.write(np.ascontiguousarray(frame).tobytes())
@@ -173,11 +166,11 @@ def stored_size(path: StrPath, width: int, height: int) -> tuple[int, int]:
 
 
 def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrite: bool = False) -> str:
-    """Write pictures ``[h,w,3]`` or ``[h,w]`` of one size as a video or a GIF; return the name of its encoding.
+    """Write pictures ``[h,w,3]`` of one size as a video or a GIF; return the name of its encoding.
 
     A ``.mp4`` has the encoding H.264 if :func:`find_ffmpeg` finds a program for it, otherwise the first encoding that
-    OpenCV has. A ``.webm`` of pictures with alpha ``[h,w,4]`` needs that program. All frames of a GIF share a palette,
-    and are in memory together. A video takes the memory of a few frames.
+    OpenCV has. All frames of a GIF share a palette, and are in memory together. A video takes the memory of a few
+    frames.
 
     The frames of a video have the :func:`stored_size`: an odd side gets one more row
     or column, a copy of the last one. SceneError if there is no encoder for the ending of the name, or if the file
@@ -186,15 +179,15 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
     path = Path(path)
     with atomic_output(path, overwrite=overwrite) as temporary:
         if path.suffix.lower() == GIF:
-            _write_gif(temporary, list(map(_to_channels, frames)), fps)
+            _write_gif(temporary, list(frames), fps)
             return "GIF"
-        even_frames = (_to_even(_to_channels(frame)) for frame in frames)
+        even_frames = (_to_even(frame) for frame in frames)
         first_frame = next(even_frames)
         writer, encoding = _open_writer(path, temporary, first_frame.shape, fps)
         written: list[Future[None]] = []
 
         def encode(frame: Picture) -> None:
-            writer.write(frame[..., BLUE_FIRST[: frame.shape[2]]])
+            writer.write(frame[..., ::-1])
 
         try:
             with ThreadPoolExecutor(1) as encoder:  # encode on one thread, while the next frame is drawn
@@ -227,11 +220,6 @@ def _write_gif(path: Path, frames: Sequence[Picture], fps: float) -> None:
     first_frame.save(path, "GIF", save_all=True, append_images=later_frames, duration=round(1000 / fps), loop=0)
 
 
-def _to_channels(picture: Picture) -> Picture:
-    """Return a picture with three or four channels; a grey one is repeated."""
-    return picture if picture.ndim == 3 else picture[..., None].repeat(3, 2)
-
-
 def _to_even(picture: Picture) -> Picture:
     """Repeat the last row and column of a picture with odd sides."""
     height, width = picture.shape[:2]
@@ -242,13 +230,10 @@ def _open_writer(
     path: Path, temporary: Path, shape: tuple[int, ...], fps: float
 ) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
     """Open a file for frames of a ``shape`` with the first available encoder; also return the encoding's name."""
-    height, width, channels = shape
-    name, encoder, container, _ = BY_FFMPEG[channels]
+    height, width, _ = shape
+    name, encoder, container, _ = H264
     if path.suffix.lower() == f".{container}" and (program := find_ffmpeg(encoder)):
         return FfmpegWriter(program, temporary, shape, fps), name
-    if channels > 3:
-        problem = f"pictures with alpha need the program ffmpeg with {encoder} on the PATH, which was not found"
-        raise SceneError(path, problem, FOLDER)
     encoders = ENCODERS[path.suffix.lower()]
     for code, name in encoders:
         with _silent_stderr():

@@ -6,25 +6,21 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
+from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import NO_VIEWS, add_views
-from gsmerge.facts.support import count_views_in_world, tint
 from gsmerge.facts.views import pick_views, subset
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import camera_depths
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
-from gsmerge.measure.camera_path import parse_path, sample_path, turned_degrees, viewing_depth
+from gsmerge.measure.camera_path import parse_path, sample_path, viewing_depth
 from gsmerge.measure.clip import (
-    BY_FFMPEG,
     FOLDER,
+    H264,
     MAX_GIF_PIXELS,
     MAX_VIDEO_PIXELS,
     draw_swipe,
@@ -35,7 +31,7 @@ from gsmerge.measure.clip import (
 )
 from gsmerge.measure.preview import Picture, contact_sheet, outside_pictures, save_picture, to_picture, view_pictures
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
-from gsmerge.raster import render, render_in_batches
+from gsmerge.raster import render_in_batches
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
@@ -45,20 +41,15 @@ from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import read_into_frame
 from gsmerge.scene.read import Loaded, move_cameras_to_scene, read_gaussian_file
 from gsmerge.settings.pictures import CLIPS, GIF, PICTURES
-from gsmerge.settings.reading import NONE, OpacityChoice
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
 
 PANEL_VIEWS = 4  # rows of a panel
-SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # least duration of a path
+SECONDS = 4  # least duration of a clip
 VIEW_FRAMES = 4  # least number of frames for each view of a spline
 FPS, GIF_FPS = 30.0, 12.5  # frames per second
 GIF_SIDE = 640  # largest side of a GIF without the option size, pixels
 PLACED_SIZE = 1280, 720  # width and height of pictures from placed cameras, pixels
-OPAQUE = 0.5  # least alpha of a pixel that has a depth
-HALF_TURN = 180  # degrees; if the cameras span less, a turntable also shows a side that no photo shows
-
-Channel = Literal["color", "alpha", "depth"]
-FULL = {"alpha": 255, "depth": 65535}  # pixel values of alpha 1 and of the farthest depth
 
 
 @dataclass(frozen=True)
@@ -75,25 +66,13 @@ class DrawOptions:
     path: str | None = None  # See :func:`gsmerge.measure.camera_path.parse_path`, or a file of cameras
     frames: int | None = None  # Along the path; None: by SECONDS, for a spline at least VIEW_FRAMES for each view
     size: tuple[int, int] | None = None  # Width and height of a picture; None: the size of the cameras
-    overlay: str | None = None  # "support": colour Gaussians by the number of views that show them
-    background: float | Literal["none"] = 0.0  # Grey level; "none": pictures have alpha
-    channel: Channel = "color"  # Content of the pictures
-
-    @property
-    def grey(self) -> float:
-        """Grey level behind pictures without alpha."""
-        return 0.0 if isinstance(self.background, str) else self.background
+    background: float = 0.0  # Grey level
 
     def choose(self, names: Sequence[str], most: int | None = None) -> list[int]:
         """Choose the ids of views by the option ``views``, by default at most ``most`` views; None: all."""
         if isinstance(self.views, str):
             return [find_view(self.views, names)]
         return pick_views(len(names), self.views or most or len(names))
-
-    @property
-    def legend(self) -> str:
-        """Words for the colours of an overlay, to follow a name."""
-        return "" if self.overlay is None else " (yellow: one view shows it, red: none)"
 
     @property
     def fps(self) -> float:
@@ -142,43 +121,18 @@ class DrawnScenes:
         ``places`` has a row of borders for each picture, see :func:`gsmerge.measure.clip.swipe_places`; scene i lies
         between the borders i and i + 1. Columns outside a scene's borders may show the background only.
         """
-        if options.background == NONE or options.channel != "color":
-            ((_, gaussians),) = self.scenes
-            return ((picture,) for picture in _draw_layers(gaussians, cameras, options, near))
         settings: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
         drawn = (
             render_in_batches(
                 gaussians,
                 cameras,
-                options.grey,
+                options.background,
                 columns=None if places is None else [(row[i], row[i + 1]) for row in places],
                 **settings,
             )
             for i, (_, gaussians) in enumerate(self.scenes)
         )
         return zip(*drawn, strict=True)
-
-
-def _draw_layers(gaussians: Gaussians, cameras: Cameras, options: DrawOptions, near: float) -> Iterator[Picture]:
-    """Yield for each camera its colours with alpha ``[h,w,4]``, its alpha ``[h,w]``, or its depth ``[h,w]``."""
-    for view in range(len(cameras)):
-        drawn = render(gaussians, cameras[[view]], near=near, with_depths=options.channel == "depth")
-        alphas = drawn.alphas[0].clip(0, 1)
-        if options.channel == "alpha":
-            yield np.round(FULL["alpha"] * alphas[..., 0]).astype(np.uint8)
-        elif options.channel == "depth":
-            assert drawn.depths is not None
-            depths = np.where(alphas > OPAQUE, drawn.depths[0], 0)[..., 0]
-            yield np.round(FULL["depth"] * (depths / farthest_depth(gaussians, cameras)).clip(0, 1)).astype(np.uint16)
-        else:
-            colors = drawn.images[0] / np.maximum(alphas, 1e-6)
-            yield np.concatenate([to_picture(colors), np.round(FULL["alpha"] * alphas).astype(np.uint8)], 2)
-
-
-def farthest_depth(gaussians: Gaussians, cameras: Cameras) -> float:
-    """Return the largest depth of a visible Gaussian from any camera, in world units."""
-    means = gaussians.means[gaussians.opacities > 0].astype(np.float64)
-    return max(float(camera_depths(means, viewmat[None]).max()) for viewmat in cameras.viewmats)
 
 
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
@@ -199,15 +153,14 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     names = [re.split(r"[\\/]", scene.names[i])[-1] for i in ids]
 
     def draw(_: int) -> Iterator[Picture]:
-        named = [(f"{path.name}{options.legend}", gaussians) for path, gaussians in group.scenes]
+        named = [(path.name, gaussians) for path, gaussians in group.scenes]
         shown = None if photos is None else [photos[i] if i in pictured else None for i in ids]
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
-        plain = options.overlay is None
-        rows = view_pictures(named, cameras[ids], shown, names, scored=plain, background=options.grey)
+        rows = view_pictures(named, cameras[ids], shown, names, background=options.background)
         # Without cameras of the scene, views are placed: the first half around it, the second half inside it
         outer_cameras = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
-        outside = outside_pictures(named, outer_cameras, photos=shown is not None, background=options.grey)
+        outside = outside_pictures(named, outer_cameras, photos=shown is not None, background=options.background)
         yield contact_sheet([*rows, outside])
 
     facts = {"scenes": group.counts(), "views": ids, "photos": len(pictured) > 0, "notes": group.notes}
@@ -220,22 +173,14 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
     is_folder = options.output.suffix.lower() not in PICTURES
     ids = options.choose(group.load.scene.names) if is_folder or options.views else [0]
     views, stems = options.resize(group.load.scene.cameras[ids]), picture_stems(group.load.scene.names)
-    names = [f"{path.name}{options.legend}: {len(gaussians):,}" for path, gaussians in group.scenes]
+    names = [f"{path.name}: {len(gaussians):,}" for path, gaussians in group.scenes]
 
     def draw(threads: int) -> Iterator[Picture]:
         for drawn in group.draw(views, options, threads):
             yield contact_sheet([list(zip(names, drawn, strict=True))]) if len(drawn) > 1 else drawn[0]
 
     facts = {"width": views.width, "height": views.height, "scenes": group.counts(), "views": ids, "notes": group.notes}
-    facts |= _depth_unit(group, views, options)
     return Drawing([options.output / f"{stems[i]}.png" for i in ids] if is_folder else [options.output], facts, draw)
-
-
-def _depth_unit(group: DrawnScenes, cameras: Cameras, options: DrawOptions) -> dict[str, float]:
-    """Return the size of one step of depth pictures in world units, for the report."""
-    if options.channel != "depth":
-        return {}
-    return {"depth_unit": farthest_depth(group.scenes[0][1], cameras) / FULL["depth"]}
 
 
 def prepare_clip(options: DrawOptions) -> Drawing:
@@ -260,7 +205,6 @@ def prepare_clip(options: DrawOptions) -> Drawing:
 
     facts = {"views": ids, "notes": group.notes, "scenes": group.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
-    facts |= _depth_unit(group, cameras, options)
     if options.output.suffix.lower() not in CLIPS:
         return Drawing([options.output / f"frame_{i:05d}.png" for i in range(len(cameras))], facts, draw)
     _check_frames(options.output, cameras.width, cameras.height, len(cameras))
@@ -299,14 +243,9 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
     cameras = cameras[ids]
     depth = viewing_depth(cameras if file is None else scene_cameras, group.scenes[0][1].means)
     if path is not None:
-        if path.kind == "turntable" and (turn := turned_degrees(cameras, depth)) < HALF_TURN:
-            group.notes.append(
-                f"the photos span {turn:.0f} degrees about the scene's centre, and a turntable also shows sides without"
-                " photos; --path orbit stays near the photos"
-            )
         min_frames = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
         try:
-            count = options.frames or max(round(SECONDS[path.kind] * options.fps), min_frames)
+            count = options.frames or max(round(SECONDS * options.fps), min_frames)
             cameras = sample_path(path, cameras, depth, count)
         except ValueError as error:
             raise UsageError(str(error)) from error
@@ -337,13 +276,9 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     framing_ply = first_ply if same_file else read_gaussian_file(framing, opacity="auto", hints=NO_HINTS)
     framing_load = move_cameras_to_scene(framing_ply, framing, hints=options.hints, photos=photos)
     load = _with_views(framing_load, inside=photos)
-    if options.overlay is not None and load is not framing_load:
-        load = replace(load, notes=(*load.notes, "overlay: it counts these placed views, not those of photos"))
     scenes = [load.scene.file_gaussians if same_file else first_ply.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first_ply.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     notes_with_paths = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
-    if options.overlay is not None and len(load.scene):
-        scenes = [tint(gaussians, count_views_in_world(gaussians, load.scene.cameras)) for gaussians in scenes]
     sizes = [file.info.file_bytes for file in (first_ply, *plys)]
     return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, notes_with_paths if plys else list(notes[0]), load)
 
@@ -414,10 +349,8 @@ def drawing_line(document: Mapping[str, Any]) -> str:
         line += f", {document['frames'] / document['fps']:.1f} s" if "fps" in document else ""
         if "encoding" not in document:
             return line
-        is_less_played = document["encoding"] != BY_FFMPEG[3][0] and document["pictures"][0].lower().endswith(".mp4")
+        is_less_played = document["encoding"] != H264[0] and document["pictures"][0].lower().endswith(".mp4")
         hint = ", which not all programs play; with ffmpeg on the PATH it would be H.264" if is_less_played else ""
         return f"{line}, {document['encoding']}{hint}"
     count, views = len(document["pictures"]), len(document["views"])
-    unit = document.get("depth_unit")
-    depth = "" if unit is None else f"; a step of depth is {unit:.4g} units of the scene"
-    return f"{count} picture{'' if count == 1 else 's'} of {views} view{'' if views == 1 else 's'}{depth}"
+    return f"{count} picture{'' if count == 1 else 's'} of {views} view{'' if views == 1 else 's'}"

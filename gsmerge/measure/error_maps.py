@@ -7,30 +7,25 @@ the render. Where no other photo shows the surface, only the view's own photo su
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import field, replace
-from pathlib import Path
+from dataclasses import field
 
 import numpy as np
 
-from gsmerge.errors import SceneError
-from gsmerge.frame import scene_frame
 from gsmerge.frozen import dataclass
 from gsmerge.kernels.pictures import blur
 from gsmerge.kernels.reproject import add_photo_errors
-from gsmerge.measure.preview import Picture, contact_sheet, to_picture
+from gsmerge.measure.preview import Picture
 from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
 from gsmerge.measure.visibility import lift_pixels
 from gsmerge.raster import render
 from gsmerge.raster.photos import NEAR_PLANE
-from gsmerge.types import Cameras, Gaussians, Scene, Views
+from gsmerge.types import Cameras, Gaussians, Views
 
 SIDE = 320  # largest longer side of a map, pixels
 # Number of nearest other photos that are compared. Of the photos that see a pixel's surface, the nearest COUNTED count.
 # The rank correlation with held-out errors of four captures is 0.53 to 0.63 with two, and 0.44 to 0.58 with four, since
 # some photos show an object in front of the surface
 NEIGHBORS, COUNTED = 8, 2
-MIN_PHOTOS = 2  # each photo needs another photo to compare with
 OPAQUE = 0.5  # least opacity of a pixel that shows a surface
 BEHIND = 1.05  # a surface is hidden in another view if its depth there exceeds the drawn depth by this factor
 SIGMA = 2.0  # standard deviation, pixels, of the blur of errors; the error of a single pixel is random
@@ -119,57 +114,3 @@ def _nearest(cameras: Cameras, camera: Cameras, own: int | None) -> list[int]:
     distances = np.square(cameras.centres - camera.centres[0]).sum(1)
     order = [int(view) for view in np.argsort(distances, kind="stable") if view != own]
     return order[:NEIGHBORS]
-
-
-def require_photos(scene: Scene, path: Path) -> None:
-    """Raise SceneError with the ``path`` of a scene unless at least two of its views have a photo."""
-    count = 0 if scene.images is None else len(scene)
-    if scene.images is not None and scene.masks is not None:  # a view without a photo has an empty mask
-        count = int(scene.masks.any((1, 2)).sum())
-    if count < MIN_PHOTOS:
-        problem = f"expected photos of at least {MIN_PHOTOS} views for maps, which compare photos, found {count}"
-        raise SceneError(path, problem, "name their folder with --images")
-
-
-def draw_sheets(
-    scene: Scene,
-    results: Mapping[str, Gaussians],
-    targets: Views | None,
-    cameras: Mapping[str, Cameras],
-    *,
-    context: bool = True,
-) -> Iterator[tuple[str, int, Picture]]:
-    """Draw the photo, the picture and the map of each result and view, side by side.
-
-    Yields (result, number of the view among all views, sheet); the input views come first. ``cameras`` has the cameras
-    of the input views, by name of each result whose cameras differ from the scene's. Without ``context`` only held-out
-    views are drawn. The scene must have photos, see :func:`require_photos`.
-    """
-    assert scene.images is not None
-    frame = scene_frame(scene)
-    for name, gaussians in results.items():
-        placed = frame.enter_cameras(cameras.get(name, scene.cameras))
-        reference = make_reference(frame.enter(gaussians), Views(placed, scene.images, scene.names), scene.masks)
-        views: list[tuple[Views, int, int | None]] = [(reference.views, view, view) for view in range(len(placed))]
-        if targets is not None:
-            held_out = shrink_views(replace(targets, cameras=frame.enter_cameras(targets.cameras)), SIDE)
-            views += [(held_out, view, None) for view in range(len(held_out))]
-        for number, (source, view, own) in enumerate(views):
-            if own is not None and not (context and (scene.masks is None or scene.masks[view].any())):
-                continue
-            title = f"view {number}: {source.names[view]}{'' if own is not None else ', held out'}"
-            yield name, number, _draw_sheet(reference, source, view, own, (title, name))
-
-
-def _draw_sheet(
-    reference: ErrorReference, source: Views, view: int, own: int | None, texts: tuple[str, str]
-) -> Picture:
-    """Draw photo, picture and map of a view of ``source``; ``texts`` are the labels of the first two."""
-    camera = source.cameras[[view]]
-    drawn, _ = draw_camera(reference.gaussians, camera) if own is None else reference.draw(own)
-    errors = expected_errors(reference, camera, own)
-    pictures = to_picture(source.images[view]), to_picture(drawn), draw_errors(errors)
-    known = errors[~np.isnan(errors)]
-    mean = f"error {known.mean():.3f}, " if len(known) else ""
-    legend = f"{mean}yellow {MAX_ERROR}; teal, {100 * (1 - len(known) / errors.size):.0f} %, unknown"
-    return contact_sheet([list(zip((*texts, legend), pictures, strict=True))])

@@ -19,7 +19,7 @@ from gsmerge.facts.views import pick_views
 from gsmerge.frame import scene_frame
 from gsmerge.frozen import dataclass
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
-from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
+from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
@@ -67,9 +67,6 @@ class ViewScore:
     # over these pixels; None if the input was not measured.
     covered_share: float | None = None
     covered: Quality = Quality()
-    # Scores at other sizes, if requested, by pixels per side relative to the photo: without LPIPS, over all pixels, and
-    # over the pixels that the input views have seen completely.
-    zooms: Mapping[float, Pair] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -86,21 +83,14 @@ class ResultScores:
     def __repr__(self) -> str:
         return f"ResultScores({self.name!r}, {self.num_gaussians:,} Gaussians, {len(self.scores)} views)"
 
-    def mean(self, split: str, *, zoom: float | None = None) -> Pair:
-        """Average the scores of a split's views, at the size of the photos or at another ``zoom``.
+    def mean(self, split: str) -> Pair:
+        """Average the scores of a split's views.
 
         Returns the mean scores over all pixels, and over the pixels that the input views have seen. ValueError for
-        another split than "context" and "target", or for a zoom that was not measured.
+        another split than "context" and "target".
         """
         views = self._select_views(split)
-        zooms = {size for score in views for size in score.zooms}
-        if zoom is not None and views and zoom not in zooms:
-            measured = [f"{size:g}" for size in sorted(zooms)]
-            raise ValueError(f"zoom: expected {', '.join([*measured, 'None'])}, got {zoom!r}")
-        pairs = [(score.full, score.masked) for score in views]
-        if zoom is not None:
-            pairs = [score.zooms[zoom] for score in views if zoom in score.zooms]
-        return _mean([full for full, _ in pairs]), _mean([masked for _, masked in pairs])
+        return _mean([score.full for score in views]), _mean([score.masked for score in views])
 
     def mean_covered(self, split: str) -> tuple[float | None, Quality]:
         """Average, over a split's views, the share of pixels that the input covers, and the scores over them."""
@@ -375,8 +365,7 @@ def _score_split(
             score = ViewScore(kind, names[view], float(split.visible[view].mean()), Quality(), Quality())
             if view in split.scored:
                 score = _score_view(score, image, split, view, covered, nets)
-            zooms = _score_zooms(score, gaussians, moved[name], view, renderer)
-            scores[name].append((seconds, replace(score, zooms=zooms)))
+            scores[name].append((seconds, score))
     return scores
 
 
@@ -398,41 +387,12 @@ def _score_view(
     return score if share is None else replace(score, covered_share=share, covered=covered_quality)
 
 
-def _score_zooms(
-    score: ViewScore, gaussians: Gaussians, split: _Split, view: int, renderer: _Renderer
-) -> dict[float, Pair]:
-    """Score a view at the requested sizes, if others than the photo's are requested; size 1 repeats ``score``."""
-    options = renderer.options
-    own = _without_lpips(score.full), _without_lpips(score.masked)
-    return {
-        zoom: own if zoom == 1 or view not in split.scored else _score_zoom(gaussians, split, view, zoom, renderer)
-        for zoom in (() if options.zoom == (1,) else options.zoom)
-    }
-
-
-def _without_lpips(quality: Quality) -> Quality:
-    return replace(quality, lpips_vgg=None, lpips_alex=None)
-
-
 def _join(
     name: str, split_scores: Sequence[Mapping[str, Sequence[tuple[float, ViewScore]]]]
 ) -> tuple[float, tuple[ViewScore, ...]]:
     """Return the median seconds and the scores of a result over the views of all splits."""
     rows = [row for scores in split_scores for row in scores[name]]
     return float(np.median([seconds for seconds, _ in rows])), tuple(score for _, score in rows)
-
-
-def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, renderer: _Renderer) -> Pair:
-    """Score a render at another size against the photo, or the render of the input, at that size."""
-    cameras = zoom_cameras(split.views.cameras, zoom)
-    size = cameras.width, cameras.height
-    if split.drawn is None:
-        photo = resize_photo(split.views.images[view], *size)
-    else:
-        photo = renderer.image(split.drawn, cameras, view)
-    image, seen = renderer.image(gaussians, cameras, view), resize_mask(split.visible[view], *size)
-    full, masked = _qualities(image, photo, (None, seen))
-    return full, masked
 
 
 def _qualities(image: np.ndarray, photo: np.ndarray, masks: Sequence[NDArray[np.bool_] | None]) -> list[Quality]:

@@ -26,7 +26,6 @@ BAND, WIDE = 22, 640
 DARK = 32  # grey level of labels, and of cells without a photo
 GAP = 4  # pixels between pictures
 OUTSIDE = "step back"  # name of the outside view
-BLUE_FIRST = [2, 1, 0, 3]  # order of channels for OpenCV and ffmpeg
 
 
 def to_picture(image: np.ndarray) -> Picture:
@@ -35,16 +34,12 @@ def to_picture(image: np.ndarray) -> Picture:
 
 
 def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool = True) -> None:
-    """Write a picture in the format of the file name; ``settings`` go to :func:`cv2.imencode`.
-
-    The picture is ``[h,w,3]``, ``[h,w,4]`` with alpha, or ``[h,w]``, with 8 or 16 bits.
-    """
-    stored = picture if picture.ndim == 2 else picture[..., BLUE_FIRST[: picture.shape[2]]]
+    """Write a picture ``[h,w,3]`` in the format of the file name; ``settings`` go to :func:`cv2.imencode`."""
     max_side, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
     if max(height, width) > max_side:
         problem = f"expected at most {max_side:,} pixels per side of a {path.suffix}, got {width} x {height}"
         raise SceneError(path, problem, "name a .png, or lower --size")
-    _, data = cv2.imencode(path.suffix, np.ascontiguousarray(stored), settings)
+    _, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[..., ::-1]), settings)
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(data.tobytes())
 
@@ -80,16 +75,14 @@ def view_pictures(
     cameras: Cameras,
     photos: Sequence[np.ndarray | None] | None = None,
     names: Sequence[str] | None = None,
-    *,
-    scored: bool = True,
     **drawing: Any,
 ) -> list[list[tuple[str, Picture]]]:
     """Render each scene in every view, in rows that begin with the photo if there is one.
 
-    Every picture comes with a line of text. For a scene, the text has the name and the number of Gaussians. If
-    ``scored``, the PSNR against the whole photo ``[h,w,3]`` follows, or, if ``photos`` is None, the PSNR against the
-    first scene. For a photo, the text has the name of the view. A view whose photo is None begins with a
-    dark picture. ``drawing`` is passed to :func:`gsmerge.render`.
+    Every picture comes with a line of text. For a scene, the text has the name, the number of Gaussians, and the PSNR
+    against the whole photo ``[h,w,3]``, or, if ``photos`` is None, the PSNR against the first scene. For a photo, the
+    text has the name of the view. A view whose photo is None begins with a dark picture. ``drawing`` is passed to
+    :func:`gsmerge.render`.
     """
     renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
@@ -100,7 +93,7 @@ def view_pictures(
             columns.insert(0, (f"{view}, photo", photo))
         elif photos is not None:
             columns.insert(0, (f"{view}: no photo", np.full_like(renders[0][row], DARK / 255)))
-        if scored and (photo is not None or photos is None):
+        if photo is not None or photos is None:
             (_, reference), *compared = columns
             name = "the photo" if photos is not None else scenes[0][0]
             columns[1:] = [(f"{text}, {psnr_words(psnr(im, reference))} to {name}", im) for text, im in compared]

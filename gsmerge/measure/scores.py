@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
-from pathlib import Path
 from typing import Any
 
 from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
@@ -18,7 +16,7 @@ Row = Sequence[str]
 Table = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
 
 KINDS = {"context": "input", "target": "held-out"}  # words for the views of a split
-ZOOMED = ("psnr", "ssim")  # measures that are also taken at other sizes
+SIMPLE = ("psnr", "ssim")  # measures that are also taken over the pixels that the input covers
 COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
 OUTSIDE = {
@@ -26,12 +24,12 @@ OUTSIDE = {
     "spikes": "spikes", "strokes": "strokes",
 }  # fields of Fog  # fmt: skip
 # Columns that a narrow terminal omits, in this order
-OMITTED_FIRST = ("bytes each", "overdraw", "smaller by", "threads", "ms/view", "kept")
+OMITTED_FIRST = ("bytes each", "smaller by", "ms/view", "kept")
 MASKED = "_visible"  # suffix of measures over the pixels that the input views have seen
 COVERED = "_covered"  # suffix of measures over the pixels that the input covers
 CSV_COLUMNS = (
     "schema_version", "result", "num_gaussians", "ratio", "split", "view", "visible_share",
-    *METRICS, *(name + MASKED for name in METRICS), *(name + COVERED for name in ("share", *ZOOMED)), *OUTSIDE,
+    *METRICS, *(name + MASKED for name in METRICS), *(name + COVERED for name in ("share", *SIMPLE)), *OUTSIDE,
 )  # fmt: skip
 
 
@@ -41,10 +39,9 @@ def evaluation_document(
     """Convert an evaluation to plain JSON types, with further facts on each result, such as path and bytes.
 
     ``schema_version`` 1 has tool, reference, views, results and notes. A result has its facts, count, ratio, render
-    seconds, fog, holes, veils and spikes (null for the input), means by split, and a score for each view. Means and
-    scores have ``zooms`` if a size other than the photos' was requested. ``photo_side`` is present if it is not 0,
-    ``antialiased`` if it is true, and ``lpips_views`` if some split has views without LPIPS. Within a
-    schema version keys may be added, but not removed.
+    seconds, fog, holes, veils and spikes (null for the input), means by split, and a score for each view.
+    ``photo_side`` is present if it is not 0, ``antialiased`` if it is true, and ``lpips_views`` if some split has views
+    without LPIPS. Within a schema version keys may be added, but not removed.
     """
     return {
         **document_head(),
@@ -75,7 +72,9 @@ def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, An
         "render_seconds": round(result.render_seconds, 5),
         **asdict(result.fog.get(ALL, Fog())),
         "fog_by_kind": {kind: asdict(fog) for kind, fog in result.fog.items() if kind != ALL},
-        "mean": {split: _mean(result, split, evaluation) for split in evaluation.num_views},
+        "mean": {
+            split: _flat(result.mean(split)) | _covered(*result.mean_covered(split)) for split in evaluation.num_views
+        },
         "views": [
             {
                 "split": s.split,
@@ -83,34 +82,15 @@ def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, An
                 "visible_share": s.visible,
                 **_flat((s.full, s.masked)),
                 **_covered(s.covered_share, s.covered),
-                **_zooms(s.zooms),
             }
             for s in result.scores
         ],
     }
 
 
-def _mean(result: ResultScores, split: str, evaluation: Evaluation) -> dict[str, Any]:
-    """Convert the mean scores of a result over the views of a split."""
-    options = evaluation.options
-    sizes = () if options.zoom == (1,) else options.zoom
-    return {
-        **_flat(result.mean(split)),
-        **_covered(*result.mean_covered(split)),
-        **_zooms({zoom: result.mean(split, zoom=zoom) for zoom in sizes}),
-    }
-
-
-def _zooms(scores: Mapping[float, Pair]) -> dict[str, Any]:
-    """Make the list ``zooms`` of scores at other sizes, in the requested order; nothing without such scores."""
-    names = [name + suffix for suffix in ("", MASKED) for name in ZOOMED]
-    flat = [(zoom, _flat(pair)) for zoom, pair in scores.items()]
-    return {"zooms": [{"zoom": zoom, **{name: score[name] for name in names}} for zoom, score in flat]} if flat else {}
-
-
 def _covered(share: float | None, quality: Quality) -> dict[str, float | None]:
     """Convert the share of covered pixels and the scores over them."""
-    return {"share" + COVERED: share} | {name + COVERED: getattr(quality, name) for name in ZOOMED}
+    return {"share" + COVERED: share} | {name + COVERED: getattr(quality, name) for name in SIMPLE}
 
 
 def _flat(pair: Pair) -> dict[str, float | None]:
@@ -120,25 +100,13 @@ def _flat(pair: Pair) -> dict[str, float | None]:
 
 
 def evaluation_csv(document: Mapping[str, Any]) -> str:
-    """Format an evaluation as CSV with one row per result and view; cells without a measurement are empty.
-
-    If other sizes were measured, columns such as ``psnr_zoom_0.5`` and ``psnr_visible_zoom_0.5`` follow.
-    """
+    """Format an evaluation as CSV with one row per result and view; cells without a measurement are empty."""
     rows = []
     for result in document["results"]:
         shared = {"schema_version": document["schema_version"], "result": result["name"]}
         shared |= {name: result[name] for name in ("num_gaussians", "ratio", *OUTSIDE)}
-        rows += [shared | _flatten_zooms(view) for view in result["views"]]
-    columns = dict.fromkeys(CSV_COLUMNS) | dict.fromkeys(name for row in rows for name in row)
-    return csv_text(list(columns), rows)
-
-
-def _flatten_zooms(view: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scores of a view with a key for each figure at another size, in place of ``zooms``."""
-    row = {key: value for key, value in view.items() if key != "zooms"}
-    for score in view.get("zooms", ()):
-        row |= {f"{key}_zoom_{score['zoom']:g}": value for key, value in score.items() if key != "zoom"}
-    return row
+        rows += [shared | view for view in result["views"]]
+    return csv_text(CSV_COLUMNS, rows)
 
 
 def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
@@ -146,7 +114,7 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     results = document["results"]
     yield (
         "Size",
-        ("", "Gaussians", "kept", "file", "smaller by", "bytes each", "ms/view", "overdraw"),
+        ("", "Gaussians", "kept", "file", "smaller by", "bytes each", "ms/view"),
         [_size_row(result, results[0]) for result in results],
     )
     for split in document["num_views"]:
@@ -154,17 +122,12 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE)) for result in results]
     heading = "Faults seen from outside that the input does not have: shares of the picture, less is better"
     yield heading, ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
-    yield (
-        "Render time",
-        ("", "threads", "pixels", "ms/frame", "faster by"),
-        [_speed_row(result, speed) for result in results for speed in result.get("speeds", ())],
-    )
 
 
 def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[Table]:
-    """Make the tables of the mean scores over a split's views: seen pixels, covered pixels, and other sizes.
+    """Make the tables of the mean scores over a split's views: over seen pixels, and over covered pixels.
 
-    The second has no rows if the input covers nearly all pixels, the third if no other size was measured.
+    The second has no rows if the input covers nearly all pixels.
     """
     results, count = document["results"], document["num_views"][split]
     quality = "Quality" if "target" in document["num_views"] else "No view was held out: quality"
@@ -177,15 +140,9 @@ def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[Table]:
     input_mean = next(iter(results[0]["mean"].values()))  # over the input views, if they are measured
     lacks_pixels = (input_mean["share" + COVERED] or 1) < WHOLE
     heading = f"{views}, over the pixels that the input covers"
-    yield heading, ("", "of all", *(COLUMNS[name] for name in ZOOMED)), [
-        (name, f"{100 * mean['share' + COVERED]:.0f} %", *_cells(mean, ZOOMED, COVERED))
+    yield heading, ("", "of all", *(COLUMNS[name] for name in SIMPLE)), [
+        (name, f"{100 * mean['share' + COVERED]:.0f} %", *_cells(mean, SIMPLE, COVERED))
         for name, mean in means if lacks_pixels
-    ]  # fmt: skip
-    zooms = [entry["zoom"] for entry in input_mean.get("zooms", ())]
-    columns = [f"{name.upper()} {zoom:g}x" for zoom in zooms for name in ZOOMED]
-    yield f"{views} at other sizes, photos resized", ("", *columns), [
-        (name, *(cell for entry in mean["zooms"] for cell in _cells(entry, ZOOMED)))
-        for name, mean in means if zooms
     ]  # fmt: skip
 
 
@@ -198,7 +155,7 @@ def _describe_options(document: Mapping[str, Any]) -> str:
 
 def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
     """Return the row of a result in the table of sizes; ``first``: the result that it is compared with."""
-    size, input_size, overdraw = result.get("bytes"), first.get("bytes"), result.get("overdraw")
+    size, input_size = result.get("bytes"), first.get("bytes")
     bytes_each = sum(result.get("bytes_by_attribute", {}).values()) / max(result["num_gaussians"], 1)
     return (
         result["name"],
@@ -208,15 +165,7 @@ def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
         "" if result is first or not (size and input_size) else f"{input_size / size:.1f} x",
         f"{bytes_each:.1f}" if bytes_each else "",
         f"{1000 * result['render_seconds']:.1f}",
-        "" if overdraw is None else f"{overdraw:.1f}",
     )
-
-
-def _speed_row(result: Mapping[str, Any], speed: Mapping[str, Any]) -> Row:
-    """Return a row of the table of render times."""
-    faster = f"{speed['speedup']:.1f} x" if "speedup" in speed else ""
-    size = f"{speed['width']} x {speed['height']}"
-    return result["name"], str(speed["threads"]), size, f"{1000 * speed['seconds']:.1f}", faster
 
 
 def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED) -> Iterator[str]:
@@ -246,39 +195,3 @@ def evaluation_lines(document: Mapping[str, Any], columns: int | None = None) ->
         table = text_table([head, *rows], "  ", columns=columns, least=omitted_first)
         lines += [*wrap_line(heading, columns, 2), *table]
     return lines
-
-
-def evaluation_markdown(document: Mapping[str, Any]) -> str:
-    """Format the tables and notes of an evaluation in Markdown."""
-    lines = [f"# {_plain(page_title(document))}", f"<!-- gsmerge {document['tool']['version']} -->", ""]
-    for title, head, rows in filled_tables(document):
-        lines += [f"## {title}", "", _line(head), _line(["---", *["---:"] * (len(head) - 1)]), *map(_line, rows), ""]
-    lines += [f"- {_plain(note)}" for note in page_notes(document)]
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def page_title(document: Mapping[str, Any]) -> str:
-    """Make the title of a document: the scene's name and its results."""
-    before, *results = document["results"]
-    path = Path(before.get("path", before["name"]))
-    return "/".join(path.parts[-2:]) + (": before and after" if results else "")
-
-
-def page_notes(document: Mapping[str, Any]) -> list[str]:
-    """Return the notes with file paths shortened to folder and name, for a page that others read."""
-    paths = [Path(result["path"]).absolute() for result in document["results"] if "path" in result]
-    prefixes = {f"{path.parent.parent}/" for path in paths} - {"/"}
-    notes = document["notes"]
-    for folder in sorted(prefixes, key=len, reverse=True):
-        notes = [note.replace(folder, "") for note in notes]
-    return list(notes)
-
-
-def _line(cells: Row) -> str:
-    """Format the row of a table in Markdown."""
-    return "| " + " | ".join(_plain(cell).replace("|", "\\|") for cell in cells) + " |"
-
-
-def _plain(text: str) -> str:
-    """Escape text for Markdown, so that it is one line without HTML."""
-    return " ".join(html.escape(text, quote=False).split())

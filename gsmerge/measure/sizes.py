@@ -18,13 +18,6 @@ from gsmerge.types import Cameras, Views
 SomeViews = TypeVar("SomeViews", bound=Views)
 
 
-def zoom_cameras(cameras: Cameras, zoom: float) -> Cameras:
-    """Scale the image size of cameras to ``zoom`` times the pixels per side, and their intrinsics with it."""
-    long_side = max(cameras.width, cameras.height)
-    factor = max(1, round(zoom * long_side)) / long_side
-    return resize_cameras(cameras, max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor)))
-
-
 def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
     """Shrink the image size of cameras to at most ``side`` pixels on the longer side; 0: do not shrink."""
     size = cameras.width, cameras.height

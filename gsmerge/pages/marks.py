@@ -8,7 +8,7 @@ from functools import reduce
 
 import numpy as np
 
-from gsmerge.facts.support import TINTS, count_views
+from gsmerge.facts.support import count_views
 from gsmerge.frozen import dataclass
 from gsmerge.io.encode_pictures import encode_indexed
 from gsmerge.raster import Splats, TiledView, tile_view
@@ -20,7 +20,7 @@ from gsmerge.types import Cameras, Gaussians
 
 Color = tuple[int, int, int]  # sRGB
 DROPS: Mapping[str, Color] = {"floaters": (255, 45, 150), "sky": (20, 170, 255)}
-SEEN: Mapping[str, Color] = {"none": TINTS[0], "one": TINTS[1]}  # by the number of views that show a Gaussian
+SEEN: Mapping[str, Color] = {"none": (230, 40, 40), "one": (255, 190, 0)}  # by the number of views that show a Gaussian
 MAX_SUPPORT = 2  # larger numbers of views are stored as this number
 FAINT = 0.1  # factor on the opacity of faded Gaussians, which no view shows
 MAX_MARKED = 300_000  # Gaussians; finding the floaters among more takes seconds

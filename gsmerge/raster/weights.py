@@ -44,16 +44,6 @@ def view_weights(tiled: TiledView) -> ViewWeights:
     return ViewWeights(tiled.ids, *tiled.lists[1:], starts, lanes, weights, tiled.height, tiled.width)
 
 
-def apply(view: ViewWeights, colors: Array) -> Array:
-    """Render ``colors [n,c]``, up to four channels, with the stored weights to an image ``[h,w,c]`` float32."""
-    channels = colors.shape[1]
-    rows = np.zeros((len(view.ids), kernels.LANES), np.float32)
-    rows[:, :channels] = colors[view.ids]
-    image = np.empty((view.height, view.width, kernels.LANES), np.float32)
-    kernels.spread(*view.entries, rows, image)
-    return image[..., :channels]
-
-
 def apply_transposed(view: ViewWeights, image: Array) -> Array:
     """Multiply the transpose of W with ``image [h,w,c]``, up to four channels; return ``[m,c]`` float64.
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import compress
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -23,9 +22,7 @@ from gsmerge.errors import SceneError
 from gsmerge.evidence.assign import Assigner, Assignment, Candidates, assign_photos
 from gsmerge.evidence.offsets import SIDE, correlate_parts
 from gsmerge.evidence.pictures import ViewPictures, show_views
-from gsmerge.evidence.rays import find_on_rays
 from gsmerge.evidence.scores import stands_out
-from gsmerge.frame import canonicalise
 from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.embedded import SHARP
@@ -365,9 +362,6 @@ def assign_to_views(
 ) -> list[Assignment | None]:
     """Assign files to the views of a scene, each with its camera; see :func:`gsmerge.evidence.assign.assign_photos`.
 
-    A proposed photo stays if Gaussians of its colours lie on its rays, even if their depths are wrong and renders look
-    different.
-
     Args:
         scene: The scene; its photos are those that names propose if ``read``.
         cameras: The camera of each view. Cameras without a view keep their proposed file.
@@ -393,19 +387,9 @@ def assign_to_views(
         return show_views(replace(scene, masks=masks), side)[views]
 
     assigned = assign_photos(show, candidates, named, exact=proposal.exact, stored=stored)
-    proposed, chosen = proposal.choice, proposal.choice
+    chosen = proposal.choice
     for view, assignment in zip(views, assigned, strict=True):
         chosen[cameras[view]] = assignment
-    named_views = {view: photo for view, photo in zip(views, named, strict=True) if photo is not None}
-    changed = {
-        view
-        for view, assignment in zip(views, assigned, strict=True)
-        if view in named_views and (assignment is None or assignment.photo != named_views[view])
-    }
-    if changed and read and images is not None:
-        on_rays = find_on_rays(canonicalise(scene)[0], list(named_views), [images[view] for view in named_views])
-        for view in changed & set(compress(named_views, on_rays)):
-            chosen[cameras[view]] = proposed[cameras[view]]
     return [None if camera in guessed else assignment for camera, assignment in enumerate(chosen)]
 
 

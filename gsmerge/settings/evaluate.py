@@ -7,7 +7,6 @@ from gsmerge.runtime import MOST_THREADS
 from gsmerge.settings.setting import Settings, setting
 
 NETS = ("vgg", "alex")
-MAX_ZOOM = 16.0  # the least zoom is its inverse; outside this range pictures have no pixels or fill the memory
 
 
 @dataclass(frozen=True)
@@ -31,9 +30,6 @@ class EvaluateOptions(Settings):
     photo_side: int = setting(0, "Longest side, in pixels, to which larger photos and their cameras are resized; the "
         "paper measures at 476.",
         "0: photos keep their size.", least=0, unit="pixels")  # fmt: skip
-    zoom: tuple[float, ...] = setting((1,), "Also measure PSNR and SSIM of renders at these multiples of the photos' "
-        "size per side.",
-        "The photos are resized to match.", least=1 / MAX_ZOOM, most=MAX_ZOOM, filled=True, unique=True)  # fmt: skip
     antialiased: bool = setting(False, "Lower the opacity of small Gaussians to offset the low-pass filter, which "
         "enlarges them, as some viewers do (Mip-Splatting).",
         "See `antialiased` of `gsmerge.render`.")  # fmt: skip

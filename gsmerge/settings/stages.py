@@ -18,7 +18,7 @@ Extent = Literal["auto", "photos", "beyond"]
 MatchMethod = Literal["overlap", "aabb", "none"]
 KRule = Literal["saliency", "distortion"]
 
-SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
+SEGMENTATIONS = ("rdseg", "bass", "bass-st", "grid")
 SHARE = "4.4%"  # superpixels per pixel by default
 MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # K differs between groups, and is one of these values
@@ -57,15 +57,15 @@ class SegmentOptions(Settings):
 
     superpixels: int | str = setting(SHARE, "Superpixels per view: a number such as 3000, a share of its pixels, or "
         "auto. auto takes 4.4 to 7 %, more the better the depths of the views agree.",
-        "`bass-adaptive` starts from a share and adapts it to each view.")  # fmt: skip
+        metavar="NUMBER|SHARE|auto")  # fmt: skip
     segmentation: str = setting("rdseg", "Method that cuts views into superpixels; `gsmerge.stages.superpixels` lists "
         "all.", choices=SEGMENTATIONS)  # fmt: skip
     rectangles: float | None = setting(None, "Of `rdseg`: number of rectangles per superpixel at its start.",
         "By default by effort: draft and fast 1, default 2, best 3.", least=1, unit="per superpixel")  # fmt: skip
     early_sweeps: int | None = setting(None, "Of `rdseg`: sweeps over border pixels before rectangles are merged.",
         "By default 0, with effort best 1.", least=0, most=1000)  # fmt: skip
-    compactness: float = setting(1e-5, "Of `rdseg` and the clean-up of `slic`: weight of squared distances in pixels, "
-        "relative to squared differences of colours in [0, 1].",
+    compactness: float = setting(1e-5, "Of `rdseg`: weight of squared distances in pixels, relative "
+        " to squared differences of colours in [0, 1].",
         "At 0 superpixels become long and winding, and no Gaussian fits them.", least=0, most=1)  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -89,11 +89,6 @@ class SegmentOptions(Settings):
         """Superpixels per pixel; the default share where the option gives a number or "auto"."""
         is_share = self.per_view is None and self.superpixels != AUTO
         return parse_share(str(self.superpixels) if is_share else SHARE)
-
-    @property
-    def adapts(self) -> bool:
-        """Whether the number of superpixels is adapted to each view: ``bass-adaptive`` with a share of the pixels."""
-        return self.segmentation == "bass-adaptive" and self.per_view is None
 
 
 @dataclass(frozen=True)

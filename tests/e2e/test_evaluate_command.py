@@ -126,21 +126,14 @@ def test_lpips_is_measured_with_alexnet_on_four_views(scene: Path, run: Run, mon
 
 
 @pytest.mark.slow
-def test_costs_and_files_of_every_kind(scene: Path, small: Path, run: Run) -> None:
-    outputs = {suffix: scene / f"page.{suffix}" for suffix in ("json", "csv", "md", "html")}
+def test_files_of_every_kind(scene: Path, small: Path, run: Run) -> None:
+    outputs = {suffix: scene / f"page.{suffix}" for suffix in ("json", "csv", "html")}
     flags = [part for path in outputs.values() for part in ("-o", path)]
     call = ("evaluate", scene / "scene.ply", small, "--lpips", "none")
-    outcome = run(*call, *flags, "--set", "zoom=1,.5", "--set", "speed=true", code=0)
-    document = json.loads(outputs["json"].read_text())
-    before, after = document["results"]
-    assert [speed["width"] for speed in before["speeds"][:2]] == [24, 12]
-    assert 1 < after["overdraw"] < before["overdraw"]
-    assert "| small.ply |" in outputs["md"].read_text()
+    run(*call, *flags, code=0)
     page = outputs["html"].read_text()
     assert "% of the Gaussians, " in page.replace("\u00a0", " ")
     assert 'id="splats-1"' in page  # the page of view
-    assert "Render time" in outcome.out
-    assert "overdraw" not in run(*call).out
     run(*call, *flags[:-2], code=0)  # what it made is replaced
     for path in outputs.values():
         path.write_text("mine")
@@ -150,7 +143,7 @@ def test_costs_and_files_of_every_kind(scene: Path, small: Path, run: Run) -> No
 
 def test_names_that_are_no_text(scene: Path, small: Path, run: Run) -> None:
     odd = small.rename(scene / "odd\udcff\x1b[31m.ply")
-    outputs = [scene / f"page.{suffix}" for suffix in ("md", "html", "json", "csv")]
+    outputs = [scene / f"page.{suffix}" for suffix in ("html", "json", "csv")]
     flags = [part for path in outputs for part in ("-o", path)]
     outcome = run("evaluate", scene, odd, "--lpips", "none", *flags, code=0)
     assert all("odd" in path.read_text(encoding="utf-8") for path in outputs)

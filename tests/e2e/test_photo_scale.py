@@ -12,8 +12,9 @@ import pytest
 from floors import nudged
 
 import gsmerge
+from gsmerge.facts.views import resize_cameras
 from gsmerge.io import read_images
-from gsmerge.measure.sizes import resize_photo, zoom_cameras
+from gsmerge.measure.sizes import resize_photo
 from gsmerge.raster.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
@@ -37,8 +38,9 @@ def scores(folder: Path, ply: Path) -> tuple[float, float]:
     targets, gaussians = folder / "targets", gsmerge.read_ply(ply).gaussians
     camera_file = gsmerge.read_cameras(targets)
     photos, values = read_images(targets, camera_file.names), []
-    for zoom in (0.5, 1.0):
-        cameras = zoom_cameras(gsmerge.to_cameras(camera_file), zoom)
+    stored = gsmerge.to_cameras(camera_file)
+    for parts in (2, 1):
+        cameras = resize_cameras(stored, stored.width // parts, stored.height // parts)
         images = gsmerge.render(gaussians, cameras).images.clip(0, 1)
         pairs = zip(images, photos, strict=True)
         values.append(np.mean([psnr(a, resize_photo(b, cameras.width, cameras.height)) for a, b in pairs]))

@@ -33,7 +33,7 @@ OTHERS = (
     ("compact", "scene", "--budget", "auto", "--effort", "draft", "-o", "new.spz"),
     ("compact", "scene.gsm", "-o", "new.sog"), ("extend", "new.gsm", "scene", *FEW), ("inspect", "scene"),
     ("view", "scene", "small.ply", "--no-open", "-o", "new.html"),
-    ("evaluate", "scene", "small.ply", "--targets", "scene/targets", "-o", "new.md"),
+    ("evaluate", "scene", "small.ply", "--targets", "scene/targets", "-o", "new.csv"),
     ("render", "scene", "small.ply", "-o", "new.png"),
     ("lab", "chart", "scene", "--grid", "budget=5%", "--set", "fit=none", "-o", "chart"),
     ("lab", "generate", "--scenes", "1", "--views", "3", "--size", "48x36", "-o", "made"),

@@ -125,7 +125,7 @@ def test_the_plan_and_its_estimate_say_so(scene: Scene) -> None:
     size = measure_size(scene)
     assert choose_for_scene(size, CompactOptions()).may_merge_pairs
     assert estimate(scene, CompactOptions())["superpixels_per_view"] == 0
-    for settings in ({"max_color": 0.11}, {"segmentation": "slic"}, {"checkpoint": "shipped"}, {"method": "random"}):
+    for settings in ({"max_color": 0.11}, {"segmentation": "grid"}, {"checkpoint": "shipped"}, {"method": "greedy"}):
         assert not choose_for_scene(size, CompactOptions().with_settings(settings)).may_merge_pairs
     assert not choose_for_scene(replace(size, rendered=False), CompactOptions()).may_merge_pairs
 

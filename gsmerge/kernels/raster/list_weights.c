@@ -44,30 +44,6 @@ API int32_t list_weights(const float *restrict conics, const int32_t *restrict f
   return 0;
 }
 
-API int32_t spread(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,
-                const int32_t *restrict flatten_ids, const int64_t *restrict isect_offsets, int64_t tile_width,
-                const float *restrict colors, float *restrict image, int64_t more, int64_t entries, int64_t n,
-                int64_t ends, int64_t m, int64_t h, int64_t w) {
-  (void)entries, (void)m;
-  if (more != n + 1) return OUTSIDE;
-  float state[PLANE][CHANNELS] __attribute__((aligned(64)));
-  for (int64_t tile = 0; tile < ends - 1; tile++) {
-    for (int i = 0; i < PLANE; i++)
-      for (int c = 0; c < CHANNELS; c++) state[i][c] = 0.f;
-    for (int64_t i = isect_offsets[tile]; i < isect_offsets[tile + 1]; i++) {
-      const float *color = colors + CHANNELS * (int64_t)flatten_ids[i];
-      for (int64_t e = starts[i]; e < starts[i + 1]; e++)
-        for (int c = 0; c < CHANNELS; c++) state[lanes[e]][c] += weights[e] * color[c];
-    }
-    int64_t left = tile % tile_width * TILE, top = tile / tile_width * TILE;
-    for (int64_t y = 0; y < mini(TILE, h - top); y++)
-      for (int64_t x = 0; x < mini(TILE, w - left); x++)
-        for (int c = 0; c < CHANNELS; c++)
-          image[((top + y) * w + left + x) * CHANNELS + c] = state[y * TILE + x][c];
-  }
-  return 0;
-}
-
 API int32_t collect(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,
                  const int32_t *restrict flatten_ids, const int64_t *restrict isect_offsets, int64_t tile_width,
                  const float *restrict image, double *restrict sums, int64_t more, int64_t entries, int64_t n,

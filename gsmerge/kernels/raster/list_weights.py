@@ -46,11 +46,6 @@ def list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width):
         lanes, weights = (np.concatenate([array, np.empty_like(array)]) for array in (lanes, weights))
 
 
-@native(STATUS, **ENTRIES, colors=f4("m", LANES), image=f4("h", "w", LANES, out=True))
-def spread(starts, lanes, weights, flatten_ids, isect_offsets, tile_width, colors, image):
-    """Write sums of weights times ``colors [m,LANES]`` to every pixel of ``image [h,w,LANES]``."""
-
-
 @native(STATUS, **ENTRIES, image=f4("h", "w", LANES), sums=f8("m", LANES, out=True))
 def collect(starts, lanes, weights, flatten_ids, isect_offsets, tile_width, image, sums):
     """Add weights times ``image [h,w,LANES]`` to ``sums [m,LANES]`` float64."""

@@ -34,7 +34,6 @@ KNOWN = flat_settings(EvaluateOptions) | flat_settings(CompactOptions)
         ("crop=", {"crop": ""}),
         ("photo_scale=2.5", {"photo_scale": 2.5}),
         ("overlap=.5", {"overlap": 0.5}),
-        ("zoom=.5,1,2", {"zoom": [0.5, 1, 2]}),
         ("lpips=alex", {"lpips": ["alex"]}),
     ],
 )

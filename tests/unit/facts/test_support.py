@@ -9,8 +9,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians
-from gsmerge.facts.support import TINT, TINTS, count_views, tint
-from gsmerge.geometry import sh0_to_rgb
+from gsmerge.facts.support import count_views
 from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import blank_photos
 from gsmerge.types import Cameras
@@ -44,12 +43,3 @@ def test_what_hides_behind_a_wall_or_a_camera_is_seen_by_none(room: Gaussians, c
     away = replace(room, means=room.means - 1000 * cameras.viewmats[:, 2, :3].mean(0).astype(np.float32))
     assert not count_views(away, cameras).any()
     assert len(count_views(room[:0], cameras)) == 0
-
-
-def test_tints_mark_what_one_and_what_no_view_shows(room: Gaussians) -> None:
-    counts = np.arange(len(room)) % 3
-    colors, own = (sh0_to_rgb(g.sh0[:, 0]) for g in (tint(room, counts), room))
-    for count, color in TINTS.items():
-        wanted = (1 - TINT) * own[counts == count] + TINT * np.array(color) / 255
-        np.testing.assert_allclose(colors[counts == count], wanted, atol=1e-6)
-    np.testing.assert_array_equal(colors[counts == 2], own[counts == 2])

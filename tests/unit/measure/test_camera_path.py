@@ -23,8 +23,6 @@ from gsmerge.measure.camera_path import (
     parse_path,
     sample_path,
     spline,
-    turned_degrees,
-    turntable,
     viewing_depth,
 )
 from gsmerge.measure.fog import outside_cameras
@@ -73,40 +71,6 @@ def ring(count: int, degrees: float, pitch: float = 0.3) -> Cameras:
         viewmat[:3, 3] = [0, 0, 2] - viewmat[:3, :3] @ [1.0, 2.0, 3.0]
     K = np.array([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
     return Cameras(viewmats, np.tile(K, (count, 1, 1)), 32, 24)
-
-
-@pytest.mark.parametrize(("count", "degrees"), [(1, 0), (7, 60), (24, 330)])
-def test_a_turntable_goes_once_around_the_middle_with_a_level_horizon(count: int, degrees: float) -> None:
-    cameras = ring(count, degrees)
-    path = turntable(cameras, 2.0, 36)
-    pixels, depths = project(np.array([[1.0, 2, 3]]), path)
-    np.testing.assert_allclose(pixels[:, 0], np.tile([16.0, 12.0], (36, 1)), atol=1e-6 if count == 1 else 0.5)
-    np.testing.assert_allclose(depths[:, 0], 2, atol=0.05)
-    if count > 1:
-        np.testing.assert_allclose(path.viewmats[:, 0, 1], 0, atol=0.03)  # the camera's right is level in the world
-        np.testing.assert_allclose(
-            camera_centres(path.viewmats)[:, 1], camera_centres(cameras.viewmats)[0, 1], atol=0.1
-        )
-    np.testing.assert_allclose(path.viewmats[0], cameras.viewmats[median_camera(cameras)], atol=0.05)
-    steps = np.linalg.norm(
-        np.diff(camera_centres(path.viewmats), axis=0, append=camera_centres(path.viewmats)[:1]), axis=1
-    )
-    np.testing.assert_allclose(steps, steps[0])
-    assert turned_degrees(cameras, 2.0) == pytest.approx(degrees, abs=3)
-
-
-def test_a_turntable_among_cameras_that_look_outwards_turns_on_the_spot() -> None:
-    cameras = ring(24, 345, 0.0)
-    outwards = replace(cameras, viewmats=cameras.viewmats - np.array([0, 0, 2.0, 0])[:, None] * [0, 0, 0, 1])
-    path = turntable(outwards, 3.0, 12)
-    assert np.linalg.norm(camera_centres(path.viewmats) - [1, 2, 3], axis=1).max() < 3.5
-    assert np.isfinite(path.viewmats).all()
-
-
-def test_a_turntable_of_cameras_that_look_straight_down_is_one() -> None:
-    path = turntable(ring(3, 20, np.pi / 2), 2.0, 8)
-    assert np.isfinite(path.viewmats).all()
-    np.testing.assert_allclose(np.linalg.det(path.viewmats[:, :3, :3]), 1)
 
 
 def test_a_spline_passes_through_all_cameras_at_even_speed(walk: Cameras) -> None:

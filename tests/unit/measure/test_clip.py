@@ -40,15 +40,11 @@ FFMPEG = f"""#!{sys.executable}
 import sys
 if "-encoders" in sys.argv:
     print(" V....D libx264              H.264")
-    print(" V....D libvpx-vp9           VP9")
     sys.exit()
 width, height = map(int, sys.argv[sys.argv.index("-s") + 1].split("x"))
 import cv2, numpy as np
 fps = int(sys.argv[sys.argv.index("-r") + 1])
-channels = 4 if "bgra" in sys.argv else 3
-frames = np.frombuffer(sys.stdin.buffer.read(), np.uint8).reshape(-1, height, width, channels)
-if channels == 4:
-    frames = frames[..., [3, 3, 3]]
+frames = np.frombuffer(sys.stdin.buffer.read(), np.uint8).reshape(-1, height, width, 3)
 writer = cv2.VideoWriter(sys.argv[-1], cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"vp09"), fps, (width, height))
 for frame in frames:
     writer.write(np.ascontiguousarray(frame))
@@ -82,19 +78,6 @@ def test_h264_where_ffmpeg_is_at_hand(ffmpeg: Path, tmp_path: Path) -> None:
         assert np.abs(drawn.astype(float) - picture).mean() < 12
     ffmpeg.write_text(FFMPEG.replace("libx264", "libx265"), encoding="utf-8")
     assert clip.write_clip(tmp_path / "b.mp4", frames(2), 24) != "H.264"
-
-
-@pytest.mark.skipif(os.name == "nt", reason="programs are no scripts there")
-def test_alpha_where_ffmpeg_is_at_hand(ffmpeg: Path, tmp_path: Path) -> None:
-    """The program of this test shows the alpha."""
-    drawn = [np.dstack([frame, frame[..., 0]]) for frame in frames(12)]
-    assert clip.write_clip(tmp_path / "a.webm", drawn, 24) == "VP9 with alpha"
-    for frame, picture in zip(drawn, read(tmp_path / "a.webm"), strict=True):
-        assert np.abs(frame[..., [3]].astype(float) - picture).mean() < 12
-    ffmpeg.write_text(FFMPEG.replace("libvpx-vp9", "libvpx"), encoding="utf-8")
-    with refuses(SceneError, "b.webm", "ffmpeg", "libvpx-vp9", "folder"):
-        clip.write_clip(tmp_path / "b.webm", drawn, 24)
-    assert not (tmp_path / "b.webm").exists()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="programs are no scripts there")

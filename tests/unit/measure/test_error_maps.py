@@ -3,26 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
 
 from gsmerge import Scene
-from gsmerge.errors import SceneError
-from gsmerge.geometry import sh0_to_rgb
-from gsmerge.measure.error_maps import (
-    MAX_ERROR,
-    STOPS,
-    UNKNOWN,
-    draw_errors,
-    draw_sheets,
-    expected_errors,
-    make_reference,
-    require_photos,
-)
+from gsmerge.measure.error_maps import MAX_ERROR, STOPS, UNKNOWN, draw_errors, expected_errors, make_reference
 from gsmerge.types import Views
 
 WIDTH, HEIGHT = 64, 48
@@ -84,13 +71,6 @@ def test_views_without_a_photo_say_nothing(wall: Scene) -> None:
     """Nor do the pixels that a mask leaves out."""
     masks = np.ones((3, HEIGHT, WIDTH), bool)
     masks[1:] = False
-    alone = replace(wall, masks=masks)
-    with refuses(SceneError, "a.ply", "2 views", "1", "--images"):
-        require_photos(alone, Path("a.ply"))
-    with refuses(SceneError, "a.ply", "2 views", "0", "--images"):
-        require_photos(replace(wall, images=None), Path("a.ply"))
-    require_photos(wall, Path("a.ply"))
-    assert [view for _, view, _ in draw_sheets(alone, {"small": wall.gaussians}, None, {})] == [0]
     assert wall.images is not None
     views = Views(wall.cameras, wall.images, wall.names)
     assert np.isnan(expected_errors(make_reference(wall.gaussians, views, masks), wall.cameras[[0]], 0)).all()
@@ -99,14 +79,3 @@ def test_views_without_a_photo_say_nothing(wall: Scene) -> None:
 def test_colours_go_from_none_to_much() -> None:
     picture = draw_errors(np.array([[0, MAX_ERROR, 9, np.nan, MAX_ERROR / 4]], np.float32))
     assert [tuple(color) for color in picture[0]] == [STOPS[0], STOPS[-1], STOPS[-1], UNKNOWN, STOPS[1]]
-
-
-def test_a_sheet_has_photo_result_and_map(wall: Scene) -> None:
-    assert wall.images is not None
-    held_out = Views(scenes.arc(2, WIDTH, HEIGHT, span=3.0), wall.images[:2], ("a", "b"))
-    sheets = list(draw_sheets(wall, {"small": wall.gaussians[::2]}, held_out, {}))
-    assert [(name, view) for name, view, _ in sheets] == [("small", view) for view in range(5)]
-    assert all(sheet.shape[1] > 3 * WIDTH for *_, sheet in sheets)
-    only = list(draw_sheets(wall, {"small": wall.gaussians}, held_out, {}, context=False))
-    assert [view for _, view, _ in only] == [3, 4]
-    assert sh0_to_rgb(wall.gaussians.sh0).std() > 0.05  # it has a pattern

@@ -6,11 +6,9 @@ import csv
 import io
 import json
 import math
-import re
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import scenes
@@ -22,13 +20,7 @@ from gsmerge.cli.console import say_notes
 from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate, near_plane
 from gsmerge.measure.fog import measure_fog
-from gsmerge.measure.scores import (
-    CSV_COLUMNS,
-    evaluation_csv,
-    evaluation_document,
-    evaluation_lines,
-    evaluation_markdown,
-)
+from gsmerge.measure.scores import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.report import to_json
 from gsmerge.types import Gaussians, Scene, Views
@@ -89,7 +81,7 @@ def test_what_the_input_covers_is_measured_apart(scene: Scene, half: Gaussians) 
     assert before.mean_covered("context")[1].psnr > before.mean("context")[0].psnr + 3
     assert 0.1 < before.mean_covered("target")[0] < 0.95
     document = document_of(lacking)
-    assert "input covers" in evaluation_markdown(document)
+    assert "input covers" in "".join(evaluation_lines(document))
     row = next(csv.DictReader(io.StringIO(evaluation_csv(document))))
     assert float(row["share_covered"]) == pytest.approx(1 - missing.mean())
     assert float(row["psnr_covered"]) > float(row["psnr"])
@@ -181,9 +173,6 @@ def test_bad_arguments(scene: Scene, half: Gaussians, actual: Evaluation) -> Non
     refuse_all(ValueError, [
         (lambda: EvaluateOptions(lpips=("squeeze",)), "lpips", "'squeeze'"),
         (lambda: EvaluateOptions(lpips_views=0), "lpips_views", 1, 0),
-        (lambda: EvaluateOptions(zoom=(0.01,)), "zoom", 0.01), (lambda: EvaluateOptions(zoom=()), "zoom", "none"),
-        (lambda: EvaluateOptions(zoom=(1, 2, 2)), "zoom", "1,2,2"),
-        (lambda: EvaluateOptions(zoom=(math.nan,)), "zoom", "nan"),
         (lambda: EvaluateOptions(photo_side=-1), "photo_side", -1),
         (lambda: EvaluateOptions(photo_side=476.5), "photo_side", 476.5),  # type: ignore[arg-type]
         (lambda: evaluate(scene, {INPUT: half}, None, PLAIN), "results", "'input'"),
@@ -191,24 +180,7 @@ def test_bad_arguments(scene: Scene, half: Gaussians, actual: Evaluation) -> Non
         (lambda: EvaluateOptions(lpips="vgg"), "lpips", "'vgg'"),  # type: ignore[arg-type]
         (lambda: actual.results[1].mean("input"), "split", "context", "target", "'input'"),
         (lambda: actual.results[1].mean_covered("x"), "split", "'x'"),
-        (lambda: actual.results[1].mean("target", zoom=3), "zoom", "None", 3),
     ])  # fmt: skip
-
-
-def test_zooms_are_renders_at_that_size(scene: Scene, half: Gaussians) -> None:
-    views, options = held_out(), replace(PLAIN, zoom=(0.5, 1, 2), context=False)
-    result = evaluate(scene, {"half": half}, views, options).results[1]
-    for score in result.scores:
-        assert list(score.zooms) == [0.5, 1, 2]
-        assert score.zooms[1][1] == score.masked
-    photo = cv2.resize(views.images[1], (24, 18), interpolation=cv2.INTER_AREA)
-    Ks = views.cameras.Ks * np.array([[0.5], [0.5], [1]])
-    small = replace(views.cameras, Ks=Ks, width=24, height=18)[[1]]
-    image = gsmerge.render(half, small).images[0].clip(0, 1)
-    expected = peak_signal_noise_ratio(photo, image, data_range=1)
-    assert result.scores[1].zooms[0.5][0].psnr == pytest.approx(expected, abs=1e-4)
-    mean = np.mean([score.zooms[2][1].ssim for score in result.scores])
-    assert result.mean("target", zoom=2)[1].ssim == pytest.approx(mean)
 
 
 def halved(views: Views) -> Views:
@@ -220,10 +192,9 @@ def halved(views: Views) -> Views:
 
 
 def figures(evaluation: Evaluation) -> np.ndarray:
-    """PSNR and SSIM of every result in every view, over all pixels and the visible ones, at all sizes."""
+    """PSNR and SSIM of every result in every view, over all pixels and the visible ones."""
     scores = [score for result in evaluation.results for score in result.scores]
-    pairs = [pair for score in scores for pair in ((score.full, score.masked), *score.zooms.values())]
-    return np.array([(quality.psnr, quality.ssim) for pair in pairs for quality in pair], float)
+    return np.array([(quality.psnr, quality.ssim) for s in scores for quality in (s.full, s.masked)], float)
 
 
 def expect_equal(actual: Evaluation, expected: Evaluation) -> None:
@@ -234,7 +205,7 @@ def expect_equal(actual: Evaluation, expected: Evaluation) -> None:
 
 
 def test_a_photo_side_is_what_hand_resized_photos_and_cameras_give(scene: Scene, half: Gaussians) -> None:
-    options = replace(PLAIN, zoom=(1, 2))
+    options = PLAIN
     unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     masks = np.ones(scene.images.shape[:3], bool)
     masks[:, :, :9] = False
@@ -276,13 +247,6 @@ def test_a_photo_side_without_photos(scene: Scene, half: Gaussians) -> None:
     assert "photo_side" not in evaluation_document(replace(actual, options=PLAIN), {})
 
 
-def test_the_input_s_renders_are_the_reference_at_every_size(scene: Scene, half: Gaussians) -> None:
-    options = replace(PLAIN, zoom=(0.5, 2), antialiased=True)
-    actual = evaluate(no_pixels(scene), {"half": half}, None, options)
-    assert all(math.isinf(full.psnr or 0) for s in actual.results[0].scores for full, _ in s.zooms.values())
-    assert all((full.psnr or 99) < 60 for s in actual.results[1].scores for full, _ in s.zooms.values())
-
-
 def test_antialiased(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     views = held_out()
     result = evaluate(scene, {"half": half}, views, replace(PLAIN, antialiased=True, context=False)).results[1]
@@ -290,23 +254,6 @@ def test_antialiased(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     expected = peak_signal_noise_ratio(views.images[0], image, data_range=1)
     assert result.scores[0].full.psnr == pytest.approx(expected, abs=1e-4)
     assert result.mean("target") != actual.results[1].mean("target")
-
-
-def test_documents_have_zooms_where_they_were_asked_for(scene: Scene, actual: Evaluation) -> None:
-    plain = evaluation_document(actual, {})
-    assert "zooms" not in plain["results"][0]["views"][0]
-    assert "antialiased" not in plain
-    zoomed = evaluate(scene, {}, held_out(), replace(PLAIN, zoom=(0.5, 2), antialiased=True))
-    document = evaluation_document(zoomed, {})
-    assert document["antialiased"]
-    sizes = document["results"][0]["mean"]["target"]["zooms"]
-    assert [tuple(one) for one in sizes] == [("zoom", "psnr", "ssim", "psnr_visible", "ssim_visible")] * 2
-    row = list(csv.DictReader(io.StringIO(evaluation_csv(document))))[-1]
-    assert float(row["psnr_visible_zoom_0.5"]) == zoomed.results[0].scores[-1].zooms[0.5][1].psnr
-    lines = evaluation_lines(document)
-    assert "held-out views at other sizes" in lines[-3]
-    assert "PSNR 0.5x" in lines[-2]
-    assert f"{sizes[0]['psnr_visible']:.2f}" in lines[-1]
 
 
 def test_csv_has_a_row_for_each_result_and_view(actual: Evaluation) -> None:
@@ -330,11 +277,9 @@ def test_names_in_csv_are_no_formulas(actual: Evaluation) -> None:
 def document_of(actual: Evaluation) -> dict[str, Any]:
     """A document with facts of files and costs, under a name that is markup."""
     odd = replace(actual, results=(actual.results[0], replace(actual.results[1], name="a|b<i>")))
-    speeds = [{"width": 4, "height": 3, "threads": 1, "seconds": s} for s in (0.2, 0.1)]
     facts: dict[str, dict[str, Any]] = {
-        "input": {"path": "in.ply", "bytes": 4000, "overdraw": 9.0, "speeds": speeds[:1]},
-        "a|b<i>": {"bytes": 1000, "bytes_by_attribute": {"means": 34 * len(actual.results[1].scores)},
-                   "overdraw": 3.0, "speeds": [{**speeds[1], "speedup": 2.0}]},
+        "input": {"path": "in.ply", "bytes": 4000},
+        "a|b<i>": {"bytes": 1000, "bytes_by_attribute": {"means": 34 * len(actual.results[1].scores)}},
     }  # fmt: skip
     return evaluation_document(odd, facts, ["first <note>"])
 
@@ -359,23 +304,7 @@ def test_narrow_terminals_keep_psnr_and_whole_words(actual: Evaluation) -> None:
         assert max(map(len, lines)) <= columns
         assert {word for line in lines for word in line.split()} <= words
         assert sum(names(line, "PSNR (dB)", "SSIM") for line in lines) == 2
-        assert not any("bytes each" in line for line in lines)
-
-
-def test_costs_are_columns(actual: Evaluation) -> None:
-    text = "\n".join(evaluation_lines(document_of(actual)))
-    assert "4.0 x" in text
-    assert "overdraw" in text
-
-
-def test_markdown_has_whole_tables(actual: Evaluation) -> None:
-    markdown = evaluation_markdown(document_of(actual))
-    assert markdown.startswith("# in.ply: ")
-    assert "- first &lt;note&gt;" in markdown
-    tables = [block for block in markdown.split("\n\n") if block.startswith("|")]
-    assert len(tables) == 5
-    for table in tables:
-        assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}) == 1, table
+        assert any("bytes each" in line for line in lines) == (columns == 79)
 
 
 def test_fog_and_holes_are_of_each_result(scene: Scene, half: Gaussians, actual: Evaluation) -> None:

@@ -6,27 +6,8 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge.measure.sizes import (
-    fill_cameras,
-    fill_photo,
-    resize_mask,
-    resize_photo,
-    shrink_cameras,
-    shrink_views,
-    zoom_cameras,
-)
+from gsmerge.measure.sizes import fill_cameras, fill_photo, resize_mask, resize_photo, shrink_cameras, shrink_views
 from gsmerge.types import Views
-
-
-def test_intrinsics_go_with_the_size() -> None:
-    cameras = scenes.arc(2, 48, 36)
-    twice = zoom_cameras(cameras, 2)
-    assert (twice.width, twice.height) == (96, 72)
-    np.testing.assert_allclose(twice.Ks[:, :2], 2 * cameras.Ks[:, :2])
-    np.testing.assert_allclose(twice.Ks[:, 2], cameras.Ks[:, 2])
-    odd = zoom_cameras(cameras, 7 / 48)
-    assert (odd.width, odd.height) == (7, 5)
-    assert zoom_cameras(scenes.arc(1, 48, 2), 1 / 16).height == 1
 
 
 @pytest.mark.parametrize("size", [(96, 54), (40, 80), (49, 36), (20, 9), (48, 36)])

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge.facts.views import subset
+from gsmerge.facts.views import resize_cameras, subset
 from gsmerge.measure import visibility
-from gsmerge.measure.sizes import zoom_cameras
 from gsmerge.measure.visibility import context_points, front_rows, visible_pixels
 from gsmerge.types import Cameras, Gaussians, Scene
 
@@ -42,10 +41,10 @@ def test_mask_is_that_of_the_slow_loop(rows: int, monkeypatch: pytest.MonkeyPatc
 def test_larger_pictures_have_no_gaps_between_samples(factor: int) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(1, 24, 18))
     points, cameras = context_points(scene, 0.01), scene.cameras
-    large = zoom_cameras(cameras, factor)
+    large = resize_cameras(cameras, 24 * factor, 18 * factor)
     assert visible_pixels(points, large, 0.01, cameras).all()
     assert not visible_pixels(points, large, 0.01).all() or factor < 4
-    small = zoom_cameras(cameras, 0.5)
+    small = resize_cameras(cameras, 12, 9)
     assert np.array_equal(visible_pixels(points, small, 0.01, cameras), visible_pixels(points, small, 0.01))
 
 
