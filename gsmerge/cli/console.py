@@ -23,7 +23,6 @@ PREFIXES: Mapping[Kind, str] = {
 }  # fmt: skip
 MAX_LINE = 5000  # characters
 NARROW = 60  # columns; narrower terminals get shorter bars with less text
-OPENING = "start ..."  # shown on a terminal until a command prints its first line or bar
 
 
 @dataclass
@@ -36,7 +35,6 @@ class JsonLines:
 
     def print(self, event: Mapping[str, Any]) -> None:
         """Print an event with the seconds since the start, the share that is done and the seconds left."""
-        _erase_opening()
         share, left = self.share, self.seconds_left
         numbers = {"share": None if share is None else round(share, 3), "seconds": round(self.seconds, 2)}
         numbers["seconds_left"] = None if left is None else round(left, 1)
@@ -65,33 +63,12 @@ class JsonLines:
 
 
 _stream: ContextVar[JsonLines | None] = ContextVar("stream", default=None)  # None: progress is not shown as JSON
-_opening: list[str] = []  # text on the terminal's last line that has to be erased
 
 
 def one_line(text: str) -> str:
     """Escape text from files or names for a terminal, and shorten it to one line."""
     clean = text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
     return clean if len(clean) <= MAX_LINE else f"{clean[: MAX_LINE // 2]} ... {clean[-MAX_LINE // 2 :]}"
-
-
-@contextmanager
-def opening_line(*, quiet: bool) -> Iterator[None]:
-    """Show that a command has started, since imports may take a second; only on a terminal and unless ``quiet``."""
-    with suppress(OSError):
-        if not quiet and sys.stderr.isatty():
-            _opening.append(f"{OPENING:>16}")
-            print(_opening[0], end="", file=sys.stderr, flush=True)
-    try:
-        yield
-    finally:
-        _erase_opening()
-
-
-def _erase_opening() -> None:
-    """Erase the text of :func:`opening_line` from the terminal."""
-    while _opening:
-        with suppress(OSError):
-            print("\r" + " " * len(_opening.pop()), end="\r", file=sys.stderr, flush=True)
 
 
 def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
@@ -107,7 +84,6 @@ def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
         return
     from gsmerge.report import wrap_line
 
-    _erase_opening()
     text = one_line(PREFIXES[kind] + message)
     with suppress(OSError):
         print("\n".join(wrap_line(text, terminal_columns(sys.stderr))), file=sys.stderr, flush=True)
@@ -151,7 +127,6 @@ def print_document(
     """Print a result on stdout as JSON or, unless ``quiet``, as lines; ``wrap``: break long lines in a terminal."""
     from gsmerge.report import to_json, wrap_line
 
-    _erase_opening()
     if as_json:
         sys.stdout.write(to_json(document))
     elif not quiet:
@@ -184,7 +159,6 @@ def _terminal(*, quiet: bool) -> Any:
         return None
     from rich.console import Console
 
-    _erase_opening()
     console = Console(stderr=True)
     # The terminal prints ^C after the bar on Ctrl-C, which must not wrap to a new line
     console.width = max(20, console.width - len("^C") - 1)

@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-from gsmerge.cli.console import opening_line
 from gsmerge.errors import UsageError
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.budget import parse_share
@@ -290,11 +289,10 @@ def command(*parameters: str | Parameter) -> Callable[[Callable[[Args], None]], 
         def run(**values: Any) -> None:
             plain = {name: value.value if isinstance(value, Enum) else value for name, value in values.items()}
             args = Args(**plain)
-            with opening_line(quiet=args.silent):
-                from gsmerge.runtime.memory import keep_memory
+            from gsmerge.runtime.memory import keep_memory
 
-                keep_memory()
-                function(args)
+            keep_memory()
+            function(args)
 
         run.__signature__ = Signature(list(listed.values()))  # type: ignore[attr-defined]
         run.__annotations__ = {}

@@ -1,4 +1,4 @@
-"""States in files: extend them by scenes, decode their Feature Gaussians, and write these as arrays."""
+"""States in files: extend them by scenes, and decode their Feature Gaussians."""
 
 from __future__ import annotations
 
@@ -9,15 +9,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
-from zipfile import ZipFile
-
-import numpy as np
 
 from gsmerge.compaction.files import read_input
 from gsmerge.compaction.outputs import add_views, name_photos
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_output, atomic_outputs, output_format
-from gsmerge.io.archives import new_member
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.rounding import rounding_notes
@@ -35,11 +31,9 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.compactor import extend_state
 from gsmerge.states.extend import BATCH
-from gsmerge.states.features import decode_features, feature_arrays
+from gsmerge.states.features import decode_features
 from gsmerge.states.state_file import State, load_state, save_state
 from gsmerge.words import count_words
-
-ARRAYS = ".npz"  # ending of a file with the arrays of Feature Gaussians
 
 
 def extend_file(
@@ -229,28 +223,3 @@ def decoding_line(document: Mapping[str, Any]) -> str:
         f" ({human_share(document['ratio'])} of the scene's), {human_bytes(before['bytes'])} ->"
         f" {human_bytes(after['bytes'])}; {seconds_line(document)}"
     )
-
-
-def convert_features(path: Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
-    """Write the Feature Gaussians in a ``.gsm`` as an ``.npz``; return the report as plain JSON types.
-
-    Raises SceneError if a file cannot be read or written, or if it holds results.
-    """
-    features = load_state(path).features
-    if features is None:
-        raise SceneError(path, "expected Feature Gaussians, found results", "name a .ply as the output")
-    arrays = feature_arrays(features)
-    with atomic_output(out, overwrite=overwrite) as temporary, ZipFile(temporary, "w") as archive:
-        for name, array in arrays.items():
-            with archive.open(new_member(f"{name}.npy"), "w", force_zip64=True) as file:
-                np.save(file, array, allow_pickle=False)
-    before = {"path": str(path), "bytes": path.stat().st_size}
-    after = {"path": str(out), "bytes": out.stat().st_size, "num_groups": len(features), "format": ARRAYS}
-    after["arrays"] = {name: list(array.shape) for name, array in arrays.items()}
-    return document_head() | {"inputs": [before], "left_out": {}, "output": after, "viewer_cameras": None, "notes": []}
-
-
-def arrays_line(document: Mapping[str, Any]) -> str:
-    """Describe the report of :func:`convert_features` in one line."""
-    after = document["output"]
-    return f"{after['path']}: {after['num_groups']:,} Feature Gaussians, {human_bytes(after['bytes'])}"

@@ -248,27 +248,13 @@ def test_feature_gaussians_in_every_kind_of_output(
     )
 
 
-def test_feature_gaussians_as_arrays(features: Path, tmp_path: Path, run: Run) -> None:
-    out = tmp_path / "features.npz"
-    document = json.loads(run("convert", features, out, "--json", code=0).out)
-    with np.load(out) as arrays:
-        count = len(arrays["means"])
-        assert {name: list(array.shape) for name, array in arrays.items()} == document["output"]["arrays"]
-    assert (document["output"]["num_groups"], document["output"]["bytes"]) == (count, out.stat().st_size)
-    assert_refused(run("convert", features, out), 2, "features.npz", "--overwrite")
-    assert f"{count:,} Feature Gaussians" in run("convert", features, out, "--overwrite", code=0).out
-    assert "Feature Gaussians" in run("inspect", features, code=0).out
-
-
 def test_what_feature_gaussians_are_not_made_into(features: Path, states: list[Path], tmp_path: Path, run: Run) -> None:
     for words, place, *found in (
         (("compact", features, "--budget", "10"), "--budget", features),
         (("compact", features, states[0], "-o", tmp_path / "a.ply"), features, "only input", 2),
         (("compact", features, "--k", "8", "-o", tmp_path / "a.ply"), "k", "1 to 4"),
-        (("convert", states[0], states[0], tmp_path / "a.npz"), tmp_path / "a.npz", ".gsm"),
     ):
         assert_refused(run(*words), 2, place, *found)
-    assert_refused(run("convert", states[0], tmp_path / "a.npz"), 3, states[0], "Feature Gaussians", "results")
     assert_refused(run("convert", features, tmp_path / "a.ply"), 3, features, "results", "Feature Gaussians")
     assert listing(tmp_path) == {}
 
@@ -314,7 +300,7 @@ def test_a_damaged_state_is_refused_by_all(spoil: Change, state: Path, walks: li
     before = digests(state.parent)
     for words in (
         ("extend", state, walks[1]), ("compact", state, "-o", out, "--overwrite"), ("inspect", state),
-        ("convert", state, out, "--overwrite"), ("convert", state, state.parent / "a.npz"),
+        ("convert", state, out, "--overwrite"),
     ):  # fmt: skip
         assert_refused(run(*words), 3, state)
     assert digests(state.parent) == before

@@ -10,18 +10,7 @@ from contextlib import redirect_stderr
 
 import pytest
 
-from gsmerge.cli.console import (
-    OPENING,
-    RunEnd,
-    json_progress,
-    opening_line,
-    plain_warnings,
-    print_document,
-    say,
-    say_warning,
-    stage_progress,
-    total_progress,
-)
+from gsmerge.cli.console import RunEnd, json_progress, plain_warnings, say_warning, stage_progress, total_progress
 from gsmerge.raster.metrics import WORSE
 
 
@@ -42,26 +31,8 @@ def terminal_of_100_columns(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
 
 
-def test_a_terminal_shows_at_once_that_a_command_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    with redirect_stderr(Terminal()) as terminal, opening_line(quiet=False):
-        assert terminal.lines() == [OPENING]
-        say("read")
-        print_document({}, "data", as_json=False)
-        say("done")
-    assert [line for line in terminal.lines() if line] == [OPENING, "read", "done"]
-    assert terminal.getvalue().count("\r") == 2  # erased once
-    assert capsys.readouterr().out == "data\n"
-
-
-@pytest.mark.parametrize(("stream", "quiet"), [(Terminal(), True), (io.StringIO(), False)], ids=["quiet", "pipe"])
-def test_nothing_is_shown_where_nobody_looks(stream: io.StringIO, quiet: bool) -> None:
-    with redirect_stderr(stream), opening_line(quiet=quiet):
-        assert stream.getvalue() == ""
-    assert stream.getvalue() == ""
-
-
-def test_bars_of_stages_replace_the_first_line() -> None:
-    with redirect_stderr(Terminal()) as terminal, opening_line(quiet=False), stage_progress(quiet=False) as progress:
+def test_bars_of_stages_have_their_names_and_counts() -> None:
+    with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as progress:
         progress("examples: room", 2, 6)
     bars = [line for line in terminal.lines() if line.startswith("examples")]
     assert "6/6" in bars[-1]
