@@ -99,10 +99,6 @@ def test_new_views_come_first(files: tuple[Path, Path]) -> None:
     assert make_document(files)["new_views"] is None
 
 
-def test_summary_line_without_photos(files: tuple[Path, Path]) -> None:
-    assert "dB" not in report.summary_line(make_document(files, psnr_before=None, psnr_after=None))
-
-
 def test_photos_as_their_files_have_them_are_left_out_if_all_is_equal(files: tuple[Path, Path]) -> None:
     for before, is_shown in ((20.0, False), (20.1, True)):
         document = make_document(files, photo_files=PhotoFiles(before, 24.5001))

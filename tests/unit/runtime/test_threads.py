@@ -42,11 +42,6 @@ def test_one_pool_works_at_once() -> None:
         assert len(parallel_map(lambda _: barrier.wait(), range(3))) == 3
 
 
-def test_one_thread_is_the_callers() -> None:
-    with use_threads(1):
-        assert parallel_map(lambda _: threading.get_ident(), range(3)) == [threading.get_ident()] * 3
-
-
 def test_other_libraries_are_held_to_one_thread(torch: Any) -> None:
     with use_threads(2):
         assert (torch.get_num_threads(), cv2.getNumThreads()) == (1, 1)
