@@ -151,12 +151,6 @@ def test_knee_weighs_structure_against_psnr() -> None:
     assert curve_knee(grows) == 800
 
 
-@pytest.mark.parametrize("function", [lambda p: count_within(p, 0.1), curve_knee])
-def test_a_curve_needs_a_point(function: Callable[[list[CurvePoint]], int]) -> None:
-    with refuses(ValueError, "points", "none"):
-        function([])
-
-
 def rises(count: int) -> float:
     """2 dB per doubling."""
     return 20 + 2 * log2(count / 1000)

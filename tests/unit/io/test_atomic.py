@@ -25,12 +25,6 @@ def write_half_and_fail(path: Path, error: BaseException) -> None:
         raise error
 
 
-def write_while_another_does(path: Path) -> None:
-    with atomic_output(path) as temporary:
-        temporary.write_text("ours")
-        path.write_text("theirs")
-
-
 def test_a_finished_file_takes_its_name(tmp_path: Path) -> None:
     with atomic_output(tmp_path / "out.png") as temporary:
         assert temporary.parent == tmp_path
@@ -63,14 +57,6 @@ def test_an_existing_file_needs_overwrite(tmp_path: Path) -> None:
     with atomic_output(target, overwrite=True) as temporary:
         temporary.write_text("new")
     assert target.read_text() == "new"
-
-
-def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
-    target = tmp_path / "out.txt"
-    with pytest.raises(SceneError, match="exists"):
-        write_while_another_does(target)
-    assert [p.name for p in tmp_path.iterdir()] == ["out.txt"]
-    assert target.read_text() == "theirs"
 
 
 def test_missing_folders_are_made_and_removed_where_the_block_fails(tmp_path: Path) -> None:
