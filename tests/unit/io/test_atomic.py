@@ -16,7 +16,7 @@ from messages import NO_FOLDER, refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic, atomic_output, atomic_outputs
-from gsmerge.io.atomic import link_file, temporary_path
+from gsmerge.io.atomic import link_file, remove_stale, temporary_path
 
 
 def write_half_and_fail(path: Path, error: BaseException) -> None:
@@ -114,6 +114,16 @@ def test_what_dead_processes_left_is_removed_and_what_others_write_is_not(tmp_pa
     with atomic_output(tmp_path / "out.ply"):
         pass
     assert sorted(tmp_path.iterdir()) == sorted([*kept, recent, tmp_path / "out.ply"])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="states of processes as Linux shows them")
+def test_what_a_process_left_is_removed_before_its_parent_knows_of_its_end(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        left = left_by(process.pid, tmp_path / "out.ply")
+        left.touch()
+        remove_stale(tmp_path)
+        assert not left.exists()
 
 
 def write_both(folder: Path, second: str, *, fail: bool = False) -> None:
