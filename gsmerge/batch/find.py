@@ -101,47 +101,32 @@ class _Search:
     seen: set[str] = field(default_factory=set)  # real paths of the folders entered so far
     num_empty: int = 0  # folders since the last scene
 
-    def walk(self, folder: Path) -> Iterator[NamedScene]:
+    def walk(self, top: Path) -> Iterator[NamedScene]:
         """Yield the scenes in a folder, or the folder itself if it has a scene file with a usual name."""
-        for current, names, folders in self.folders(folder):
-            if names is None:
-                scenes = [current]
-            elif _is_scene(current, names):
-                folders[:] = [name for name in folders if name not in SCENE_PARTS]
-                scenes = [current]
-            else:
-                scenes = _other_scenes(current, names)
-            self.num_empty = 0 if scenes else self.num_empty
-            yield from ((scene, folder) for scene in scenes)
+        unreadable: list[NamedScene] = []  # reading such a folder reports the reason
 
-    def folders(self, top: Path) -> Iterator[tuple[Path, list[str] | None, list[str]]]:
-        """Yield a folder and all folders below it, each with the names in it and a list of its folders' names.
+        def note_error(error: OSError) -> None:
+            unreadable.append((Path(error.filename), top))
 
-        The names are None if the folder cannot be read. A folder is not entered if the caller removes its name from the
-        list.
-        """
-        stack = [(top, os.path.realpath(top))]
-        while stack:
-            folder, real = stack.pop()
+        for folder, folders, files in os.walk(top, followlinks=True, onerror=note_error):
+            yield from unreadable
+            unreadable.clear()
+            current, names, real = Path(folder), [*folders, *files], os.path.realpath(folder)
             if real == self.skip or real in self.seen:
+                folders.clear()
                 continue
             self.seen.add(real)
             self.num_empty += 1
             if self.num_empty > MAX_FOLDERS:
                 problem = f"expected scenes, found more than {MAX_FOLDERS:,} folders without one"
                 raise SceneError(folder, problem, "name the folders of the scenes, or a list of them")
-            try:
-                with os.scandir(folder) as opened:
-                    entries = {entry.name: entry for entry in opened}
-            except OSError:
-                yield folder, None, []
-                continue
-            names = natural_order(name for name in entries if not name.startswith("."))
-            folders = [name for name in names if _is_folder(entries[name])]
-            yield folder, list(entries), folders
-            for name in reversed(folders):
-                below = os.path.join(real, name)
-                stack.append((folder / name, os.path.realpath(below) if entries[name].is_symlink() else below))
+            is_scene = _is_scene(current, names)
+            omitted = SCENE_PARTS if is_scene else ()
+            folders[:] = natural_order(name for name in folders if not name.startswith(".") and name not in omitted)
+            scenes = [current] if is_scene else _other_scenes(current, names)
+            self.num_empty = 0 if scenes else self.num_empty
+            yield from ((scene, top) for scene in scenes)
+        yield from unreadable
 
 
 def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
@@ -156,13 +141,6 @@ def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
         if scenes or os.path.isdir(folder):
             return scenes
     return [folder]  # reading it reports the reason
-
-
-def _is_folder(entry: os.DirEntry[str]) -> bool:
-    try:
-        return entry.is_dir()
-    except OSError:  # it is a link to itself, or into a folder that cannot be read
-        return False
 
 
 def _is_scene(folder: Path, names: list[str]) -> bool:

@@ -22,6 +22,7 @@ PREFIXES: Mapping[Kind, str] = {
     "info": "", "note": "note: ", "warning": "gsmerge: warning: ", "error": "gsmerge: error: ",
 }  # fmt: skip
 MAX_LINE = 5000  # characters
+NARROW = 60  # columns; narrower terminals get shorter bars with less text
 
 
 @dataclass
@@ -153,72 +154,55 @@ def json_progress(lines: JsonLines | None = None) -> Iterator[None]:
         _stream.reset(token)
 
 
-def _print_stages(stream: JsonLines) -> Progress:
-    """Return a progress callback that prints each event as JSON."""
+def _share(text: str, done: int, total: int) -> float | None:
+    """Return the share of a run that is done at an event of progress; None if it is not known.
+
+    It follows from the parts that the run expects; without any, from the steps of a stage that counts them.
+    """
     from gsmerge.runtime.record import STAGES, current_record
 
-    def move(text: str, done: int, total: int) -> None:
-        stage, _, detail = one_line(text).partition(": ")
-        share = 1.0 if stage == "done" else current_record().forecast.share
-        if share is None and total and (detail or stage not in STAGES):
-            share = done / total
-        stream.move(share)
-        stream.print({"stage": stage, "detail": detail, "done": done, "total": total})
-
-    return move
+    if text == "done":
+        return 1.0
+    share = current_record().forecast.share
+    return done / total if share is None and total and text not in STAGES else share
 
 
 @contextmanager
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
-    """Show a progress bar per stage on stderr, if it is a terminal (or ``FORCE_COLOR`` is set) and not ``quiet``.
+    """Show a progress bar of a run on stderr, if it is a terminal (or ``FORCE_COLOR`` is set) and not ``quiet``.
 
-    Yields ``(stage, done, total) -> None``; a stage is done when the next one begins.
+    Yields ``(stage, done, total) -> None``, which shows the stage, and the time left at the rate so far.
     """
-    stream = _stream.get()
+    stream, console = _stream.get(), _terminal(quiet=quiet)
     if stream is not None:
-        yield _print_stages(stream)
+
+        def print_event(text: str, done: int, total: int) -> None:
+            stage, _, detail = one_line(text).partition(": ")
+            stream.move(_share(text, done, total))
+            stream.print({"stage": stage, "detail": detail, "done": done, "total": total})
+
+        yield print_event
         return
-    console = _terminal(quiet=quiet)
     if console is None:
         yield lambda stage, done, total: None
         return
     from rich import progress as rich
+    from rich.table import Column
 
-    from gsmerge.runtime.record import STAGES
-
-    columns = (
-        rich.TextColumn("{task.description:>12}", markup=False), rich.BarColumn(16), rich.TimeElapsedColumn(),
-        rich.TextColumn("{task.fields[count]}"), rich.TimeRemainingColumn(compact=True),
-        rich.TextColumn("{task.fields[detail]}", markup=False),
-    )  # fmt: skip
+    text_column = Column(no_wrap=True, overflow="ellipsis")
+    is_wide = console.width >= NARROW
+    columns = [rich.BarColumn(16 if is_wide else 8), rich.TimeRemainingColumn(compact=True)]
+    columns += [rich.TimeElapsedColumn()] if is_wide else []
+    columns += [rich.TextColumn("{task.description}", markup=False, table_column=text_column)]
     with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
-        tasks: dict[str, Any] = {}
-        totals: dict[str, int] = {}
-        running: list[str] = []
+        task = bars.add_task("", total=None)
 
-        def finish() -> None:
-            for name in running:
-                count = f"{totals[name]}/{totals[name]}" if name in totals else ""
-                bars.update(tasks[name], total=1, completed=1, count=count)
-                bars.stop_task(tasks[name])
-            running.clear()
-
-        def move(stage: str, done: int, total: int) -> None:
-            name, _, detail = one_line(stage).partition(": ")
-            if running != [name]:
-                finish()
-                if name == "done":
-                    return
-                if name in tasks:
-                    bars.remove_task(tasks[name])
-                tasks[name] = bars.add_task(name, total=None, count="", detail="")
-                running.append(name)
-            if total and (detail or name not in STAGES):
-                totals[name] = total
-                bars.update(tasks[name], completed=done, total=total, count=f"{done}/{total}", detail=detail)
+        def move(text: str, done: int, total: int) -> None:
+            share, is_stage = _share(text, done, total), ": " not in text
+            total_share = None if share is None else 1.0
+            bars.update(task, description=one_line(text), completed=share, total=total_share, refresh=is_stage)
 
         yield move
-        finish()
 
 
 @contextmanager

@@ -27,8 +27,7 @@ class PhotoOptions(Settings):
                  "Files or folders of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb, lod-meta.json, "
                  ".ksplat, meta.json, .lcc or .lcc2. Several files in one coordinate frame are joined. The last path "
                  "is the output, and its name sets the format: .ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html (a "
-                 "page to send), lod-meta.json, a folder, or a folder named colmap. Or a .gsm of gsmerge extend, and "
-                 "a .npz for the arrays of its Feature Gaussians."),
+                 "page to send), lod-meta.json, a folder, or a folder named colmap."),
     opt.changed("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
     opt.changed("hint", help="How the files store opacity and scales, if it is not recognised: opacity=logit or "
@@ -42,9 +41,6 @@ def convert(args: opt.Args) -> None:
     if not inputs:
         remedy = f"name the output last, as in gsmerge convert {output} x.spz"
         raise UsageError(f"expected files to read and one to write, got only {output}; {remedy}")
-    if output.suffix.lower() == ".npz":
-        _convert_features(args, inputs, output)
-        return
     from gsmerge.scene.files import find_plys
 
     inputs = [file for path in inputs for file in (find_plys(path) if path.is_dir() else [path])]
@@ -66,18 +62,3 @@ def convert(args: opt.Args) -> None:
         document = convert_files(options)
     say_notes(document["notes"], quiet=args.silent)
     print_document(document, conversion_line(document), as_json=args.json, quiet=args.quiet)
-
-
-def _convert_features(args: opt.Args, inputs: list[Path], output: Path) -> None:
-    """Write the Feature Gaussians of a ``.gsm`` as arrays."""
-    from gsmerge.io.formats.table import STATE_ENDING
-
-    path = inputs[0]
-    if len(inputs) > 1 or path.suffix.lower() != STATE_ENDING:
-        raise UsageError(f"{output}: expected one {STATE_ENDING} of Feature Gaussians to write as arrays, got {path}")
-    args.require_scene(("paths", "overwrite", "json", "quiet"), path)
-    from gsmerge.states.files import arrays_line, convert_features
-
-    check_outputs((output,), (path,), overwrite=args.overwrite)
-    document = convert_features(path, output, overwrite=args.overwrite)
-    print_document(document, arrays_line(document), as_json=args.json, quiet=args.quiet)

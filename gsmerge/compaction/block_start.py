@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.partition import Block, Covisibility, owning_views
-from gsmerge.compaction.scores import InputScores, score_input
+from gsmerge.compaction.scores import measure_input
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.frame import Frame
 from gsmerge.frozen import dataclass
@@ -31,7 +31,7 @@ class BlockStart:
     count: int  # Gaussians that the block is to have in the end
     prepared: Prepared  # Its views, without the Gaussians of their pixels
     plan: Plan
-    before: InputScores
+    psnr_before: float | None  # Of the input on the scored photos, dB; None without photos
 
 
 def start_block(
@@ -46,9 +46,9 @@ def start_block(
     plan = make_plan(prepared, options)
     decoded = decode_views(prepared, plan, plan.limits.count)
     keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
-    before = score_input(prepared, plan)
+    before = measure_input(prepared, plan)
     count, prepared = round(keep.sum() / max(1, len(keep)) * decoded.count), without_gaussians(prepared)
-    return BlockStart(block, decoded.gaussians[keep], count, prepared, plan, before)
+    return BlockStart(block, decoded.gaussians[keep], count, prepared, plan, None if before is None else before.psnr)
 
 
 def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
@@ -77,8 +77,6 @@ def without_gaussians(prepared: Prepared) -> Prepared:
         images = move(np.asarray(scene.images))  # views with Gaussians of their own always have pictures
         return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=images, pixels=None)
 
-    reference = prepared.reference
-    if reference.photo_files is not None:
-        reference = replace(reference, photo_files=move(reference.photo_files))
+    reference = replace(prepared.reference, photo_files=None)
     scene, input_scene = empty(prepared.scene), empty(prepared.input_scene)
     return replace(prepared, reference=reference, scene=scene, input_scene=input_scene)

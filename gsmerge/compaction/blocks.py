@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsmerge.budget import file_size
-from gsmerge.compaction.block_report import BlockScores, join_reports
+from gsmerge.compaction.block_report import join_reports
 from gsmerge.compaction.block_start import BlockStart, start_block
 from gsmerge.compaction.costs import RunCosts
 from gsmerge.compaction.file_size import drop_to_bytes, measure_rest
@@ -23,7 +23,7 @@ from gsmerge.compaction.partition import (
     partition_views,
 )
 from gsmerge.compaction.result import CompactResult
-from gsmerge.compaction.scores import measure_parts, measure_result
+from gsmerge.compaction.scores import measure_result
 from gsmerge.compaction.seams import fit_seams
 from gsmerge.facts.views import subset
 from gsmerge.fit import fit_scene, peak_weights
@@ -117,7 +117,7 @@ def compact_in_blocks(
     facts = [
         {
             "views": len(start.block.own), "shared_views": len(start.block.shared), "num_start": len(start.gaussians),
-            "psnr_input_views": score.psnr, "fit": block_choices.get("fit"),
+            "psnr_input_views": score, "fit": block_choices.get("fit"),
         }
         for start, (_, block_choices), score in zip(starts, fitted, scores, strict=True)
     ]  # fmt: skip
@@ -180,12 +180,11 @@ def fit_block(start: BlockStart, everything: tuple[Gaussians, np.ndarray], growt
     return fitted.gaussians[owners[rows[fitted.report.origins]] == number]
 
 
-def score_block(start: BlockStart, gaussians: Gaussians, _: int) -> BlockScores:
-    """Score the whole result on the photos of a block."""
+def score_block(start: BlockStart, gaussians: Gaussians, _: int) -> float | None:
+    """Return the PSNR (dB) of the whole result on the photos of a block; None without photos."""
     begin_part()
     measured = measure_result(gaussians, start.prepared, start.plan)
-    psnr = None if measured is None else measured.psnr
-    return BlockScores(psnr, measure_parts(start.before, gaussians, start.prepared, start.plan))
+    return None if measured is None else measured.psnr
 
 
 def finish_joined(

@@ -109,8 +109,6 @@ def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
 
     Points come by rising count. Between them the quality is linear in the logarithm of the count.
     """
-    if not points:
-        raise ValueError("points: expected at least one, got none")
     best = max(point.quality for point in points)
     return count_reaching([(point.count, point.quality) for point in points], best - max_drop)
 
@@ -131,8 +129,6 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
     the middle of two neighbouring points is the slope of the line between them. Between the middles the slope is
     linear. Points come by rising count.
     """
-    if not points:
-        raise ValueError("points: expected at least one, got none")
     doublings = [float(log(p.count) / log(2)) for p in points]
     pairs = list(pairwise(range(len(points))))
     middles = [(doublings[a] + doublings[b]) / 2 for a, b in pairs]

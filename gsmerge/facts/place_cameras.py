@@ -105,11 +105,6 @@ def placed_views(steps: int) -> int:
     return FITTED_LONG if steps >= LONG else FITTED
 
 
-def count_placed(count: int) -> int:
-    """Return how many views :func:`draw_placed` adds for a ``count``."""
-    return 3 * count + count // 2
-
-
 def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
     """Add renders of a canonical scene from placed views, which come last.
 

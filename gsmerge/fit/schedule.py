@@ -48,7 +48,7 @@ DRAW_MODES = (
     (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
 )  # fmt: skip
 
-Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos, share of the first steps
+OnStep = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos, share of the first steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class FitJob:
     count: int = 0  # Gaussians to grow to, where the run is long enough
     most_growth: int | None = None  # Most Gaussians after the growth, relative to those before it; None: any number
     seed: int = 0
-    progress: Progress | None = None  # Called after each step
+    progress: OnStep | None = None  # Called after each step
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay unchanged; None: none
     # If renders stand for photos, the result is scored on this number of first photos; None: on all photos
     num_scored: int | None = None

@@ -17,5 +17,4 @@ from gsmerge.io.formats.table import output_format as output_format
 from gsmerge.io.formats.write import lost_harmonics as lost_harmonics
 from gsmerge.io.formats.write import write_gaussians as write_gaussians
 from gsmerge.io.formats.write import write_ply as write_ply
-from gsmerge.io.locks import lock_folder as lock_folder
 from gsmerge.io.photo_files import read_images as read_images

@@ -253,7 +253,11 @@ def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
         os.kill(pid, 0)
     except (OSError, OverflowError) as error:  # any other error: a process of another user
         return isinstance(error, ProcessLookupError)
-    return False
+    try:  # a killed process whose parent has not asked for its exit status is still listed, as a zombie
+        status = Path(f"/proc/{pid}/stat").read_bytes()
+        return status.rpartition(b") ")[2][:1] in (b"Z", b"X")
+    except OSError:
+        return False
 
 
 def _refuse(path: Path, overwrite: bool) -> None:

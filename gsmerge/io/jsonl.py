@@ -13,7 +13,9 @@ from typing import Any
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import ReadBudget, parse_json, read_budget, read_errors
-from gsmerge.io.locks import lock_folder
+from gsmerge.io.locks import lock_file
+
+LOCK = ".gsmerge-lock"  # beside a file while a line is appended
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
@@ -49,7 +51,7 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
     line = json.dumps(value, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii") + b"\n"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with lock_folder(path.parent), FileIO(path, "a+b") as file:
+        with lock_file(path.parent / LOCK), FileIO(path, "a+b") as file:
             end = _end_of_lines(file)
             file.truncate(end)
             if file.write(line) != len(line):  # a full disk stores the first part without an error

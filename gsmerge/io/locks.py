@@ -1,9 +1,9 @@
-"""Lock files and folders between processes; the file of a lock exists only while the lock is held."""
+"""Locks between processes; the file of a lock exists only while the lock is held."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from gsmerge.errors import SceneError
@@ -25,15 +25,10 @@ def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
         yield False
         return
     except OSError as error:
-        raise SceneError(path, f"cannot be written ({error.strerror})", "choose another folder") from error
+        raise SceneError(path.parent, f"cannot be written ({error.strerror})", "choose another folder") from error
     try:
         yield True
     finally:
         with suppress(OSError):  # Windows removes no open file; there the release removes it
             path.unlink()  # before the release, so that a waiting process notices that its file is no longer the lock
         lock.release()
-
-
-def lock_folder(folder: Path) -> AbstractContextManager[bool]:
-    """Let one process at a time into the block for a folder; other processes wait."""
-    return lock_file(folder / ".gsmerge-lock")

@@ -95,10 +95,8 @@ def work_alone() -> None:
 def use_threads(count: int | None = None) -> Iterator[int]:
     """Let :func:`parallel_map` use ``count`` threads (None: all processors) inside the block.
 
-    A block inside another block uses the threads of the outer block. Raises ValueError if ``count`` is below 1.
+    A block inside another block uses the threads of the outer block.
     """
-    if count is not None and count < 1:
-        raise ValueError(f"expected at least 1 thread, got {count}")
     if _local.pool is not None or _local.inside:
         hold_torch()
         yield _local.count

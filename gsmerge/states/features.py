@@ -332,28 +332,3 @@ def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
     gaussians = decode_gaussians(children, parents, described, context)
     gaussians = gaussians[gaussians.opacities >= options.min_opacity]
     return state.frame.leave(Gaussians.concat([gaussians, state.unseen]))
-
-
-def feature_arrays(state: FeatureState) -> dict[str, np.ndarray]:
-    """Return the arrays of a state's g Feature Gaussians and v views by name, in the world's frame and unit.
-
-    docs/reference/formats.md describes each array with its shape and unit.
-    """
-    features, unit = state.refined, state.frame.unit
-    gaussians, cameras = state.frame.leave(feature_to_gaussians(features)), state.frame.leave_cameras(state.cameras)
-    return {
-        **{name: np.asarray(column) for name, column in vars(gaussians).items()},
-        "covars": features.covars.astype(np.float64) * unit**2,
-        "weights": features.weights,
-        "masses": features.masses.astype(np.float64) * unit**3,
-        "extinctions": features.extinctions.astype(np.float64) * unit**2,
-        "gains": features.gains,
-        "footprints": features.footprints.astype(np.float64) * unit,
-        "latents": np.asarray(features.latents),
-        "views": state.views,
-        "num_members": state.num_members,
-        "saliency": state.saliency,
-        "viewmats": cameras.viewmats,
-        "Ks": cameras.Ks,
-        "size": np.array([cameras.width, cameras.height]),
-    }

@@ -1,33 +1,29 @@
-"""States in files: extend them by scenes, decode their Feature Gaussians, and write these as arrays."""
+"""States in files: extend them by scenes, and decode their Feature Gaussians."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
-from zipfile import ZipFile
-
-import numpy as np
 
 from gsmerge.compaction.files import read_input
 from gsmerge.compaction.outputs import add_views, name_photos
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import atomic_output, atomic_outputs, output_format
-from gsmerge.io.archives import new_member
+from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.write import output_notes
-from gsmerge.io.locks import lock_folder
+from gsmerge.io.locks import lock_file
 from gsmerge.report import document_head, seconds_document, seconds_line
 from gsmerge.runtime.memory import human_bytes, human_share, peak_memory
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.content_hash import content_hash, list_files
+from gsmerge.scene.content_hash import content_hash, digest, list_files
 from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.scene.files import SceneFiles, scene_title
 from gsmerge.settings.extend import batch_settings
@@ -35,11 +31,9 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.compactor import extend_state
 from gsmerge.states.extend import BATCH
-from gsmerge.states.features import decode_features, feature_arrays
+from gsmerge.states.features import decode_features
 from gsmerge.states.state_file import State, load_state, save_state
 from gsmerge.words import count_words
-
-ARRAYS = ".npz"  # ending of a file with the arrays of Feature Gaussians
 
 
 def extend_file(
@@ -56,27 +50,24 @@ def extend_file(
 ) -> tuple[dict[str, Any], State]:
     """Add a batch of views to the state in a file, or to a new file; return report (plain JSON types) and new state.
 
-    The file is replaced at the end, but not if anything fails or another process has changed the file. If two processes
-    end together, the second waits for the first and then notices its change. A batch is left out, with a note, if the
-    state already has it. ``settings``: see :class:`gsmerge.Compactor`. ``seconds_before``: wall time by name of the
-    caller's earlier steps. ``dry_run``: write nothing. ``tried``: the state of an earlier dry run, used in place of the
-    file's. Raises SceneError if a file cannot be read or written, if it was changed in the meantime, or if the batch
-    seems to be in another world; UsageError if a setting is unknown, out of range, or impossible for the state or the
-    scene.
+    The file is replaced at the end, but not if anything fails; another process that extends it waits. A batch is left
+    out, with a note, if the state already has it. ``settings``: see :class:`gsmerge.Compactor`. ``seconds_before``:
+    wall time by name of the caller's earlier steps. ``dry_run``: write nothing. ``tried``: the state of an earlier dry
+    run, used in place of the file's. Raises SceneError if a file cannot be read or written, or if the batch seems to be
+    in another world; UsageError if a setting is unknown, out of range, or impossible for the state or the scene.
     """
-    start, identity = perf_counter(), _file_identity(path)
     try:
         batch_settings(settings)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    state = tried or (None if identity is None else load_state(path))
-    sha256 = content_hash(list_files(files))
-    document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}, "dry_run": dry_run}
-    number = None if state is None else _find_batch(state, sha256)
-    if state is not None and number is not None:
-        note = f"{files.ply}: left out, since the same files are batch {number} of {path.name} already"
-        return document | {"left_out": True, "state": _describe_file(path, state), "notes": [note]}, state
-    with _replace_file(path, identity, dry_run=dry_run) as temporary:
+    with nullcontext() if dry_run else lock_state(path):
+        start = perf_counter()
+        state, sha256 = tried or (load_state(path) if os.path.exists(path) else None), content_hash(list_files(files))
+        document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}, "dry_run": dry_run}
+        number = None if state is None else _find_batch(state, sha256)
+        if state is not None and number is not None:
+            note = f"{files.ply}: left out, since the same files are batch {number} of {path.name} already"
+            return document | {"left_out": True, "state": _describe_file(path, state), "notes": [note]}, state
         load_end = perf_counter()
         load = read_input(files, opacity=opacity, hints=hints)
         read_end = perf_counter()
@@ -86,22 +77,28 @@ def extend_file(
             raise (SceneError(files.ply, error.problem, error.remedy) if error.path == BATCH else error) from error
         state = _note_source(state, sha256, load.comments)
         extend_end = perf_counter()
-        if temporary is not None:
-            save_state(temporary, state, overwrite=True)
-    seconds = {**(seconds_before or {}), "load": load_end - start, "read": read_end - load_end, **report.seconds}
-    seconds["other"] = extend_end - read_end - sum(report.seconds.values())
-    facts = {name: fact for name, fact in asdict(report).items() if name not in ("seconds", "notes", "options")}
-    document["input"] |= load.recognised
-    document |= {
-        **facts,
-        "left_out": False,
-        "state": _describe_file(path, state),
-        "options": dict(report.options),
-        **seconds_document(seconds | {"write": perf_counter() - extend_end}),
-        "peak_memory_bytes": peak_memory(),
-        "notes": [*load.notes, *report.notes],
-    }
-    return document, state
+        if not dry_run:
+            save_state(path, state, overwrite=True)
+        seconds = {**(seconds_before or {}), "load": load_end - start, "read": read_end - load_end, **report.seconds}
+        seconds["other"] = extend_end - read_end - sum(report.seconds.values())
+        facts = {name: fact for name, fact in asdict(report).items() if name not in ("seconds", "notes", "options")}
+        document["input"] |= load.recognised
+        document |= {
+            **facts,
+            "left_out": False,
+            "state": _describe_file(path, state),
+            "options": dict(report.options),
+            **seconds_document(seconds | {"write": perf_counter() - extend_end}),
+            "peak_memory_bytes": peak_memory(),
+            "notes": [*load.notes, *report.notes],
+        }
+        return document, state
+
+
+def lock_state(path: Path) -> AbstractContextManager[bool]:
+    """Let one process at a time into the block for a state."""
+    path = Path(os.path.realpath(path))
+    return lock_file(path.with_name(f".gsmerge-{digest({'name': path.name})[:16]}.lock"))
 
 
 def _find_batch(state: State, sha256: str) -> int | None:
@@ -118,35 +115,10 @@ def _note_source(state: State, sha256: str, comments: Sequence[str]) -> State:
     return replace(state, about={**state.about, "batches": [*earlier, last], "comments": all_comments})
 
 
-@contextmanager
-def _replace_file(path: Path, identity: tuple[int, int, int] | None, *, dry_run: bool) -> Iterator[Path | None]:
-    """Yield a temporary file that replaces ``path`` after the block; None in a dry run.
-
-    SceneError if the identity of ``path`` after the block is not ``identity``.
-    """
-    if dry_run:
-        yield None
-        return
-    with ExitStack() as locks, atomic_output(path, overwrite=True) as temporary:
-        yield temporary
-        locks.enter_context(lock_folder(path.resolve().parent))  # until the file is renamed
-        if _file_identity(path) != identity:
-            raise SceneError(path, "was changed by another process in the meantime, and is not replaced", "run again")
-
-
 def _describe_file(path: Path, state: State) -> dict[str, Any]:
     """Describe the file of a state; after a dry run it may not exist."""
     num_bytes = path.stat().st_size if path.exists() else 0
     return {"path": str(path), "bytes": num_bytes, "num_batches": len(state.about["batches"])}
-
-
-def _file_identity(path: Path) -> tuple[int, int, int] | None:
-    """Return numbers that change when a file of this name is replaced; None if there is no file."""
-    try:
-        status = os.stat(path)
-    except OSError:  # problems other than a missing file are reported when it is written
-        return None
-    return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def batch_line(document: Mapping[str, Any]) -> str:
@@ -229,28 +201,3 @@ def decoding_line(document: Mapping[str, Any]) -> str:
         f" ({human_share(document['ratio'])} of the scene's), {human_bytes(before['bytes'])} ->"
         f" {human_bytes(after['bytes'])}; {seconds_line(document)}"
     )
-
-
-def convert_features(path: Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
-    """Write the Feature Gaussians in a ``.gsm`` as an ``.npz``; return the report as plain JSON types.
-
-    Raises SceneError if a file cannot be read or written, or if it holds results.
-    """
-    features = load_state(path).features
-    if features is None:
-        raise SceneError(path, "expected Feature Gaussians, found results", "name a .ply as the output")
-    arrays = feature_arrays(features)
-    with atomic_output(out, overwrite=overwrite) as temporary, ZipFile(temporary, "w") as archive:
-        for name, array in arrays.items():
-            with archive.open(new_member(f"{name}.npy"), "w", force_zip64=True) as file:
-                np.save(file, array, allow_pickle=False)
-    before = {"path": str(path), "bytes": path.stat().st_size}
-    after = {"path": str(out), "bytes": out.stat().st_size, "num_groups": len(features), "format": ARRAYS}
-    after["arrays"] = {name: list(array.shape) for name, array in arrays.items()}
-    return document_head() | {"inputs": [before], "left_out": {}, "output": after, "viewer_cameras": None, "notes": []}
-
-
-def arrays_line(document: Mapping[str, Any]) -> str:
-    """Describe the report of :func:`convert_features` in one line."""
-    after = document["output"]
-    return f"{after['path']}: {after['num_groups']:,} Feature Gaussians, {human_bytes(after['bytes'])}"

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer.main
 from batches import FAST, InlinePool, records, results, statuses
 from messages import names
 
 import gsmerge
 from gsmerge.batch.records import record
 from gsmerge.cli import main
-from gsmerge.cli.app import app
 from gsmerge.cli.batch_command import Totals
 
 from .conftest import Outcome, Run, listing
@@ -180,25 +178,3 @@ def test_a_missed_target_ends_with_4_and_keeps_the_result(rooms: Path, tmp_path:
     outcome = run("batch", rooms / "room0", "--output", tmp_path, *arguments, code=4)
     assert names(outcome.err, "1 of 1", "target")
     assert (tmp_path / "room0.ply").exists()
-
-
-def test_what_compact_has_besides_is_set_by_name() -> None:
-    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    options = {name: {o: p for p in commands[name].params for o in p.opts} for name in ("compact", "batch")}
-    only = {option.removeprefix("--") for option in options["compact"].keys() - options["batch"].keys()}
-    assert only - {"scenes"} <= gsmerge.CompactOptions().to_dict().keys()
-    own = {
-        "scenes",
-        "--cameras",
-        "--images",
-        "--masks",
-        "--protect",
-        "-o",
-        "--output",
-        "--threads",
-        "--overwrite",
-        "--json",
-        "--set",
-    }
-    for name in options["compact"].keys() & options["batch"].keys() - own:
-        assert options["compact"][name].help == options["batch"][name].help

@@ -5,13 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +19,6 @@ from damage.tensors import negate
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.errors import SceneError
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene
@@ -246,27 +242,13 @@ def test_feature_gaussians_in_every_kind_of_output(
     )
 
 
-def test_feature_gaussians_as_arrays(features: Path, tmp_path: Path, run: Run) -> None:
-    out = tmp_path / "features.npz"
-    document = json.loads(run("convert", features, out, "--json", code=0).out)
-    with np.load(out) as arrays:
-        count = len(arrays["means"])
-        assert {name: list(array.shape) for name, array in arrays.items()} == document["output"]["arrays"]
-    assert (document["output"]["num_groups"], document["output"]["bytes"]) == (count, out.stat().st_size)
-    assert_refused(run("convert", features, out), 2, "features.npz", "--overwrite")
-    assert f"{count:,} Feature Gaussians" in run("convert", features, out, "--overwrite", code=0).out
-    assert "Feature Gaussians" in run("inspect", features, code=0).out
-
-
 def test_what_feature_gaussians_are_not_made_into(features: Path, states: list[Path], tmp_path: Path, run: Run) -> None:
     for words, place, *found in (
         (("compact", features, "--budget", "10"), "--budget", features),
         (("compact", features, states[0], "-o", tmp_path / "a.ply"), features, "only input", 2),
         (("compact", features, "--k", "8", "-o", tmp_path / "a.ply"), "k", "1 to 4"),
-        (("convert", states[0], states[0], tmp_path / "a.npz"), tmp_path / "a.npz", ".gsm"),
     ):
         assert_refused(run(*words), 2, place, *found)
-    assert_refused(run("convert", states[0], tmp_path / "a.npz"), 3, states[0], "Feature Gaussians", "results")
     assert_refused(run("convert", features, tmp_path / "a.ply"), 3, features, "results", "Feature Gaussians")
     assert listing(tmp_path) == {}
 
@@ -281,7 +263,7 @@ def test_a_damaged_state_is_refused_by_all(spoil: Change, state: Path, walks: li
     before = digests(state.parent)
     for words in (
         ("extend", state, walks[1]), ("compact", state, "-o", out, "--overwrite"), ("inspect", state),
-        ("convert", state, out, "--overwrite"), ("convert", state, state.parent / "a.npz"),
+        ("convert", state, out, "--overwrite"),
     ):  # fmt: skip
         assert_refused(run(*words), 3, state)
     assert digests(state.parent) == before
@@ -300,41 +282,18 @@ def test_batches_before_a_broken_one_stay(states: list[Path], walks: list[Path],
 
 
 @pytest.mark.parametrize("exists", [False, True])
-def test_two_that_end_together_lose_no_batch(
-    exists: bool, state: Path, walks: list[Path], make_scene: Callable[..., Path], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    """Both have read the state before either goes on; whoever may rename waits until the other may as well, or not."""
-    import gsmerge.io.atomic as atomic
-    import gsmerge.states.files as files
+def test_two_at_once_lose_no_batch(
+    exists: bool, state: Path, walks: list[Path], make_scene: Callable[..., Path], tmp_path: Path
+) -> None:
+    """The second waits for the first, and adds to what that one has made."""
+    from gsmerge.states.files import extend_file
 
     path = state if exists else tmp_path / "new.gsm"
     before = len(load_state(path).about["batches"]) if exists else 0
     scenes = [walks[1], make_scene(tmp_path / "third", num_views=2, width=24, height=16, seed=0)]
-    extended, renamed = files.extend_state, atomic._rename_all
-    both_read, both_rename = threading.Barrier(2), threading.Barrier(2)
-
-    def extend_together(*arguments: Any, **named: Any) -> Any:
-        both_read.wait(PATIENCE)
-        return extended(*arguments, **named)
-
-    def rename_together(pairs: Any, **named: Any) -> None:
-        with suppress(threading.BrokenBarrierError):
-            both_rename.wait(1)
-        renamed(pairs, **named)
-
-    monkeypatch.setattr(files, "extend_state", extend_together)
-    monkeypatch.setattr(atomic, "_rename_all", rename_together)
-    settings = {"superpixels": 60}
     with ThreadPoolExecutor(2) as pool:
         found = [find_scene_files(scene) for scene in scenes]
-        ends = [pool.submit(files.extend_file, path, scene, settings) for scene in found]
-    refusals = [end.exception() for end in ends if end.exception() is not None]
-    assert [type(refusal) for refusal in refusals] == [SceneError]
-    assert "another process" in str(refusals[0])
-    assert len(load_state(path).about["batches"]) == before + 1
-    monkeypatch.undo()
-    for scene, end in zip(scenes, ends, strict=True):
-        if end.exception() is not None:
-            files.extend_file(path, find_scene_files(scene), {})
+        ends = [pool.submit(extend_file, path, scene, {"superpixels": 60}) for scene in found]
+    assert [end.exception() for end in ends] == [None, None]
     assert len(load_state(path).about["batches"]) == before + 2
+    assert not [name for name in listing(path.parent) if name.endswith(".lock")]

@@ -40,7 +40,7 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 VALIDATION = 2**32  # replaces the step in the seed of the random numbers of validation
 Row = dict[str, float]  # a row of the table of losses
 Scores = list[tuple[float, float, float]]  # of each window: PSNR (dB) without and with networks, share merged
-Progress = Callable[[int, int, float], None]  # step, steps, loss
+OnStep = Callable[[int, int, float], None]  # step, steps, loss
 FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
 
@@ -119,7 +119,7 @@ def train(
     *,
     threads: int | None = None,
     device: str = "cpu",
-    progress: Progress | None = None,
+    progress: OnStep | None = None,
 ) -> TrainResult:
     """Train networks, or continue the run in the folder.
 
@@ -169,7 +169,7 @@ def _train(
     validation: Sequence[Shard],
     out: Path,
     device: str,
-    progress: Progress | None,
+    progress: OnStep | None,
 ) -> TrainResult:
     with torch.random.fork_rng(devices=[]):  # new networks depend only on the seed
         torch.manual_seed(options.seed)

@@ -11,6 +11,7 @@ from contextlib import redirect_stderr
 import pytest
 
 from gsmerge.cli.console import RunEnd, json_progress, plain_warnings, say, stage_progress, total_progress
+from gsmerge.runtime.record import Part, begin_part, expect_parts, record_run, report_progress
 
 
 class Terminal(io.StringIO):
@@ -30,16 +31,21 @@ def terminal_of_100_columns(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
 
 
-def test_bars_end_full() -> None:
-    """Also the last one, whose stage says where it is before each of its parts."""
+@pytest.mark.parametrize(("columns", "bar"), [("80", 16), ("40", 8)])
+def test_the_bar_of_a_run_fills_and_names_the_stage(monkeypatch: pytest.MonkeyPatch, columns: str, bar: int) -> None:
+    """By the shares of expected parts, or else by the steps that are counted."""
+    monkeypatch.setenv("COLUMNS", columns)
     with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as progress:
-        progress("read: small.ply", 1, 3)
-        progress("superpixels and the view from outside: input", 11, 12)
-    for name, count in (("read", "3/3"), ("superpixels and", "12/12")):
-        last = [line for line in terminal.lines() if line.startswith(name)][-1]
-        assert "━" * 16 in last
-        assert count in last
-        assert len(last) < 100
+        progress("read: small.ply", 3, 3)
+    with redirect_stderr(terminal), stage_progress(quiet=False) as progress, record_run(progress):
+        expect_parts([Part(1.0, 3.0)])
+        begin_part()
+        report_progress("fit: photos 20.0 dB", 100, 100)
+    lines = [line for line in terminal.lines() if "━" in line]
+    assert all(len(line) < int(columns) for line in lines)
+    (read,) = {line for line in lines if line.endswith("read: small.ply")}
+    assert "━" * bar in read
+    assert any("done" in line and "━" * bar in line for line in lines)
 
 
 def test_failures_of_a_batch_stand_above_its_bar() -> None:

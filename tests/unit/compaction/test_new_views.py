@@ -10,7 +10,7 @@ import scenes
 
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.compaction.left_out import LEAST_VIEWS, choose_views, cover, leave_out, mean_seen
-from gsmerge.compaction.new_views import MOST_SHARE, OWN, SPREAD, NewViews, Trial, shrink_scene
+from gsmerge.compaction.new_views import OWN, SPREAD, NewViews, Trial, shrink_scene
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.views import subset
 from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, new_views_comment, read_new_views
@@ -109,13 +109,6 @@ def test_left_out_views_leave_neither_photos_nor_rows(room: Scene) -> None:
     assert leave_out(prepared.scene, [], prepared) is None
     scores = left_out.score(left_out.rows)
     assert mean_seen(scores, left_out.shares) == pytest.approx(np.average(scores, weights=left_out.shares))
-
-
-def test_nothing_is_said_of_rows_without_pixels_nor_of_many(room: Scene) -> None:
-    rows = replace(room, pixels=None)
-    assert compact(rows, **QUICK, budget="2%").report.new_views is None
-    settings = QUICK | {"budget": int((MOST_SHARE + 0.01) * room.num_gaussians)}
-    assert compact(room, **settings).report.new_views is None
 
 
 def test_what_only_left_out_views_show_does_not_count() -> None:

@@ -14,7 +14,7 @@ from messages import noted, refuses
 from gsmerge.budget import exact_count, max_allowed
 from gsmerge.compaction.curve import CurvePoint, count_within, curve_counts, curve_knee
 from gsmerge.compaction.left_out import LeftOut
-from gsmerge.compaction.search import CLOSE, MAX_RUNS, MAX_TRIED, CountSearch, level_counts, meet, search_count
+from gsmerge.compaction.search import CLOSE, MAX_RUNS, MAX_TRIED, CountSearch, level_counts, search_count
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.fit import FitOptions
@@ -149,12 +149,6 @@ def test_knee_weighs_structure_against_psnr() -> None:
     grows = points(*((count, psnr, 0.60 + 0.04 * i) for i, (count, psnr) in enumerate(psnr_falls)))
     assert curve_knee(without) == 100
     assert curve_knee(grows) == 800
-
-
-@pytest.mark.parametrize("function", [lambda p: count_within(p, 0.1), curve_knee])
-def test_a_curve_needs_a_point(function: Callable[[list[CurvePoint]], int]) -> None:
-    with refuses(ValueError, "points", "none"):
-        function([])
 
 
 def rises(count: int) -> float:
@@ -305,7 +299,3 @@ def test_photos_left_out_take_no_more_than_they_gain_from() -> None:
     facts, reached = actual.facts(actual.best), "photos left out reach 20.68 dB with 1,600 Gaussians"
     assert facts.unmet == f"quality: 30 dB was asked for; {reached}, the best that was tried"
     assert facts.choices["search"]["left_out"] == 2
-
-
-def test_a_search_builds_until_nothing_is_next() -> None:
-    assert meet(lambda count: count * 10, 5, lambda built: len(built) if len(built) < 4 else None) == [5, 10, 20, 30]

@@ -86,15 +86,6 @@ def test_a_damaged_line_in_the_middle_costs_that_line_alone(tmp_path: Path) -> N
     assert values(path) == [{"a": 1}, None, None, {"b": 2}]
 
 
-def test_long_lines_are_cut_back_to_the_right_place(tmp_path: Path) -> None:
-    path = tmp_path / "lines.jsonl"
-    append_line(path, {"a": 1})
-    with path.open("ab") as file:
-        file.write(b"x" * 200_000)
-    append_line(path, {"b": 2})
-    assert values(path) == [{"a": 1}, {"b": 2}]
-
-
 def test_what_is_no_json_is_refused_and_leaves_the_file_alone(tmp_path: Path) -> None:
     path = tmp_path / "lines.jsonl"
     append_line(path, {"a": 1})

@@ -14,7 +14,6 @@ from messages import refuses
 from gsmerge.errors import UsageError
 from gsmerge.runtime.record import note, record_run, stage
 from gsmerge.runtime.work import Cluster, Work, start_work
-from gsmerge.settings.stages import Engine
 
 
 def halve(number: int) -> float:
@@ -32,29 +31,6 @@ def test_calls_have_records_of_their_own() -> None:
     assert all("join" in record.seconds for _, record in made)
     assert run.notes == []
     assert heard[:2] == ["block 1 of 2: halve: join", "block 2 of 2: halve: join"]
-
-
-def test_calls_are_made_one_by_one() -> None:
-    """What they take is made when it is their turn, so that one of them is in memory at once."""
-    events = list[str]()
-
-    def calls() -> Iterator[tuple[int]]:
-        for number in (1, 2):
-            events.append(f"take {number}")
-            yield (number,)
-
-    with start_work("local", threads=1, memory=0) as work:
-        for value, _ in work.run("halve", halve, 2, calls()):
-            events.append(f"made {value}")
-    assert events == ["take 1", "made 0.5", "take 2", "made 1.0"]
-
-
-@pytest.mark.parametrize(
-    ("name", "address", "named"), [("spark", None, ("engine", "'spark'")), ("local", "auto", ("address", "local"))]
-)
-def test_wrong_engines(name: str, address: str | None, named: tuple[str, ...]) -> None:
-    with refuses(ValueError, *named):
-        Engine(name, address)
 
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,11 +11,10 @@ import pytest
 import scenes
 from network_fixtures import SMALL, noisy, written
 
-from gsmerge import Compactor, Gaussians, Scene, compact
+from gsmerge import Compactor, Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.geometry import camera_centres
-from gsmerge.pooling import feature_to_gaussians
-from gsmerge.states.features import FeatureState, feature_arrays
+from gsmerge.states.features import FeatureState
 
 PAPER: dict[str, Any] = {"recipe": "paper", "superpixels": "10%"}
 
@@ -133,18 +132,3 @@ def test_what_cannot_be_decoded(room: Scene, whole: Compactor) -> None:
     rich = scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18), degree=1)
     with pytest.raises(UsageError, match="degree 0"):
         fed(halves(room)[0], rich)
-
-
-def test_the_arrays_are_those_of_one_gaussian_for_each(whole: Compactor) -> None:
-    state = state_of(whole)
-    arrays = feature_arrays(state)
-    ones = state.frame.leave(feature_to_gaussians(state.refined))
-    for name, column in vars(ones).items():
-        np.testing.assert_array_equal(arrays[name], column)
-    assert isinstance(ones, Gaussians)
-    g = len(state)
-    assert arrays["covars"].shape == (g, 3, 3)
-    assert arrays["latents"].shape[0] == arrays["num_members"].shape[0] == g
-    assert arrays["viewmats"].shape == (4, 4, 4)
-    assert arrays["size"].tolist() == [36, 24]
-    assert arrays["num_members"].sum() == 4 * 36 * 24
