@@ -3,8 +3,8 @@
 gsmerge compact demo -o small.ply
 python benchmarks/open_formats.py small.ply opened --photos demo/images --npm packages --gsplat checkout
 
-Programs that are not there are named and skipped: of Python gsply, usd-core, pycolmap, usd-convert-gsplat and
-omniverse-asset-validator; splat-transform (GSMERGE_SPLAT_TRANSFORM); below --npm the packages three and gltf-validator;
+Programs that are not there are named and skipped: of Python gsply and pycolmap;
+splat-transform (GSMERGE_SPLAT_TRANSFORM); below --npm the packages three and gltf-validator;
 chromium, for Spark; --gsplat is a checkout of that repository, for the reader of its trainer. Harmonics of degree 3 are
 drawn at random. Compared are all Gaussians, those in another order with the nearest: the largest errors of positions,
 as a share of the scene's width, and of colours and opacities, which are 0 to 1.
@@ -47,12 +47,8 @@ from gsmerge.pages.page import ENGINE
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "e2e"))
 
-NAMES = (
-    "a.ply", "a.spz", "a.sog", "a.splat", "a.glb", "web/lod-meta.json", "a.usdc", "a.usdz",
-    f"{FOLDER}/{PLACE}/{POINTS}",
-)  # fmt: skip
+NAMES = ("a.ply", "a.spz", "a.sog", "a.splat", "a.glb", "web/lod-meta.json", f"{FOLDER}/{PLACE}/{POINTS}")
 SPLATS = (".ply", ".spz", ".sog", ".splat", "lod-meta.json")
-USD = (".usdc", ".usdz")
 NODE_SCRIPT = Path(__file__).with_suffix(".mjs")
 UPRIGHT = np.array([-1, -1, 1, 1, 1, 1, 1])  # what half a turn about z does to values
 
@@ -103,32 +99,6 @@ def validate_glb(packages: Path, path: Path) -> str:
     issues = json.loads(run_node(packages, "gltf-validator", path))["messages"]
     other = {issue["code"] for issue in issues if "KHR_gaussian_splatting" not in str(issue)}
     return f"issues: {', '.join(sorted(other))}" if other else "no issue, but that it does not know the extension"
-
-
-def usd_values(path: Path) -> Values:
-    """Values of a USD file by usd-core, in the frame of a .ply."""
-    from pxr import Usd, UsdVol
-
-    stage = Usd.Stage.Open(str(path))  # whose prims end with it
-    splats = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
-    means, opacities = (np.array(a.Get()) for a in (splats.GetPositionsAttr(), splats.GetOpacitiesAttr()))
-    harmonics = np.array(splats.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()).reshape(len(means), -1, 3)
-    assert harmonics.shape[1] == (splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() + 1) ** 2
-    return np.concatenate([means, sh0_to_rgb(harmonics[:, 0]), opacities[:, None]], 1) * UPRIGHT
-
-
-def validate_usd(path: Path) -> str:
-    done = subprocess.run(["omni_asset_validate", str(path)], check=False, capture_output=True, text=True)
-    lines = (done.stdout + done.stderr).splitlines()
-    found = [line.partition("]")[0].rpartition("[")[2] for line in lines if line.startswith(("ERROR", "WARNING"))]
-    return "no issues" if any("No issues found" in line for line in lines) else f"issues: {', '.join(found)}"
-
-
-def converted(path: Path) -> Values:
-    """Values of what usd-convert-gsplat makes of a file; it keeps the frame."""
-    out = path.with_name("by-usd-convert-gsplat.usdc")
-    subprocess.run(["usd-convert-gsplat", "-i", str(path), "-o", str(out)], check=True, capture_output=True)
-    return usd_values(out) * UPRIGHT
 
 
 def colmap_values(path: Path) -> Values:
@@ -225,13 +195,6 @@ def find_programs(args: argparse.Namespace) -> Iterator[Program]:
         ),
         "gltf-validator": lambda: Program(
             "gltf-validator", package("gltf-validator"), (".glb",), partial(validate_glb, args.npm)
-        ),
-        "usd-core": lambda: Program("usd-core", version("usd-core"), USD, usd_values),
-        "omniverse-asset-validator": lambda: Program(
-            "omniverse-asset-validator", version("omniverse-asset-validator"), (".usdc", ".usdz"), validate_usd
-        ),
-        "usd-convert-gsplat": lambda: Program(
-            "usd-convert-gsplat", version("usd-convert-gsplat"), ("a.ply", "opened/a.spz"), converted
         ),
         "pycolmap": lambda: Program("pycolmap", version("pycolmap"), (POINTS,), colmap_values),
         "gsplat": lambda: Program("gsplat's trainer", commit(), (POINTS,), partial(trainer_values, args.gsplat)),

@@ -34,7 +34,7 @@ from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, change_settings, find_near_names, flat_settings, join_words, suggest_name
-from gsmerge.settings.stages import CROP_FILES, Engine
+from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
@@ -98,10 +98,6 @@ class Args(SimpleNamespace):
         values = options | pairs
         if "seed" in settings:
             values |= {"seed": values["seed"]} if "seed" in values else _environment_seed()
-        if Path(str(values.get("crop"))).suffix.lower() in CROP_FILES:
-            from gsmerge.io.crop_file import read_crop
-
-            values["crop"] = read_crop(Path(values["crop"]))
         return values
 
     def settings(self, **changes: Any) -> CompactOptions:
@@ -371,7 +367,7 @@ AFTER = argument(
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder that holds it.")
 
 # Shared by commands: a text, and names of options
-COMPACT_SCENE = "The compact scene; the ending sets the format: .ply, .spz, .sog, .splat, .glb, .usdc or .usdz."
+COMPACT_SCENE = "The compact scene; the ending sets the format: .ply, .spz, .sog, .splat or .glb."
 READING = "cameras images hint"
 TARGETS = "targets target_images"
 

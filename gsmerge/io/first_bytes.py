@@ -80,7 +80,7 @@ OTHER_CONTENTS = (
         "run Lyra with save_gaussians_orig: true, and name the file in gaussians_orig",
         right=(".torch",),
     ),
-    OtherContent("a zip archive", r"PK\x03\x04", _UNPACK, right=(".sog", ".npz", ".usdz", ".torch")),
+    OtherContent("a zip archive", r"PK\x03\x04", _UNPACK, right=(".sog", ".npz", ".torch")),
     OtherContent("a gzip archive", r"\x1f\x8b\x08[\0-\x1f]", _UNPACK, right=(".spz",)),
     OtherContent("a tar archive", r"(?s).{257}ustar", _UNPACK),
     OtherContent("a 7z archive", r"7z\xbc\xaf\x27\x1c", _UNPACK),

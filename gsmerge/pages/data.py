@@ -354,7 +354,8 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     colors, color_ids = (levels * (255 // (OUTLINE_LEVELS - 1))).astype(np.uint8), np.cumsum(is_used, dtype=np.uint8)
     factor = max(1, OUTLINE_SIDE // max(labels.shape))
     drawn = draw_borders(labels, color_ids[codes], factor)  # numbers of colours from 1 on
-    return encode_indexed(drawn, np.pad(colors, ((1, 0), (0, 0))))  # index 0 is transparent
+    opaque = np.pad(colors, ((0, 0), (0, 1)), constant_values=255)
+    return encode_indexed(drawn, np.pad(opaque, ((1, 0), (0, 0))))  # index 0 is transparent
 
 
 def _map(reference: ErrorReference | None, view: PageView) -> bytes | None:

@@ -43,7 +43,6 @@ from gsmerge.io import read_cameras, read_gaussians, read_images
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_sharp_camera
-from gsmerge.io.crop_file import read_crop
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.kernels.matrices import invert
@@ -430,7 +429,6 @@ def write_text(name: str, text: str) -> Make:
     return lambda folder: (folder / name).write_text(text)
 
 
-BOX = '{"shape": "box", "center": [0, 1, 2], "size": [1, 2, 3], "rotate": [0, 30, 0]}'
 PAIRS = 'k=2\nfit=none\nmin_opacity=0.01\nbudget=300\nquality=high\nphotos=null\nk="auto"\nlevels=1e3\n'
 PLAIN_SCENE, OF_CAMERAS = TINY.save, partial(TINY.save, cameras=False)
 INSPECT = ("inspect",)
@@ -495,13 +493,12 @@ SOUNDS: dict[str, Sound] = {
     "gsm of features": Sound("a.gsm", write_state("paper"), load_state, INSPECT),
     "checkpoint": Sound("a.safetensors", lambda folder: written(folder / "a.safetensors", noisy()), load_checkpoint,
                         INSPECT),
-    # Photos, crops and lists, which only their readers read
+    # Photos and lists, which only their readers read
     **{f"photo.{ending}": Sound("a.png", write_photo(ending), check_photo, ()) for ending in PHOTO_ENDINGS},
     **{f"photo of {kind}": Sound("a.png", write_photo("png", kind), check_photo, (), rare=True)
        for kind in ("grey", "alpha", "16 bits")},
     **{f"mask.{ending}": Sound("a.png", write_photo(ending), check_mask, (), rare=True) for ending in PHOTO_ENDINGS},
     "mask of alpha": Sound("a.png", write_photo("png", "alpha"), check_mask, (), rare=True),
-    "crop": Sound("a.json", write_text("a.json", BOX), read_crop, ()),
     "list": Sound("list.txt", write_text("list.txt", "a.ply\n# b\nscene c\n\nd.spz\n"), check_list, ()),
     "set": Sound("pairs.txt", write_text("pairs.txt", PAIRS), check_pairs, ()),
 }  # fmt: skip

@@ -108,7 +108,6 @@ _page, _model = lazy_functions("gsmerge.pages"), lazy_functions("gsmerge.compact
 _SOG = 13.0, 22.0, 36.5, 56.5
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
 _READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
-_USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
     each=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes, columns=True, marks=None,
@@ -151,14 +150,6 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
     Format(
         ".glb", "binary glTF with KHR_gaussian_splatting", _lazy("glb.read_rows"), _lazy("glb.glb_bytes"), 3,
         holds=_lazy("glb.holds_gaussians"), each=(52.1, 88.1, 148.1, 232.2),
-    ),
-    Format(
-        ".usdc", "USD with ParticleField3DGaussianSplat, binary", None, _lazy("usd.usdc_bytes"), 3,
-        require=_REQUIRE_USD, each=_USD, kept_as=".ply",
-    ),
-    Format(
-        ".usdz", "USD, a .usdc in an archive", None, _lazy("usd.usdz_bytes"), 3, require=_REQUIRE_USD, each=_USD,
-        kept_as=".ply",
     ),
 )  # fmt: skip
 DEPTHS = Format(
