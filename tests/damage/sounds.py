@@ -336,21 +336,6 @@ def write_pose_list(folder: Path) -> None:
     (folder / "intrinsic.txt").write_text(f"{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}\n")
 
 
-def write_pose_folder(folder: Path) -> None:
-    """Write a file for each pose."""
-    (folder / "pose").mkdir()
-    for view in range(2):
-        (folder / f"pose/{view}.txt").write_text(f"1 0 0 {view}\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-
-
-POSE_LISTS = {
-    "TUM": "# time x y z q\n1.5 0 0 1 0 0 0 1\n1.6 0 0 2 0 0 0 1\n",
-    "RealEstate10K": "https://a.b/c\n100 .9 .9 .5 .5 0 0 1 0 0 0 0 1 0 0 0 0 1 0\n"
-    "200 .9 .9 .5 .5 0 0 1 0 0 0 0 1 0 0 0 0 1 0\n",
-}
-LOG = "0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n1 1 2\n1 0 0 1\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
-
-
 def write_moved(folder: Path) -> None:
     """Write Long-LRM's cameras, with the files that say how they were moved."""
     with tempfile.TemporaryDirectory() as place:
@@ -479,9 +464,6 @@ SOUNDS: dict[str, Sound] = {
     "Metashape": Sound("cameras.xml", write_metashape, check_metashape, INSPECT),
     "Metashape moved": Sound("cameras.xml", write_metashape_moved, check_metashape, INSPECT, rare=True),
     "Polycam": Sound("keyframes/corrected_cameras", FORMATS["Polycam"].write, check_cameras, (), packed=True),
-    "pose folder": Sound("pose", write_pose_folder, check_cameras, (), packed=True),
-    **{name: Sound("a.txt", write_text("a.txt", text), check_cameras, INSPECT) for name, text in POSE_LISTS.items()},
-    "Tanks and Temples": Sound("a.log", write_text("a.log", LOG), check_cameras, INSPECT),
     "predictions.npz": Sound("predictions.npz", write_vggt, check_arrays, INSPECT),
     "moved Long-LRM": Sound("opencv_cameras.json", write_moved, check_cameras, INSPECT, packed=True, rare=True),
     "dataparser": Sound("transforms.json", write_dataparser, lambda path: read_dataparser(path, path), (), packed=True),

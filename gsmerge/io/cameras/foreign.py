@@ -19,15 +19,14 @@ class Foreign(NamedTuple):
     files: str  # patterns of their names, separated by spaces
     program: str
     remedy: str  # the export of the program that is read
-    start: str = ""  # regular expression that is found in the first bytes of its files
+    start: str = ""  # regular expression that is found in the first bytes of its files, in which $ ends any line
 
 
-POSE_FOLDERS = ("pose", "poses")  # each has a file for each view
-# Places of intrinsics beside poses; the first existing place is read. A folder has a file for each view
-INTRINSICS = ("intrinsic.txt", "intrinsics.txt", "pred_intrinsics.txt", "intrinsic/intrinsic_color.txt", "intrinsics")
+INTRINSICS = "intrinsic.txt"  # of DA3-Streaming, beside its poses
 _DEPTH, _MAX_PATHS = 3, 10_000  # limits of the search for files of PROGRAMS: levels of folders, and paths
 _WRITE = "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
 _MODEL = f"name the COLMAP model that it was made from, or {_WRITE}"
+_NUMBER = r"[-+.\deE]+"
 _NERFSTUDIO = "`ns-process-data {}` of nerfstudio makes a transforms.json of it"
 _KAPTURE = "kapture_import_{}.py and kapture_export_colmap.py of kapture make a COLMAP model of it"
 _OPF = "export OPF from PIX4Dmatic, of which `opf2colmap` of pyopf makes a COLMAP model"
@@ -41,7 +40,7 @@ CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
     "cameras.json", "camera_params.json", "sparse/0", "sparse", "colmap/sparse/0", "colmap", "exports/npz/results.npz",
     "exports/mini_npz/results.npz", "results.npz", "cameras.npz", "camera_poses.txt", "keyframes/corrected_cameras",
-    "keyframes/cameras", "reconstruction.json", "opensfm/reconstruction.json", "cameras.xml", *POSE_FOLDERS, "0", ".",
+    "keyframes/cameras", "reconstruction.json", "opensfm/reconstruction.json", "cameras.xml", "0", ".",
 )  # fmt: skip
 PROGRAMS = (
     Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
@@ -63,7 +62,12 @@ PROGRAMS = (
     Foreign("cameras*.npz", "IDR, NeuS or DTU", _MODEL, "(world|scale|camera)_mat"),
     Foreign("metadata.json *.r3d", "Record3D", _NERFSTUDIO.format("record3d"), '^PK|"(poses|perFrameIntrinsicCoeffs)"'),
     Foreign("*.vrs *_loop_trajectory.csv", "Project Aria", _NERFSTUDIO.format("aria")),
-    Foreign("*.sens", "ScanNet", "its SensReader exports poses and intrinsics, which are read"),
+    Foreign("*.sens", "ScanNet", _WRITE),
+    Foreign("pose/*.txt poses/*.txt", "ScanNet, NSVF or SRN", _WRITE, rf"\A({_NUMBER}\s+){{3,15}}{_NUMBER}\s*$"),
+    Foreign("*.txt", "TUM, ORB-SLAM or MonST3R", "`evo_traj tum FILE --save_as_kitti` of evo makes lines of 12 numbers"
+            " of it, which are read", rf"\A(#.*\n)*({_NUMBER}[ \t]+){{7}}{_NUMBER}\s*$"),
+    Foreign("*.txt", "RealEstate10K", _WRITE, rf"\Ahttps?:.*\n({_NUMBER}[ \t]+){{18}}{_NUMBER}\s*$"),
+    Foreign("*.log", "Open3D or Tanks and Temples", _WRITE, r"\A\d+[ \t]+\d+[ \t]+\d+\s*$"),
     Foreign("*.traj", "ARKitScenes", _WRITE), Foreign("*.jgz", "CO3D", _WRITE),
     Foreign("*.json", "Open3D", _WRITE, '"PinholeCamera'),
     Foreign("*.json", "3D Scanner App", _WRITE, '"cameraPoseARFrame"'),
@@ -125,4 +129,4 @@ def find_unread(place: Path) -> Path | None:
 
 def _is_of(path: Path, foreign: Foreign) -> bool:
     has_name = any(map(path.match, foreign.files.split())) and path.is_file()
-    return has_name and re.search(foreign.start, read_start(path).decode("latin-1")) is not None
+    return has_name and re.search(foreign.start, read_start(path).decode("latin-1"), re.MULTILINE) is not None

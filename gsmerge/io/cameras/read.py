@@ -17,8 +17,6 @@ from gsmerge.io.cameras.table import (
     CAMERA_FORMATS,
     CHUNK,
     KEYFRAME,
-    LISTS_POSES,
-    LOG,
     RE10K,
     SHARP_PLY,
     is_colmap,
@@ -33,7 +31,7 @@ _lazy = lazy_functions(__package__)
 holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.read_depths")
 _holds_poses, _read_scenes = _lazy("npz_files.holds_poses"), _lazy("re10k.read_scenes")
 _MAX_CANDIDATES = 16  # files in a folder that are searched for cameras
-_CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt", LOG, ".csv")
+_CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt", ".csv")
 
 
 def find_cameras(folder: Path) -> Path | None:
@@ -57,7 +55,7 @@ def find_other_cameras(folder: Path) -> Path | None:
     several files of cameras, or none.
     """
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _CANDIDATE_ENDINGS)
-    files = [path for path in files if path.name not in INTRINSICS and not path.name.endswith(ENDING)]
+    files = [path for path in files if path.name != INTRINSICS and not path.name.endswith(ENDING)]
     files = [path for path in files if path.is_file()][:_MAX_CANDIDATES]
     files = [path for path in files if holds_cameras(path)] or [*filter(starts_like_poses, files)][:1]
     return files[0] if len(files) == 1 else None
@@ -95,7 +93,7 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
         (5, 'transforms.json')
     """
     path = _resolve(Path(path))
-    ending = "" if path.is_dir() else path.suffix.lower().replace(LOG, ".txt")
+    ending = "" if path.is_dir() else path.suffix.lower()
     source = CameraSource(path, scene, folder)
     format_ = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
     if format_ is None:
@@ -130,11 +128,9 @@ def _folder_of(path: Path) -> Path | None:
     if path.suffix == ".json":
         is_keyframe = is_keyframes(path.parent) and KEYFRAME in CameraSource(path).object
         return path.parent if is_keyframe else None
-    in_model = path.with_suffix(".bin").name in MODEL_NAMES and is_colmap(path.parent)
-    if path.suffix not in (".bin", ".txt") or (not in_model and LISTS_POSES(path)):
+    if path.suffix not in (".bin", ".txt") or path.with_suffix(".bin").name not in MODEL_NAMES:
         return None
     if not is_colmap(path.parent):
-        check_unknown(path)
         raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
     return path.parent
 

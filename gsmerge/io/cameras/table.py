@@ -31,7 +31,6 @@ from gsmerge.runtime.plugins import LazyFunction, lazy_functions
 
 _lazy = lazy_functions(__package__)
 CHUNK = ".torch"  # ending of re10k's chunks
-LOG = ".log"  # ending of Open3D's lists of poses, which are read as ``.txt``
 FFGS = "ffgs cameras.json"  # format of cameras whose photos were resized to cover the model's input, and cropped
 KEYFRAME = "t_00"  # key in files of Polycam, within their first bytes
 
@@ -83,7 +82,7 @@ def _has_views_with(source: CameraSource, key: str) -> bool:
 
 _ARRAY_NAMES, _IS_DA3 = _lazy("npz_files.array_names"), _lazy("npz_files.is_da3")
 _READ_COLMAP, _READ_DA3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3")
-LISTS_POSES, _READ_POSES = _lazy("pose_lines.lists_poses"), _lazy("pose_lines.read_poses")
+_LISTS_POSES = _lazy("pose_lines.lists_poses")
 _READ_STATE = LazyFunction("gsmerge.io.formats.gsm", "read_views")
 
 _TRANSFORMS = ViewLayout(
@@ -169,10 +168,9 @@ CAMERA_FORMATS = (
                  C2W_OPENGL, "pixels", lambda file: is_keyframes(file.path)),
     CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(_READ_COLMAP, suffix=".txt"),
                  W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".txt")),
-    CameraFormat("pose folder", "`pose/*.txt` of ScanNet, NSVF", "", _READ_POSES,
-                 C2W_OPENCV, "pixels, in `intrinsic.txt`; may be missing", lambda file: LISTS_POSES(file.path)),
-    CameraFormat("pose list", "poses of KITTI, TUM, RealEstate10K; `.log` of Open3D", ".txt", _READ_POSES, C2W_OPENCV,
-                 "as these"),
+    CameraFormat("pose list", "`camera_poses.txt` of DA3-Streaming, VGGT-Long: 12 or 16 numbers a line", ".txt",
+                 _lazy("pose_lines.read_poses"), C2W_OPENCV, "pixels, in `intrinsic.txt`; may be missing",
+                 lambda file: _LISTS_POSES(file.path)),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", _LONG_LRM, W2C_OPENCV, "pixels", is_long_lrm),
     CameraFormat("transforms.json", "`transforms.json` of nerfstudio, instant-ngp; `transforms_train.json` of Blender",
                  ".json", _TRANSFORMS, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
@@ -204,4 +202,4 @@ CAMERA_FORMATS = (
     SHARP_PLY,
     CameraFormat("state", "inside a `.gsm` of gsmerge extend", STATE_ENDING, _READ_STATE, W2C_OPENCV, "pixels"),
 )  # fmt: skip
-CAMERA_ENDINGS = (*dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")), LOG)
+CAMERA_ENDINGS = tuple(dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")))

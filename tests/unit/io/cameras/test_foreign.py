@@ -41,7 +41,13 @@ FILES = [
     ("cameras.npz", "PK\3\4 scale_mat_0.npy", "DTU", "views.npz"),
     ("dino_par.txt", "16\ndino0001.png 3310 0 316", "Middlebury", "transforms.json"),
     ("camera/0001.json", '{"orientation": [[1, 0, 0]', "Nerfies", "transforms.json"),
-    ("scene0000_00.sens", "\4\0\0\0", "ScanNet", "SensReader"),
+    ("scene0000_00.sens", "\4\0\0\0", "ScanNet", "transforms.json"),
+    ("pose/0.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "NSVF", "transforms.json"),
+    ("poses/0.txt", "1 0 0 -.5 0 1 0 0 0 0 1 0 0 0 0 1", "SRN", "transforms.json"),
+    ("pred_traj.txt", "# time tx\n0.0 0 0 1e-3 0 0 0 1\n1.0 0 0 2 0 0 0 1\n", "MonST3R", "evo_traj tum"),
+    ("0a1b.txt", "https://www.youtube.com/watch?v=a\n100 .9 .9 .5 .5 0 0 1 0 0 0 0 1 0 0 0 0 1 0\n", "RealEstate10K",
+     "transforms.json"),
+    ("Barn.log", "0 0 0\n1 0 0 0\n", "Tanks and Temples", "transforms.json"),
     ("seq-01/frame-000000.pose.txt", "1 0 0 0\n", "7-Scenes", "kapture_import_7scenes.py"),
     ("sensors/sensors.txt", "# kapture format: 1.1", "kapture", "kapture_export_colmap.py"),
     ("metadata.json", '{"w": 1, "h": 2, "K": [1], "poses": [[', "Record3D", "ns-process-data record3d"),
@@ -57,7 +63,7 @@ FILES = [
     ("transforms_train.json", '[\n {"file_path": "a.png", "transform": [[', "ns-export", "of the capture"),
     ("a.psht", "\0", "Postshot", "loaded into it"),
     ("a.blend", "BLENDER", "3D programs", "BlenderNeRF"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "start", "program", "remedy"), FILES)
@@ -90,7 +96,7 @@ def test_each_layout_that_is_not_read_is_tried() -> None:
     ("name", "start"),
     [
         ("a.csv", "name,price\n"), ("a.json", '{"transform": [[1'), ("a.xml", "<a/>"), ("a.out", "x"),
-        ("metadata.json", "{}"), ("a.db", "x"), ("cameras.npz", "PK\3\4 extrinsics.npy"), ("a.xmp", "<x:xmpmeta>"),
+        ("metadata.json", "{}"), ("a.db", "x"), ("cameras.npz", "PK\3\4 extrinsics.npy"), ("notes.txt", "1 2 3"), ("a.xmp", "<x:xmpmeta>"),
     ],
 )  # fmt: skip
 def test_files_of_others_are_none(tmp_path: Path, name: str, start: str) -> None:
