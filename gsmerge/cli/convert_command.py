@@ -26,7 +26,7 @@ class PhotoOptions(Settings):
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
                  "Files or folders of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb, lod-meta.json, "
-                 ".ksplat, meta.json, .lcc or .lcc2. Several files in one coordinate frame are joined. The last path "
+                 "meta.json. Several files in one coordinate frame are joined. The last path "
                  "is the output, and its name sets the format: .ply, .spz, .sog, .splat, .glb, .html (a "
                  "page to send), lod-meta.json, a folder, or a folder named colmap. Or a .gsm of gsmerge extend, and "
                  "a .npz for the arrays of its Feature Gaussians."),

@@ -10,12 +10,11 @@ from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.io import file_notes
-from gsmerge.io.archives import damaged_member
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_all_cameras
-from gsmerge.io.cameras.table import CAMERA_ENDINGS, CHUNK
-from gsmerge.io.formats import ply, spz, streamed
+from gsmerge.io.cameras.table import CAMERA_ENDINGS
+from gsmerge.io.formats import ply, streamed
 from gsmerge.io.formats.read import degree_notes
 from gsmerge.io.formats.table import (
     META,
@@ -30,14 +29,13 @@ from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.scene.exporters import AUTO
-from gsmerge.scene.files import find_scene_files, list_plys
+from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_files
 from gsmerge.settings.reading import OpacityChoice, ReadHints
 from gsmerge.states.state_file import holds_features, load_state
 
 NETWORKS = ".safetensors"
 CAMERAS = (*CAMERA_ENDINGS, ".bin")
-ARCHIVES = (".sog", ".npz", CHUNK)
 
 
 @dataclass(frozen=True)
@@ -75,9 +73,8 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
         file_check = _read_scene(path, opacity, hints) if holds_scene(path) else _read(path)
     except SceneError as error:
         return FileCheck(str(path), "", problems=(str(error).removeprefix(f"{path}: "),))
-    problems = (*file_check.problems, *list_damage(path))
     size = 0 if path.is_dir() else path.stat().st_size
-    return replace(file_check, file_bytes=file_check.file_bytes or size, problems=problems)
+    return replace(file_check, file_bytes=file_check.file_bytes or size)
 
 
 def holds_scene(path: Path) -> bool:
@@ -90,21 +87,6 @@ def holds_scene(path: Path) -> bool:
     if path.name == META:
         return find_format(path).holds(path)
     return suffix in SCENE_SUFFIXES or os.path.isdir(path)
-
-
-def list_damage(path: Path) -> list[str]:
-    """List problems that reading a file does not reveal: bytes after its content, and wrong checksums of its parts."""
-    suffix = path.suffix.lower()
-    if os.path.isdir(path):
-        return [f"{file.name}: {problem}" for file in list_plys(path) for problem in list_damage(file)]
-    problem = None
-    if suffix in ARCHIVES:
-        problem = damaged_member(path)
-    elif suffix == ".spz":
-        problem = spz.problem_at_end(path)
-    elif suffix == ".ply" and (surplus := ply.bytes_after_rows(path)):
-        problem = f"{surplus:,} bytes after the last row, which are not read"
-    return [problem] if problem else []
 
 
 def _read(path: Path) -> FileCheck:

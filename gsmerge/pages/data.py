@@ -29,9 +29,8 @@ from gsmerge.measure.evaluate import (
 )
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, draw_borders, mean_colors, to_picture
-from gsmerge.pages.marks import Marks, draw_marks, find_marks
-from gsmerge.pages.splats import MAX_GAUSSIANS, drawn_rows, highest_degree, pack_splats, pack_support
-from gsmerge.raster import Splats, make_splats, render
+from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
+from gsmerge.raster import render
 from gsmerge.raster.metrics import is_worse
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE
 from gsmerge.runtime.threads import use_threads
@@ -62,9 +61,6 @@ class Side:
     covered_share: float | None  # share of the pixels of these views that the input covers
     covered: Quality  # mean over the covered pixels
     seconds: float  # time to draw a view on this machine, with all threads
-    dropped: Mapping[str, int]  # number of Gaussians that ``--drop`` would remove, by its words
-    seen: Mapping[str, int]  # number of Gaussians shown by "none" or by "one" of the input views; empty: not known
-    support: bytes | None  # number of views that show each packed Gaussian, see :func:`pack_support`; None: not known
     new_gain: tuple[float, float] | None = None  # bounds of the expected gain of new views, dB; None: not known
 
 
@@ -82,10 +78,7 @@ class PageView:
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
     outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None for held-out views
     outside: bool = False  # True for the outside view, which has neither a photo nor scores
-    drops: tuple[bytes | None, ...] = ()  # PNG, one for each side: Gaussians that ``--drop`` would remove, coloured
-    seen: tuple[bytes | None, ...] = ()  # PNG, one for each side: Gaussians that none or one of the input views shows
     maps: tuple[bytes | None, ...] = ()  # WebP, one for each side: see :mod:`gsmerge.measure.error_maps`
-    faded: tuple[bytes | None, ...] = ()  # outside view only: stills with faint Gaussians where no view shows them
 
 
 @dataclass(frozen=True)
@@ -206,14 +199,9 @@ def page_data(
     canonical = {name: frame.enter(gaussians) for name, gaussians in named.items()}
     scene_cameras = frame.enter_cameras(scene.cameras.numpy())
     inspected = [name for name in named if name != INPUT or not results]
-    photos = pictures if len(pictures) else None
-    marks = {name: Marks() for name in named} | {
-        name: find_marks(canonical[name], scene_cameras, photos, own=name == INPUT and scene.has_own_pixels)
-        for name in inspected
-    }
     split = "context" if held_out is None else "target"
     sides = [
-        _side(result, size, split, canonical[result.name], marks[result.name], scene, scene_cameras, light=light)
+        _side(result, size, split, canonical[result.name], scene, scene_cameras, light=light)
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
     means = canonical[evaluation.results[:2][-1].name].means  # of the first result, or of the scene without results
@@ -225,18 +213,14 @@ def page_data(
         for name in (inspected if len(pictures) > 1 else ())
     }
     shown = tuple(replace(view, maps=tuple(_map(references.get(name), view) for name in named)) for view in shown)
-    splats = {name: make_splats(canonical[name]) for name in inspected}
-    *marked, outside = (
-        _with_marks(view, splats, marks) for view in (*shown, _outside_view(scene, named, frame, len(views)))
-    )
-    faded = tuple(_fade(canonical[name], marks[name], outside.camera) for name in named)
+    outside = _outside_view(scene, named, frame, len(views))
     measured_notes = evaluation.notes if results else ()  # they concern results
     notes = (*measured_notes, *_limits(sides, len(shown), len(views)))
     covered_share, _ = evaluation.results[0].mean_covered("context")
     lacks_pixels = covered_share is not None and covered_share < WHOLE
     agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
     return ViewData(
-        title, tuple(sides), tuple(marked), replace(outside, faded=faded), len(views), evaluation.reference, notes,
+        title, tuple(sides), shown, outside, len(views), evaluation.reference, notes,
         num_superpixels, lacks_pixels, agreement,
     )  # fmt: skip
 
@@ -251,22 +235,6 @@ def _split_views(
     if held_out is not None:
         splits["target"] = (held_out.cameras.numpy(), held_out.images, held_out.names)
     return splits
-
-
-def _fade(gaussians: Gaussians, marks: Marks, camera: Cameras) -> bytes | None:
-    """Draw canonical Gaussians, faint where no view shows them; None if views show all."""
-    faint = marks.fade(gaussians)
-    return None if faint is None else encode_still(to_picture(render(faint, camera, near=NEAR_PLANE).images[0]))
-
-
-def _with_marks(view: PageView, splats: Mapping[str, Splats], marks: Mapping[str, Marks]) -> PageView:
-    """Add to a view the pictures of the marked Gaussians of each side."""
-    pictures = [
-        draw_marks(splats[name], side_marks, view.camera) if name in splats else (None, None)
-        for name, side_marks in marks.items()
-    ]
-    drops, seen = zip(*pictures, strict=True)
-    return replace(view, drops=drops, seen=seen)
 
 
 def _page_views(
@@ -391,20 +359,16 @@ def _side(
     file_bytes: int,
     split: str,
     gaussians: Gaussians,
-    marks: Marks,
     scene: Scene,
     cameras: Cameras,
     *,
     light: bool,
 ) -> Side:
-    """Collect the data of one side of a page: scores, counts of marked Gaussians, and packed canonical Gaussians."""
+    """Collect the data of one side of a page: scores and packed canonical Gaussians."""
     packed = _pack(gaussians, result.name, scene, cameras, light)
-    support = None if marks.support is None or packed[0] is None else pack_support(marks.support[drawn_rows(gaussians)])
-    dropped, seen = ({word: int(mask.sum()) for word, mask in masks.items()} for masks in (marks.drops, marks.seen))
     mean, covered = result.mean(split)[1], result.mean_covered(split)
     return Side(
-        result.name, result.num_gaussians, file_bytes, mean, *packed, *covered, result.render_seconds,
-        dropped, seen, support,
+        result.name, result.num_gaussians, file_bytes, mean, *packed, *covered, result.render_seconds
     )  # fmt: skip
 
 

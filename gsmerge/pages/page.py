@@ -72,15 +72,12 @@ def view_page(data: ViewData) -> bytes:
     first = {source: start_stills[source] for source in (left, right)}  # in the HTML itself, to appear at once
     start_stills[left] = start_stills[right] = None
 
-    def pictures(of_sides: Sequence[bytes | None], kind: str = "image/webp") -> list[str | None]:
+    def pictures(of_sides: Sequence[bytes | None]) -> list[str | None]:
         """Encode pictures of the sides; the photos, as a source, have none."""
-        return payloads.add_uris([None] * (len(sources) - len(of_sides)) + list(of_sides), kind)
+        return payloads.add_uris([None] * (len(sources) - len(of_sides)) + list(of_sides))
 
     splats = {f"splats-{i}": payloads.add(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     engine = VIEWER.read_bytes() if splats else None
-    splats |= {
-        f"support-{i}": payloads.add(side.support) for i, side in enumerate(data.sides) if side.support is not None
-    }
     result_ids = range(min(len(data.sides) - 1, 1), len(data.sides))  # sides; a single scene counts as a result
     results = [_result(data, i) for i in result_ids]
     by_size = sorted(result_ids, key=lambda i: data.sides[i].num_gaussians)
@@ -112,9 +109,6 @@ def view_page(data: ViewData) -> bytes:
         speed_words=speed_words(results[0]["speed"]),
         agreement=agreement_words(data),
         outlines=payloads.add_uris([view.outlines for view in data.shown], "image/png"),
-        drops=[pictures(view.drops, "image/png") for view in data.shown],
-        seen=[pictures(view.seen, "image/png") for view in data.shown],
-        faded=pictures(data.outside.faded),
         maps=[pictures(view.maps) for view in data.shown],
         splats=splats,
         engine=engine and payloads.add(engine),
@@ -125,15 +119,10 @@ def view_page(data: ViewData) -> bytes:
 def _sources(data: ViewData, has_photos: bool) -> list[dict[str, Any]]:
     """List the choices for the two sides of a page: the photos if there are any, and each scene."""
     picture = "own colours" if data.reference == ROW_COLORS else "photo"
-    sources: list[dict[str, Any]] = (
-        [{"name": picture, "splats": None, "count": 0, "dropped": {}, "seen": {}, "support": None}]
-        if has_photos
-        else []
-    )
+    sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0}] if has_photos else []
     return sources + [
         {
-            "name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians,
-            "dropped": side.dropped, "seen": side.seen, "support": None if side.support is None else f"support-{i}",
+            "name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians
         }
         for i, side in enumerate(data.sides)
     ]  # fmt: skip

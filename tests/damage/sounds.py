@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import json
 import re
-import struct
 import tempfile
 import warnings
 import zipfile
@@ -43,7 +41,6 @@ from gsmerge.io import read_cameras, read_gaussians, read_images
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_sharp_camera
-from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.kernels.matrices import invert
 from gsmerge.networks.checkpoint import load_checkpoint
@@ -54,15 +51,13 @@ from gsmerge.states.compactor import Compactor
 from gsmerge.states.state_file import load_state
 from gsmerge.types import Gaussians
 
-from .changes import glb_bytes, pack_members
+from .changes import pack_members
 
-SPLATTING = "KHR_gaussian_splatting"
-SPZ_IN_GLB = f"{SPLATTING}_compression_spz_2"
 NAMES = ("view_000.png", "view_001.png", "view_002.png")
 VIEW_NAMES = [Path(name).stem for name in NAMES]
 TINY = replace(make_tiny(6, 4), names=NAMES)
 SOME = random_gaussians(6, 0, degree=1)
-PHOTO_ENDINGS = ("png", "jpg", "bmp", "webp", "tiff", "ppm")
+PHOTO_ENDINGS = ("png", "jpg", "bmp", "webp", "ppm")
 COMPACT = ("compact", "--dry-run")
 PLAIN = re.compile(r"([\w-]+/){0,2}[\w-]+\.\w+")
 UNPACKING = (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError)
@@ -265,21 +260,6 @@ def write_sharp(folder: Path) -> None:
     )
 
 
-def write_glb_of_spz(folder: Path) -> None:
-    """Write a ``.glb`` whose Gaussians are a ``.spz`` inside, as Cesium's tiles have them."""
-    packed = spz_bytes(SOME)
-    packed += bytes(-len(packed) % 4)
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "extensions": {SPZ_IN_GLB: {"bufferView": 0}}}
-    document = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "extensionsUsed": [SPLATTING],
-        "nodes": [{"mesh": 0}], "buffers": [{"byteLength": len(packed)}],
-        "meshes": [{"primitives": [{"attributes": {}, "mode": 0, "extensions": {SPLATTING: splats}}]}],
-        "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": len(packed)}],
-    }  # fmt: skip
-    rest = struct.pack("<I4s", len(packed), b"BIN\0") + packed
-    (folder / "a.glb").write_bytes(glb_bytes(json.dumps(document).encode(), rest))
-
-
 def write_levels(folder: Path, leaves: int = 1) -> None:
     write_set(folder / "lod-meta.json", [random_gaussians(n, n) for n in (6, 3)], leaves=leaves)
 
@@ -433,7 +413,6 @@ SOUNDS: dict[str, Sound] = {
     "sog": Sound("a.sog", write_some("a.sog"), check_gaussians),
     "splat": Sound("a.splat", write_some("a.splat"), check_gaussians),
     "glb": Sound("a.glb", write_some("a.glb"), check_gaussians),
-    "glb of spz": Sound("a.glb", write_glb_of_spz, check_gaussians, rare=True),
     "levels": Sound("lod-meta.json", write_levels, check_gaussians, packed=True),
     "levels of a tree": Sound("lod-meta.json", partial(write_levels, leaves=2), check_gaussians, rare=True,
                               packed=True),

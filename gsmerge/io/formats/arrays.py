@@ -161,16 +161,11 @@ class Columns:
 
     def along_curve(self) -> Columns:
         """Return the rows in the order of a space-filling curve, which keeps neighbours in space close in the file."""
-        return self.take(curve_order(self.means))
+        return self.take(np.argsort(morton_codes(self.means), kind="stable"))
 
     def take(self, rows: np.ndarray) -> Columns:
         """Return the rows with the given indices, in that order."""
         return Columns(*(column[rows] for column in vars(self).values()))
-
-
-def curve_order(means: np.ndarray) -> np.ndarray:
-    """Return the order of centres ``[n,3]`` along a space-filling curve."""
-    return np.argsort(morton_codes(means), kind="stable")
 
 
 def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:

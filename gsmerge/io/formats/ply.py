@@ -19,7 +19,7 @@ from types import MappingProxyType
 from typing import IO, Any, Literal
 
 import numpy as np
-from plyfile import PlyData, PlyElementParseError, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElementParseError, PlyParseError
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.frozen import dataclass
@@ -348,18 +348,6 @@ def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Call
             return out
 
         yield read
-
-
-def bytes_after_rows(path: Path) -> int:
-    """Count the bytes of a binary PLY file after its last row; 0 for text or list rows."""
-    with path.open("rb") as file:
-        end, is_text, _ = _check_header(file.read(MAX_HEADER_BYTES), budget := read_budget(path))
-    if is_text:
-        return 0
-    data = open_ply(path)
-    if any(isinstance(p, PlyListProperty) for element in data.elements for p in element.properties):
-        return 0
-    return budget.file_bytes - end - sum(element.data.nbytes for element in data.elements)
 
 
 def header_counts(path: Path) -> tuple[int, int]:

@@ -156,10 +156,9 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto", scales: Sc
     """Read a file of Gaussians; the ending of its name tells the format.
 
     Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2), ``.glb``, and ``.npz`` of depth maps. The
-    finest level of a ``lod-meta.json`` is read. splat-transform reads ``.ksplat``, ``meta.json`` or its folder,
-    ``.lcc`` and ``.lcc2``. Everything else is read by :func:`read_ply`; only this uses ``opacity``
-    and ``scales``. SceneError if the file cannot be read, is damaged, or holds no finite Gaussian. ValueError for an
-    unknown ``opacity`` or ``scales``.
+    finest level of a ``lod-meta.json`` is read; ``meta.json`` or its folder is a ``.sog`` without its zip. Everything
+    else is read by :func:`read_ply`; only this uses ``opacity`` and ``scales``. SceneError if the file cannot be read,
+    is damaged, or holds no finite Gaussian. ValueError for an unknown ``opacity`` or ``scales``.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)

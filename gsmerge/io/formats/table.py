@@ -107,7 +107,6 @@ class Format:
 _page, _model = lazy_functions("gsmerge.pages"), lazy_functions("gsmerge.compaction")
 _SOG = 13.0, 22.0, 36.5, 56.5
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
-_READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
     each=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes, columns=True, marks=None,
@@ -160,28 +159,16 @@ STATE = Format(
     STATE_ENDING, "batches of views: Gaussians, cameras and pictures", _lazy("gsm.read_rows"), None, -1, each=(56.0,)
 )
 META = "meta.json"  # of a .sog that is a folder
-BY_PROGRAM = (  # formats that splat-transform reads for gsmerge
-    Format(".ksplat", "by splat-transform", _READ_BY_PROGRAM, None, -1),
-    Format(
-        META, "a .sog without its zip, by splat-transform", _READ_BY_PROGRAM, None, -1,
-        holds=_lazy("splat_transform.holds_sog"),
-    ),
-    Format(".lcc", "the finest level, by splat-transform", _READ_BY_PROGRAM, None, -1),
-    Format(".lcc2", "as `.lcc`", _READ_BY_PROGRAM, None, -1),
+SOG_FOLDER = Format(
+    META, "a .sog without its zip", _lazy("sog.read_folder"), None, -1, holds=_lazy("sog.is_folder"),
 )  # fmt: skip
 SEVERAL_USES = (".npz", ".glb")  # endings of files that often hold no Gaussians
-FORMATS = (*FILES, HTML, LEVELS, COLMAP, DEPTHS, STATE, *BY_PROGRAM)
+FORMATS = (*FILES, HTML, LEVELS, COLMAP, DEPTHS, STATE, SOG_FOLDER)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # results that a page shows
 FOLDERS = {row.folder: row for row in FORMATS if row.folder}  # by the name of an output folder
 READ_ENDINGS = tuple(row.ending for row in FORMATS if row.read is not None)
-SCENE_SUFFIXES = tuple(
-    dict.fromkeys(
-        Path(f"_{row.ending}").suffix
-        for row in (*FILES, DEPTHS, *BY_PROGRAM)
-        if row.read is not None and row.ending[0] == "."
-    )
-)
+SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in (*FILES, DEPTHS) if row.read is not None))
 
 
 def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:

@@ -18,7 +18,6 @@ from messages import noted
 
 from gsmerge import Gaussians, Scene, evaluate, render
 from gsmerge.facts.row_colors import ROW_COLORS
-from gsmerge.facts.support import count_views
 from gsmerge.frame import scene_frame
 from gsmerge.io.formats.spz import UNIX, spz_bytes
 from gsmerge.measure.camera_path import outside_camera
@@ -27,13 +26,9 @@ from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages import data, splats
 from gsmerge.pages.data import ViewData, collect, encode_still, short_names
-from gsmerge.pages.marks import DROPS, FAINT, draw_shares, light_shares
 from gsmerge.pages.page import headline
 from gsmerge.pages.splats import pack_splats
-from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.metrics import psnr
-from gsmerge.settings.stages import CleanOptions
-from gsmerge.stages.clean import clean
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Views
 
@@ -214,50 +209,6 @@ def test_a_light_page_has_no_gaussians_of_the_scene(small: Scene) -> None:
     light = collect("room", small, {"half": small.gaussians[::2]}, (2, 1), light=True)
     assert [side.splats is None for side in light.sides] == [True, False]
     assert not any("stills only" in note or "harmonics" in note for note in light.notes)
-
-
-def test_what_would_be_dropped_is_drawn(small: Scene) -> None:
-    """Floaters and sky as ``compact --drop`` takes them, in the pictures that show them."""
-    half, frame = small.gaussians[::2], scene_frame(small)
-    entered, camera = frame.enter(half), frame.enter_cameras(small.cameras)
-    _, counts = clean(entered, CleanOptions(drop="floaters,sky"), camera, small.images, frame.leave)
-    shown = collect("room", small, {"half": half}, (2, 1))
-    assert [side.dropped for side in shown.sides] == [{}, {word: n for word, n in counts.items() if n}]
-    assert counts["floaters"] > 0
-    assert all(view.drops[0] is None for view in shown.shown)
-    assert any(view.drops[1] for view in shown.shown)
-    splats, near = make_splats(entered), near_plane(small) / frame.unit
-    tiled = tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=near)
-    mask = draw_shares(light_shares(tiled, {"sky": np.arange(len(half)) < len(half) / 2}), DROPS)
-    picture = cv2.imdecode(np.frombuffer(mask or b"", np.uint8), cv2.IMREAD_UNCHANGED)
-    assert picture.shape == (small.cameras.height, small.cameras.width, 4)
-    alphas = picture[..., 3]
-    assert set(map(tuple, picture[alphas > 0][:, :3])) == {(255, 170, 20)}
-    assert alphas.max() < 200  # what is behind the whole of it is seen
-    assert 0 < alphas[alphas > 0].min() < alphas.max() / 2  # and more where it is a part of the light
-    assert draw_shares(light_shares(tiled, {"floaters": np.zeros(len(half), bool)}), DROPS) is None
-
-
-def test_what_few_views_show_is_counted_drawn_and_faded(small: Scene) -> None:
-    """A result with as many Gaussians behind the cameras: the view from outside sees them, and fades them."""
-    half = small.gaussians[::2]
-    away = small.cameras.viewmats[:, 2, :3].mean(0) * np.linalg.norm(np.ptp(half.means, axis=0))
-    both = Gaussians.concat([half, replace(half[::3], means=half.means[::3] - away.astype(np.float32))])
-    shown = collect("room", small, {"both": both}, (2, 1))
-    counts = count_views(scene_frame(small).enter(both), scene_frame(small).enter_cameras(small.cameras))
-    scene, side = shown.sides
-    assert (scene.seen, scene.support) == ({}, None)
-    assert side.seen == {"none": (counts == 0).sum(), "one": (counts == 1).sum()}
-    assert side.seen["none"] >= len(half[::3])
-    np.testing.assert_array_equal(np.frombuffer(gzip.decompress(side.support or b""), np.uint8), np.minimum(counts, 2))
-    assert all(view.faded == () for view in shown.views)
-    plain, faint = (
-        cv2.imdecode(np.frombuffer(one[1] or b"", np.uint8), 1).astype(int)
-        for one in (shown.outside.stills, shown.outside.faded)
-    )
-    assert (plain - faint).max() > 20
-    assert shown.outside.faded[0] is None
-    assert 0 < FAINT < 1
 
 
 def test_too_many_gaussians_are_left_out(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -177,32 +177,6 @@ def test_how_much_faster_it_draws(before: float, after: float, words: str, data:
     assert speed(replace(data, sides=data.sides[:1])) is None
 
 
-def test_what_would_be_dropped_has_a_switch(data: ViewData) -> None:
-    bare = tuple(replace(side, dropped={}) for side in data.sides)
-    dropping = (bare[0], replace(bare[1], dropped={"sky": 12}))
-    views = tuple(replace(view, drops=(None, b"one")) for view in data.views)
-    page = page_of(replace(data, sides=dropping, views=views))
-    assert 'data-set="drops"' in page
-    assert json.loads(block(page, "drop-pictures"))[0] == [None, None, f"{PNG}b25l"]
-    assert json.loads(block(page, "data"))["sources"][2]["dropped"] == {"sky": 12}
-    assert 'data-set="drops"' not in page_of(replace(data, sides=bare))
-
-
-def test_what_no_view_shows_has_a_switch(data: ViewData) -> None:
-    bare = tuple(replace(side, seen={}, support=None) for side in data.sides)
-    known = (bare[0], replace(bare[1], seen={"none": 7}, support=b"two"))
-    views = tuple(replace(view, seen=(None, b"one")) for view in data.views)
-    outside = replace(data.outside, faded=(None, b"one"))
-    page = page_of(replace(data, sides=known, views=views, outside=outside))
-    assert 'data-set="seen"' in page
-    assert "--drop unseen" in page
-    assert json.loads(block(page, "seen-pictures"))[0] == [None, None, f"{PNG}b25l"]
-    assert json.loads(block(page, "faded-pictures")) == [None, None, f"{WEBP}b25l"]
-    assert base64.b64decode(block(page, "support-1")) == b"two"
-    assert json.loads(block(page, "data"))["sources"][2]["support"] == "support-1"
-    assert 'data-set="seen"' not in page_of(replace(data, sides=bare))
-
-
 def test_colours_are_readable_in_both_schemes(page: str) -> None:
     """Contrast of at least 4.5 of text on what it stands on."""
     style = re.findall("<style>(.*?)</style>", page, re.DOTALL)[0]

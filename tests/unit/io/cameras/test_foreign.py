@@ -96,7 +96,8 @@ def test_each_layout_that_is_not_read_is_tried() -> None:
     ("name", "start"),
     [
         ("a.csv", "name,price\n"), ("a.json", '{"transform": [[1'), ("a.xml", "<a/>"), ("a.out", "x"),
-        ("metadata.json", "{}"), ("a.db", "x"), ("cameras.npz", "PK\3\4 extrinsics.npy"), ("notes.txt", "1 2 3"), ("a.xmp", "<x:xmpmeta>"),
+        ("metadata.json", "{}"), ("notes.txt", "1 2 3"), ("a.db", "x"), ("cameras.npz", "PK\3\4 extrinsics.npy"),
+        ("a.xmp", "<x:xmpmeta>"),
     ],
 )  # fmt: skip
 def test_files_of_others_are_none(tmp_path: Path, name: str, start: str) -> None:

@@ -162,7 +162,7 @@ def test_frames_that_are_not_all_there(tmp_path: Path, tiny: Tiny) -> None:
         find_scene_files(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["results.npz", "a.ksplat", "a.compressed.ply", "a.lcc"])
+@pytest.mark.parametrize("name", ["results.npz", "a.compressed.ply", "meta.json"])
 def test_what_is_only_read_is_not_written(name: str) -> None:
     with refuses(UsageError, name, "can be read but not written", "a name that ends in"):
         output_format(name)
