@@ -83,32 +83,6 @@ PROGRAMS = (
     Foreign("*.abc *.fbx *.chan *.blend *.ma", "3D programs", "BlenderNeRF, in Blender, writes transforms_train.json"),
 )  # fmt: skip
 
-# Words for positions, rotations and matrices, by which a text file of an unknown format shows that it has poses
-_POSITION = r'\b(position|location|translation|transform|[xyz]|([tp]|loc|pos)[_.]?x)\b|"t":'
-_ROTATION = r'\b(rotation|quaternion|orientation|transform|heading|omega|yaw|(q|r|rot|quat|rotation)[_.]?[wx])\b|"r":'
-_MATRIX = r"\b(extrinsics?|c2w|w2c|cam(era)?_?(to|2)_?world|world_?(to|2)_?cam(era)?|view_?matrix|poses?)\b\W*[\d{[]"
-
-
-def starts_like_poses(path: Path) -> bool:
-    """Return whether a text file seems to have camera poses, by words of its first bytes.
-
-    The first line of a table must have words for position and rotation. JSON and XML must have them several times, or a
-    word for a pose before a number.
-    """
-    suffix, text = path.suffix.lower(), read_start(path).decode("latin-1").lower().lstrip()
-    if suffix in (".csv", ".txt"):
-        return all(re.search(words, text.partition("\n")[0]) for words in (_POSITION, _ROTATION))
-    has_several_words = all(len(re.findall(words, text)) > 1 for words in (_POSITION, _ROTATION))
-    return suffix in (".json", ".xml") and (has_several_words or re.search(_MATRIX, text) is not None)
-
-
-def check_unknown(path: Path) -> None:
-    """Raise SceneError if a file of an unknown format seems to have camera poses."""
-    if starts_like_poses(path):
-        raise SceneError(
-            path, "expected cameras in a supported format, found poses in a format that is not known", _WRITE
-        )
-
 
 def check_program(place: Path) -> None:
     """Raise SceneError, with the export to use instead, if a path is, or contains, a file of :data:`PROGRAMS`."""

@@ -37,8 +37,6 @@ _SMALL = 1e-9  # smaller principal points are raised to this, because they are d
 _EQUAL_INTRINSICS = 1e-5  # relative tolerance
 _MAX_RATIO_DIFFERENCE, _MIN_SIZE_DIFFERENCE = 0.03, 0.1  # relative: of two axes' ratios, and of two sizes
 _MAX_HEADER = 1 << 16  # bytes of an array's header
-_POINTS = "world_points"  # array of the points of all pixels
-_SAMPLE_POINTS = 1000  # points of each view that are compared with the depth maps
 _KINDS = "biufU"  # NumPy's kinds of arrays that are read: numbers and text
 
 
@@ -52,8 +50,8 @@ def read_da3(source: CameraSource) -> StoredCameras:
 
     Intrinsics are scaled to the depth maps if they are divided by the size, or if they are for another image size, as
     after a COLMAP export in the same call. The function also reads ``cameras.npz`` of Lyra 2, and the outputs of VGGT
-    (``extrinsic``, world to camera), MapAnything (camera to world, as its points show) and AnySplat (camera to world,
-    intrinsics divided by the size, in a batch of one). SceneError if the file cannot be read or lacks an array.
+    (``extrinsic``, world to camera) and AnySplat (camera to world, intrinsics divided by the size, in a batch of one).
+    SceneError if the file cannot be read or lacks an array.
     """
     path = source.path
     size_names = () if holds_images(path) else _DEPTHS  # depths are read for their shape alone
@@ -77,25 +75,7 @@ def read_da3(source: CameraSource) -> StoredCameras:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
     if width <= 1 and Ks is not None and not is_da3(path):  # AnySplat divides intrinsics by the size
         return StoredCameras(_views(poses, Ks, (0, 0)), photos, convention=C2W_OPENCV)
-    convention = C2W_OPENCV if _POINTS in array_names(path) and _are_camera_to_world(path, poses) else None
-    return StoredCameras(_views(poses, Ks, (width, height)), photos, convention=convention)
-
-
-def _are_camera_to_world(path: Path, poses: np.ndarray) -> bool:
-    """Return whether stored points fit the depth maps better with camera-to-world than with world-to-camera poses."""
-    points, depths = read_arrays(path, (_POINTS,))[_POINTS], read_depths(path)
-    has_point_per_depth = depths is not None and len(depths) == len(poses) and points.shape == (*depths.shape, 3)
-    if depths is None or not has_point_per_depth or points.dtype.kind not in "fiu":
-        return False
-    sample = slice(None), slice(None, None, max(1, depths[0].size // _SAMPLE_POINTS))
-    z, xyz = (array.reshape(len(poses), depths[0].size, -1)[sample].astype(np.float64) for array in (depths, points))
-    rotations, shifts = poses[:, None, :3, :3].astype(np.float64), poses[:, None, :3, 3].astype(np.float64)
-    with np.errstate(all="ignore"):
-        z_w2c = (xyz * rotations[..., 2, :]).sum(-1) + shifts[..., 2]
-        z_c2w = ((xyz - shifts) * rotations[..., 2]).sum(-1)
-        errors = np.abs(np.array((z_w2c, z_c2w)) - z[..., 0])
-    as_w2c, as_c2w = errors[:, np.isfinite(errors).all(0)]
-    return len(as_w2c) > 0 and bool(np.median(as_c2w) < np.median(as_w2c))
+    return StoredCameras(_views(poses, Ks, (width, height)), photos)
 
 
 def read_dump(source: CameraSource) -> StoredCameras:

@@ -11,7 +11,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.camera_source import CameraSource, check_objects
-from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program, check_unknown, starts_like_poses
+from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program
 from gsmerge.io.cameras.table import (
     CAMERA_ENDINGS,
     CAMERA_FORMATS,
@@ -31,7 +31,7 @@ _lazy = lazy_functions(__package__)
 holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.read_depths")
 _holds_poses, _read_scenes = _lazy("npz_files.holds_poses"), _lazy("re10k.read_scenes")
 _MAX_CANDIDATES = 16  # files in a folder that are searched for cameras
-_CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt", ".csv")
+_CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt")
 
 
 def find_cameras(folder: Path) -> Path | None:
@@ -51,13 +51,12 @@ def _is_camera_folder(folder: Path) -> bool:
 def find_other_cameras(folder: Path) -> Path | None:
     """Find the only file in a folder that can be read as cameras, whatever its name.
 
-    If no file can be read, return the first file that starts like camera poses of an unknown program. None if there are
-    several files of cameras, or none.
+    None if there are several files of cameras, or none.
     """
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _CANDIDATE_ENDINGS)
     files = [path for path in files if path.name != INTRINSICS and not path.name.endswith(ENDING)]
     files = [path for path in files if path.is_file()][:_MAX_CANDIDATES]
-    files = [path for path in files if holds_cameras(path)] or [*filter(starts_like_poses, files)][:1]
+    files = [path for path in files if holds_cameras(path)]
     return files[0] if len(files) == 1 else None
 
 
@@ -99,7 +98,6 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
     if format_ is None:
         if isinstance(entries := source.json if ending == ".json" else None, list):
             check_objects(path, entries)
-        check_unknown(path)
         raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
     return format_.cameras(source)
 

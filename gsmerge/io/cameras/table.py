@@ -17,14 +17,7 @@ from gsmerge.io.cameras.embedded import SHARP, read_sharp
 from gsmerge.io.cameras.long_lrm import is_long_lrm, move_to_gaussians
 from gsmerge.io.cameras.programs import join_matrices, list_keyframes, list_shots, set_centred_size
 from gsmerge.io.cameras.read_views import read_views
-from gsmerge.io.cameras.view_layout import (
-    Matrix,
-    MatrixEntries,
-    Pinhole,
-    RotationAndShift,
-    ViewLayout,
-    rotation_of_vector,
-)
+from gsmerge.io.cameras.view_layout import Matrix, Pinhole, RotationAndShift, ViewLayout, rotation_of_vector
 from gsmerge.io.first_bytes import read_start
 from gsmerge.io.formats.table import STATE_ENDING
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
@@ -136,10 +129,7 @@ _OPENSFM = ViewLayout(
     optional=("focal_y", "c_x", "c_y"),
 )
 _POLYCAM = ViewLayout(
-    views=list_keyframes,
-    pose=MatrixEntries([[f"t_{row}{column}" for column in range(4)] for row in range(3)]),
-    K=Pinhole("fx", "fy", "cx", "cy"),
-    size=("width", "height"),
+    views=list_keyframes, pose=Matrix("transform"), K=Pinhole("fx", "fy", "cx", "cy"), size=("width", "height")
 )
 _METASHAPE = ViewLayout(
     views=_lazy("metashape.list_cameras"),

@@ -39,7 +39,6 @@ SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 PLAIN_COLORS = (("red", "green", "blue"), ("r", "g", "b"))  # instead of SH0, in files of nerfstudio and of 4DGT
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
-FILTER = "filter_3D"  # of Mip-Splatting: standard deviation of the filter that is added to all scales
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of compressed PLYs
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
 MAX_STRAY = 0.01  # share of a column's values that may contradict the rest, because of roundings and damage

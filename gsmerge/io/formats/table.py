@@ -76,7 +76,6 @@ class Format:
     # Cameras of views: in a file beside it, inside it, or inside it and required
     cameras: Literal["", "inside", "needed"] = ""
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as the format does
-    kept_as: str = ""  # ending of the format that rounds its Gaussians, if it stores them in another format
     columns: bool = False  # whether the user can choose which of INRIA's columns it has
     marks: Sequence[str] | None = ()  # comments of the input that it keeps; None: all of ``copied_comments``
     lost: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
@@ -116,7 +115,7 @@ LEVELS = Format(
     INDEX, "levels of detail in chunks; written by splat-transform",
     _lazy("streamed.read_rows"), None, 3, require=_lazy("splat_transform.find_program"),
     write=_lazy("streamed.write_output"), finish=_lazy("streamed.remove_unused_chunks"), levels="inside",
-    round_means=_lazy("sog.round_means"), kept_as=".sog", marks=(MIP_COMMENT, FLAT_COMMENT),
+    round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
 )  # fmt: skip
 COLMAP = Format(
     POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0,
@@ -128,7 +127,7 @@ COLMAP = Format(
 HTML = Format(
     ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
     write=_page("site.write_output"), levels="", cameras="inside", round_means=_lazy("sog.round_means"),
-    kept_as=".sog", site="index.html", beside=_page("site.files_beside"),
+    site="index.html", beside=_page("site.files_beside"),
     each=tuple(_IN_TEXT * sog_bytes for sog_bytes in _SOG), rest=_page("site.least_bytes"),
     measure=_page("site.measure"),
 )  # fmt: skip

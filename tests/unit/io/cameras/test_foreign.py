@@ -105,36 +105,6 @@ def test_files_of_others_are_none(tmp_path: Path, name: str, start: str) -> None
     assert find_unread(tmp_path) is None
 
 
-VIEW = '{"position": {"x": 1}, "rotation": {"w": 1}}'
-
-
-@pytest.mark.parametrize(
-    ("name", "start", "poses"),
-    [
-        ("cameras_unity.json", f'{{"cameras": [{VIEW}, {VIEW}]}}', True),
-        ("unreal.json", '{"Cameras": [' + '{"Location": {"X": 1}, "Rotation": {"Yaw": 2}}, ' * 2 + "{}]}", True),
-        ("luma.json", '{"views": [{"cameraToWorld": [1, 0, 0]}]}', True),
-        ("rt.json", '{"a": {"R": [[1]], "t": [0]}, "b": {"R": [[1]], "t": [0]}}', True),
-        ("blender.csv", "frame,loc_x,loc_y,loc_z,quat_w,quat_x\n1,0", True),
-        ("a.txt", "name tx ty tz qw qx qy qz\na 1", True),
-        ("config.json", '{"position_lr_init": 1, "rotation_lr": 1, "rotation": 2, "extrinsics": true}', False),
-        ("viewer.json", f'{{"camera": {VIEW}}}', False),
-        ("README.txt", "The camera's\nposition and rotation\n", False),
-        ("cloud.csv", "x,y,z,nx,ny,nz,red\n", False),
-        ("a.yaml", "extrinsics: [1]", False),
-    ],
-)
-def test_poses_of_a_program_that_is_not_known_are_told_by_words(
-    tmp_path: Path, name: str, start: str, poses: bool
-) -> None:
-    path = tmp_path / name
-    path.write_text(start)
-    (tmp_path / "a.ply").write_text("ply\n")
-    assert find_scene_files(tmp_path / "a.ply").cameras == (path if poses else None)
-    with refuses(SceneError, name, *(("not known", "transforms.json") if poses else ("found",))):
-        read_cameras(path)
-
-
 def test_cameras_of_a_scene_below_are_its_own(tmp_path: Path, tiny: Tiny) -> None:
     below = tmp_path / "other/rc.csv"
     below.parent.mkdir()
@@ -152,7 +122,6 @@ def test_cameras_that_are_read_go_first(tmp_path: Path, tiny: Tiny) -> None:
     assert find_scene_files(tmp_path / "a.ply").cameras == tmp_path / "a.nvm"
     write_transforms(tmp_path / "transforms.json", tiny)
     assert find_cameras(tmp_path) == find_scene_files(tmp_path / "a.ply").cameras == tmp_path / "transforms.json"
-    (tmp_path / "unity.json").write_text(f'{{"cameras": [{VIEW}, {VIEW}]}}')
     (tmp_path / "transforms.json").rename(tmp_path / "b.json")
     assert find_other_cameras(tmp_path) == tmp_path / "b.json"
     (tmp_path / "c.json").write_text((tmp_path / "b.json").read_text())

@@ -58,24 +58,6 @@ def test_npz_intrinsics_of_a_colmap_export_of_the_same_call_are_scaled_back(tmp_
     assert not np.allclose(read_cameras(tmp_path / "exports/npz").Ks, tiny.K)
 
 
-def test_npz_with_points_have_the_poses_that_the_points_show(tmp_path: Path, tiny: Tiny) -> None:
-    """MapAnything writes camera-to-world under the name that VGGT has for world-to-camera."""
-    y, x = np.mgrid[: tiny.height, : tiny.width] + 0.5
-    depths = np.random.default_rng(0).uniform(1, 3, (3, tiny.height, tiny.width))
-    local = depths[..., None] * (np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(tiny.K).T)
-    points = np.einsum("vij,vhwj->vhwi", tiny.c2w[:, :3, :3], local) + tiny.c2w[:, None, None, :3, 3]
-    for poses in (tiny.w2c, tiny.c2w):
-        arrays = {"extrinsic": poses, "intrinsic": np.tile(tiny.K, (3, 1, 1)), "images": tiny.images}
-        np.savez(tmp_path / "predictions.npz", **arrays, depth=depths[..., None], world_points=points)
-        assert_same(read_cameras(tmp_path / "predictions.npz"), tiny)
-    depths[:, 0] = np.nan  # a mask
-    np.savez(tmp_path / "predictions.npz", **arrays, depth=depths, world_points=points)
-    assert_same(read_cameras(tmp_path / "predictions.npz"), tiny)
-    for maps, other in ((depths[:2], points[:2]), (depths, points.astype("U8")), (depths, points * np.nan)):
-        np.savez(tmp_path / "predictions.npz", **arrays, depth=maps, world_points=other)
-        assert np.allclose(read_cameras(tmp_path / "predictions.npz").viewmats, tiny.c2w)
-
-
 def test_npz_that_are_refused(tmp_path: Path, tiny: Tiny) -> None:
     write_npz(tmp_path / "a.npz", tiny, extrinsics=None, intrinsics=None)
     write_npz(tmp_path / "b.npz", tiny, intrinsics=np.eye(3))
