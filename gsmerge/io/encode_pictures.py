@@ -17,13 +17,3 @@ def encode_picture(picture: np.ndarray, quality: int) -> bytes:
     content = io.BytesIO()
     Image.fromarray(picture).save(content, "WEBP", quality=quality, method=_EFFORT)
     return content.getvalue()
-
-
-def encode_indexed(indices: np.ndarray, colors: np.ndarray) -> bytes:
-    """Encode ``indices [h,w]`` uint8 into ``colors [n,4]`` uint8 sRGB and opacity as a PNG with a palette."""
-    from PIL import PngImagePlugin  # noqa: F401 - as for WebP
-
-    content, picture = io.BytesIO(), Image.fromarray(indices)
-    picture.putpalette(colors[:, :3].tobytes())
-    picture.save(content, "PNG", transparency=colors[:, 3].tobytes(), compress_level=1)
-    return content.getvalue()

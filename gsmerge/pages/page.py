@@ -48,10 +48,9 @@ class Payloads:
         self._contents.append(content)
         return f"{self._name}-{len(self._contents) - 1}-"
 
-    def add_uris(self, pictures: Sequence[bytes | None], kind: str = "image/webp") -> list[str | None]:
-        """Add pictures, and return ``data:`` addresses with their marks; None stays None."""
-        head = f"data:{kind};base64,"
-        return [None if picture is None else head + self.add(picture) for picture in pictures]
+    def add_uris(self, pictures: Sequence[bytes | None]) -> list[str | None]:
+        """Add WebP pictures, and return ``data:`` addresses with their marks; None stays None."""
+        return [None if picture is None else "data:image/webp;base64," + self.add(picture) for picture in pictures]
 
     def insert(self, page: str) -> bytes:
         """Put the contents in place of their marks, each where it stands; the page in UTF-8."""
@@ -108,7 +107,6 @@ def view_page(data: ViewData) -> bytes:
         stills=stills,
         speed_words=speed_words(results[0]["speed"]),
         agreement=agreement_words(data),
-        outlines=payloads.add_uris([view.outlines for view in data.shown], "image/png"),
         maps=[pictures(view.maps) for view in data.shown],
         splats=splats,
         engine=engine and payloads.add(engine),

@@ -171,13 +171,6 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Seque
         one_view(view)
 
 
-def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Render the mean depth ``[v,h,w]`` of every pixel, and a mask ``[v,h,w]`` of mostly opaque pixels."""
-    drawn = render(scene.gaussians, scene.cameras, near=NEAR_PLANE, with_depths=True)
-    assert drawn.depths is not None
-    return drawn.depths[..., 0], drawn.alphas[..., 0] > MIN_ALPHA
-
-
 def thin_out(gaussians: Gaussians, count: int) -> Gaussians:
     """Sample every k-th Gaussian, at most ``count``, and enlarge the samples to about the area of all together."""
     step = max(1, -(-len(gaussians) // count))

@@ -35,7 +35,7 @@ FRESH = (
     "solid.request = () => {};"
     "for (const one of document.querySelectorAll('.handle, .tag, .back')) one.style.display = '';"
     "for (const name of ['borderRadius', 'width', 'margin']) stage.style[name] = '';"
-    "set('scheme', ''); set('order', 'worst'); set('outlines', ''); set('drops', ''); set('seen', ''); set('maps', '');"
+    "set('scheme', ''); set('order', 'worst'); set('maps', '');"
     "set('pixels', 'screen'); set('shape', 'splats');"
     "set('solid', ''); set('mode', 'swipe'); set('other', false); pick('left', 1); choose(2); zoomTo(1); swipeTo(0.5);"
     "jump(data.start); document.fullscreenElement && document.exitFullscreen(); scrollTo(0, 0)"
@@ -293,32 +293,13 @@ def test_keys(opened: tuple[Browser, Any]) -> None:
     assert tab.run("[...id('strip').children].filter(one => one.ariaCurrent === 'true').length") == 1
 
 
-@pytest.mark.slow
-def test_outlines_of_superpixels(opened: tuple[Browser, Any]) -> None:
-    """Lines that are a little off the photo's colours, on stills and in 3D, from the cameras of input photos."""
-    tab, _ = opened
-    tab.run(f"{BARE} set('mode', 'blink'); set('other', false); jump(data.views.findIndex(view => !view.held_out))")
-    for solid in ("''", "'1'"):
-        tab.run(f"set('solid', {solid})")
-        plain = picture(tab)
-        tab.press("o")
-        lines = np.abs(picture(tab) - plain)
-        assert 0.003 < lines.mean() < 0.15  # they are a pixel wide on pictures of 1,280
-        assert tab.run("document.querySelector('[data-set=outlines][data-value=\"1\"]').ariaPressed") == "true"
-        tab.run("jump(data.views.findIndex(view => view.held_out))")
-        assert tab.run("document.querySelector('#left-pane .outlines').hidden") is True
-        tab.press("o")
-        tab.run("jump(data.views.findIndex(view => !view.held_out))")
-        assert psnr(picture(tab), plain) > 45
-
-
 def test_grey_controls_say_why(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
-    tab.run("jump(data.views.findIndex(view => view.held_out)); set('solid', '')")
+    tab.run("jump(data.views.findIndex(view => view.outside)); set('solid', '')")
     grey = "[...document.querySelectorAll('button:disabled')].filter(one => one.checkVisibility())"
     assert tab.run(f"{grey}.length") >= 2
     assert tab.run(f"{grey}.every(one => one.title.length > 5)")
-    assert tab.run("document.querySelector('[data-set=outlines]').title") == "Held-out photos have no superpixels"
+    assert tab.run("document.querySelector('[data-set=maps]').title") == "From a photo's camera only"
     seen = "[...document.querySelectorAll('[data-set=shape], [data-set=pixels]')].map(one => one.checkVisibility())"
     assert tab.run(seen) == [False] * 4  # in 3D only
     tab.run("set('solid', '1')")
@@ -368,7 +349,7 @@ def test_a_phone(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     resize(tab, 390, 844)
     assert tab.box("stage")["y"] < 20
-    for control in ("id('left-source')", "id('right-source')", "document.querySelector('[data-set=outlines]')"):
+    for control in ("id('left-source')", "id('right-source')", "document.querySelector('[data-set=maps]')"):
         assert 0 < tab.box(control)["y"] < 844
     for mode, shown in {"swipe": 2, "side": 2, "blink": 1, "difference": 2}.items():
         side = mode == "side"

@@ -7,18 +7,16 @@ const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
   view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
-  order: "worst", overlay: 0, outlines: "", maps: "", other: false, from: data.start, // the view before the step back
+  order: "worst", overlay: 0, maps: "", other: false, from: data.start, // the view before the step back
   atCamera: true, left: 0, right: 0, scheme: "",
   result: 0, zoom: 1, centre: [0.5, 0.5], // of the stills: what lies in the middle, in shares of the picture
 };
 const BLINK = 700; // milliseconds
 const SOFTWARE_MOST = 150000; // Gaussians: 2 seconds a frame on a processor
 const PIXELS = 8; // of the screen for one of a still, from which on they are drawn as squares
-const OUTLINES = 0.8; // opacity of superpixels' outlines
 const QUIET = 1000; // milliseconds after which a 3D that has come is measured
 const NARROW = 640; // pixels of the stage, below which sides go one above the other
 let stills = null; // per view the pictures of every source; those that are seen first are in the page itself
-let outlines = []; // per view the borders of its superpixels, where there are any
 let maps = []; // per view and source how far off new views are likely to be
 let solid = null; // the 3D view, once it is there
 let blinking = 0; // the timer
@@ -95,7 +93,7 @@ function showZoom() {
 
 const mapOf = (source) => (maps[state.view] || [])[source] || null;
 
-// Lays a picture over a side: the photo, outlines, or the map of a source.
+// Lays a picture over a side: the photo, or the map of a source.
 function lay(layer, address, opacity, source = "") {
   layer.hidden = !address || opacity === 0;
   if (layer.hidden) return;
@@ -128,7 +126,6 @@ function show() {
     const pane = id(`${side}-pane`);
     pane.hidden = !here;
     lay(pane.querySelector(".overlay"), data.photos && plain && stillOf(0), state.overlay);
-    lay(pane.querySelector(".outlines"), plain && state.outlines && outlines[state.view], OUTLINES);
     lay(pane.querySelector(".maps"), plain && state.maps && mapOf(source), 1, source);
     const tag = id(`${side}-tag`);
     tag.hidden = !here;
@@ -153,10 +150,9 @@ function showLimits() {
   const none = solid ? "" : id("status").textContent || "3D is not there yet";
   const shown = [state.left, state.right];
   const outside = view().outside ? "From a photo's camera only" : "";
-  const bare = outlines[state.view] ? "" : outside || (view().held_out ? "Held-out photos have no superpixels" : "Not there yet");
   const mapped = maps.some((one) => one.some(Boolean));
   const unmapped = outside || (shown.some(mapOf) ? "" : mapped ? "Results alone have one: choose one" : "It takes photos of two views");
-  const reasons = { outlines: bare || away, maps: away || unmapped };
+  const reasons = { maps: away || unmapped };
   for (const field of document.querySelectorAll(".in-3d")) field.hidden = !state.solid;
   for (const button of document.querySelectorAll("[data-set]")) {
     const { set: name, value } = button.dataset;
@@ -224,7 +220,6 @@ function toggleFull() {
 // The strip, when the stills have come.
 function startStrip() {
   stills = JSON.parse(id("stills").textContent);
-  outlines = JSON.parse(id("outline-pictures").textContent);
   maps = JSON.parse(id("map-pictures").textContent);
   stills[data.start] = stills[data.start].map((still, source) => still || inPage.get(source) || null);
   const shown = Number(!data.photos && data.sources.length > 1); // without photos the result, not its reference

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any
@@ -29,16 +28,7 @@ from gsmerge.pages.data import ViewData, collect, encode_still, short_names
 from gsmerge.pages.page import headline
 from gsmerge.pages.splats import pack_splats
 from gsmerge.raster.metrics import psnr
-from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Views
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _small_outlines() -> Iterator[None]:
-    """A quarter as wide as on a page: they take most of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(data, "OUTLINE_SIDE", 320)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +150,7 @@ def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) 
     frame = scene_frame(scene)
     assert actual.outside.distance == pytest.approx(distance / frame.unit)
     np.testing.assert_allclose(actual.outside.camera.viewmats, frame.enter_cameras(camera).viewmats)
-    assert (actual.outside.photo, actual.outside.scores, actual.outside.outlines) == (None, (), None)
+    assert (actual.outside.photo, actual.outside.scores) == (None, ())
     assert actual.outside not in actual.views
 
 
@@ -254,33 +244,6 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
     whole, _ = pack_splats(half)
     counts = [unpacked(one)[0]["count"] for one in (content, whole)]
     assert counts[0] == counts[1] - 2
-
-
-def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene) -> None:
-    assert actual.num_superpixels == (int(0.044 * 80 * 60),) * 2
-    assert [view.outlines is None for view in actual.views] == [view.held_out for view in actual.views]
-    view = next(view for view in actual.views if view.place == 1)
-    labels = segment(scene.images, SegmentOptions()).labels[1]
-    picture = cv2.imdecode(np.frombuffer(view.outlines or b"", np.uint8), cv2.IMREAD_UNCHANGED)
-    factor = 320 // 80
-    assert picture.shape == (60 * factor, 80 * factor, 4)
-    lines = picture[..., 3] > 0
-    enlarged = labels.repeat(factor, 0).repeat(factor, 1)[lines]
-    counts = np.bincount(labels.reshape(-1))[:, None]
-    sums = [np.bincount(labels.reshape(-1), channel) for channel in scene.images[1].reshape(-1, 3).T]
-    away = picture[lines][:, 2::-1] / 255 - (np.stack(sums, 1) / counts)[enlarged]
-    assert np.abs(away).max() < 0.5  # a third of the way to black or white, in steps of a fifth
-    assert 0.1 < np.abs(away).mean() < 0.35
-    right, below = lines[factor // 2 :: factor, ::factor], lines[::factor, factor // 2 :: factor]
-    np.testing.assert_array_equal(right[:, 1:], labels[:, 1:] != labels[:, :-1])
-    np.testing.assert_array_equal(below[1:], labels[1:] != labels[:-1])
-    assert not lines[factor // 2 :: factor, factor // 2 :: factor].any()  # the middles of pixels
-
-
-def test_without_photos_there_are_no_superpixels(small: Scene) -> None:
-    none = collect("room", replace(small, images=None, pixels=None), {"half": small.gaussians[::2]}, (2, 1))
-    assert none.num_superpixels is None
-    assert {view.outlines for view in none.views} == {None}
 
 
 def test_many_views_are_thinned(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

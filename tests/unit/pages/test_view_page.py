@@ -85,10 +85,6 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
     for address, still in ((shown[0], 1), (shown[1], 0)):
         assert base64.b64decode(address.removeprefix(WEBP)) == data.views[1].stills[still]
     assert base64.b64decode(stills[0][2].removeprefix(WEBP)) == data.views[0].stills[1]
-    outlines = json.loads(block(page, "outline-pictures"))
-    assert [one and base64.b64decode(one.removeprefix(PNG)) for one in outlines] == [
-        view.outlines for view in data.shown
-    ]
     assert page.index("data:image/webp") < page.index("<script")
     for i, side in enumerate(data.sides):
         assert base64.b64decode(block(page, f"splats-{i}")) == side.splats
@@ -235,18 +231,6 @@ def test_without_photos(data: ViewData) -> None:
     assert "overlay-share" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
 
 
-def test_without_superpixels(data: ViewData, page: str) -> None:
-    bare = page_of(replace(data, num_superpixels=None))
-    for words in ('data-set="outlines"', "<kbd>O</kbd>", "Superpixels: "):
-        assert words in page
-        assert words not in bare
-
-
-@pytest.mark.parametrize(("counts", "words"), [((1234, 1234), "1,234 of each"), ((900, 1234), "900 to 1,234 of each")])
-def test_views_may_differ_in_superpixels(data: ViewData, counts: tuple[int, int], words: str) -> None:
-    assert f"Superpixels: {words} input photo" in page_of(replace(data, num_superpixels=counts))
-
-
 @pytest.fixture(scope="module")
 def alone() -> ViewData:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
@@ -264,8 +248,8 @@ def test_one_scene_is_compared_with_its_photos(alone: ViewData) -> None:
 
 
 def test_one_scene_without_photos_is_compared_with_nothing(alone: ViewData) -> None:
-    views = tuple(replace(view, photo=None, outlines=None) for view in alone.views)
-    data = replace(alone, views=views, num_superpixels=None)
+    views = tuple(replace(view, photo=None) for view in alone.views)
+    data = replace(alone, views=views)
     page = page_of(data)
     assert (data.scored, data.start) == (False, 0)
     assert json.loads(block(page, "stills"))[0] == [None]
