@@ -12,7 +12,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.io import file_notes
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.npz_files import read_depths
-from gsmerge.io.cameras.read import read_all_cameras
+from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.cameras.table import CAMERA_ENDINGS
 from gsmerge.io.formats import ply, streamed
 from gsmerge.io.formats.read import degree_notes
@@ -99,7 +99,9 @@ def _read(path: Path) -> FileCheck:
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
     if suffix in CAMERAS:
-        return _read_cameras(path)
+        cameras = read_cameras(path)
+        read_depths(Path(cameras.path))  # None unless the file has depth maps
+        return FileCheck(str(path), "cameras", len(cameras), cameras.source)
     check_file(path)
     if suffix in SCENE_SUFFIXES:
         find_scene_files(path)  # which says what a file without Gaussians holds
@@ -120,16 +122,6 @@ def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileChe
         str(path), "Gaussians", info.count, info.layout, info.file_bytes, notes=notes,
         num_views=len(views.cameras), num_photos=num_photos,
     )  # fmt: skip
-
-
-def _read_cameras(path: Path) -> FileCheck:
-    """Read the cameras of a file; if it has several scenes, read the cameras of all."""
-    count = 0
-    for cameras in read_all_cameras(path):
-        count += len(cameras)
-    if Path(cameras.path).suffix == ".npz":
-        read_depths(Path(cameras.path))
-    return FileCheck(str(path), "cameras", count, cameras.source)
 
 
 def _read_levels(path: Path) -> FileCheck:

@@ -29,7 +29,6 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 ONE_AT_A_TIME = 4_000_000  # Gaussians; larger scenes tile one view at a time, since a tiled view takes as much memory
 BAND_PIXELS = 1 << 22  # largest number of pixels drawn at once; larger images are drawn in bands to save memory
-MIN_ALPHA = 0.5  # least opacity of a pixel that counts when superpixels are merged
 
 
 def _needs_gradient(gaussians: Gaussians, cameras: Cameras) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 from gsmerge.arguments import check_arguments
@@ -12,16 +11,7 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.camera_source import CameraSource, check_objects
 from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program
-from gsmerge.io.cameras.table import (
-    CAMERA_ENDINGS,
-    CAMERA_FORMATS,
-    CHUNK,
-    KEYFRAME,
-    RE10K,
-    SHARP_PLY,
-    is_colmap,
-    is_keyframes,
-)
+from gsmerge.io.cameras.table import CAMERA_ENDINGS, CAMERA_FORMATS, CHUNK, KEYFRAME, SHARP_PLY, is_colmap, is_keyframes
 from gsmerge.io.cameras.viewer_cameras import ENDING
 from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.runtime.plugins import lazy_functions
@@ -29,7 +19,7 @@ from gsmerge.types import StrPath
 
 _lazy = lazy_functions(__package__)
 holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.read_depths")
-_holds_poses, _read_scenes = _lazy("npz_files.holds_poses"), _lazy("re10k.read_scenes")
+_holds_poses = _lazy("npz_files.holds_poses")
 _MAX_CANDIDATES = 16  # files in a folder that are searched for cameras
 _CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt")
 
@@ -131,14 +121,6 @@ def _folder_of(path: Path) -> Path | None:
     if not is_colmap(path.parent):
         raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
     return path.parent
-
-
-def read_all_cameras(path: Path) -> Iterator[CameraFile]:
-    """Read the cameras of a path as :func:`read_cameras`; of a ``.torch`` chunk, those of each of its scenes."""
-    if path.suffix.lower() == CHUNK and os.path.isfile(path):
-        yield from (RE10K.convert(path, scene) for scene in _read_scenes(path))
-    else:
-        yield read_cameras(path)
 
 
 def read_sharp_camera(path: Path) -> CameraFile | None:

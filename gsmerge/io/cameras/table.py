@@ -43,12 +43,8 @@ class CameraFormat:
     def cameras(self, source: CameraSource) -> CameraFile:
         """Read the cameras of a file; SceneError if it is damaged or incomplete."""
         stored = read_views(source, self.read) if isinstance(self.read, ViewLayout) else self.read(source)
-        return self.convert(source.path, stored)
-
-    def convert(self, path: Path, stored: StoredCameras) -> CameraFile:
-        """Convert the cameras that a file stores; SceneError if one of them is invalid."""
         convention = stored.convention or self.convention
-        return make_camera_file(path, self.name, convention, stored.views, stored.images, stored.order)
+        return make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)
 
 
 def is_colmap(folder: Path) -> bool:
@@ -146,10 +142,6 @@ SHARP_PLY = CameraFormat(
     SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
     "pixels of the photo", lambda file: read_sharp(file) is not None,
 )  # fmt: skip
-RE10K = CameraFormat(
-    "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`; needs torch", CHUNK,
-    _lazy("re10k.read_re10k"), W2C_OPENCV, "divided by the size",
-)  # fmt: skip
 # Rows are tried in this order; a file is read by the first row that has its ending and recognises it
 CAMERA_FORMATS = (
     CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(_READ_COLMAP, suffix=".bin"),
@@ -188,7 +180,8 @@ CAMERA_FORMATS = (
                  lambda file: _IS_DA3(file.path)),
     CameraFormat("npz of poses", "`.npz` of what VGGT, or MapAnything or AnySplat (camera-to-world), returns",
                  ".npz", _READ_DA3, W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
-    RE10K,
+    CameraFormat("re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`; needs torch", CHUNK,
+                 _lazy("re10k.read_re10k"), W2C_OPENCV, "divided by the size"),
     SHARP_PLY,
     CameraFormat("state", "inside a `.gsm` of gsmerge extend", STATE_ENDING, _READ_STATE, W2C_OPENCV, "pixels"),
 )  # fmt: skip

@@ -90,7 +90,7 @@ def _find_white(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[float
     """Find the stored value of a full channel of plain colours; also return notes."""
     colors = arrays.color_columns(rows.dtype.names)
     float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
-    if float_colors and np.nanmedian(_read_column(path, rows, colors[0])) > 1:
+    if float_colors and np.nanmedian(read_columns(path, rows, colors[:1])[colors[0]]) > 1:
         return 255.0, [f"colours are read as 0 to 255, since half of the values of {colors[0]} are above 1"]
     return 1.0, []
 
@@ -105,10 +105,6 @@ def read_columns(path: Path, rows: np.ndarray | arrays.PackedRows, names: Sequen
             for name in names:
                 out[name][start : start + block_rows] = block[name]
     return out
-
-
-def _read_column(path: Path, rows: np.ndarray | arrays.PackedRows, name: str) -> np.ndarray:
-    return np.asarray(read_columns(path, rows, [name])[name])
 
 
 def _adapt_rows(rows: np.ndarray, *, white: float) -> np.ndarray:
