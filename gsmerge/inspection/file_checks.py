@@ -16,15 +16,7 @@ from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.cameras.table import CAMERA_ENDINGS
 from gsmerge.io.formats import ply, streamed
 from gsmerge.io.formats.read import degree_notes
-from gsmerge.io.formats.table import (
-    META,
-    READ_ENDINGS,
-    SCENE_SUFFIXES,
-    SEVERAL_USES,
-    STATE_ENDING,
-    find_format,
-    may_hold_gaussians,
-)
+from gsmerge.io.formats.table import READ_ENDINGS, SCENE_SUFFIXES, STATE, STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
@@ -79,14 +71,9 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
 
 def holds_scene(path: Path) -> bool:
     """Return whether a path is read as a scene, not as cameras, networks, levels or a state."""
-    suffix = path.suffix.lower()
-    if suffix in SEVERAL_USES:
-        return os.path.exists(path) and may_hold_gaussians(path)
-    if suffix == STATE_ENDING:
+    if STATE.names(path):
         return os.path.isfile(path) and not holds_features(path)
-    if path.name == META:
-        return find_format(path).holds(path)
-    return suffix in SCENE_SUFFIXES or os.path.isdir(path)
+    return os.path.isdir(path) or may_hold_gaussians(path)
 
 
 def _read(path: Path) -> FileCheck:

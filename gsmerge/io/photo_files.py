@@ -110,13 +110,7 @@ def decode_images(paths: Sequence[Path]) -> PhotoArrays:
         if (w, h) != size:
             problem = f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {files[0]}"
             raise SceneError(path, problem, "resize them to one size")
-    if not files:
-        return []
-    _check_together(paths, sum(map(check_file, files)), size)
-    if _CHANNELS * size[0] * size[1] * len(files) > _AT_ONCE:
-        return PhotoReader(len(paths), size, lambda photo: decode_image(paths[photo], size))
-    decoded = dict(zip(files, parallel_map(lambda path: decode_image(path, size), files), strict=True))
-    return [decoded[path] for path in paths]
+    return decode_views(paths, [0] * len(paths), size) if files else []
 
 
 def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
@@ -131,23 +125,27 @@ def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
 def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size) -> PhotoArrays:
     """Decode the photo of each view to ``[h,w,3]`` uint8, turned, and resized to one ``size``; black without a file.
 
-    If photos are large, they are decoded at each use. SceneError as in :func:`decode_images`.
+    If photos are large, they are decoded at each use; else a photo that several views have is decoded once. SceneError
+    as in :func:`decode_images`.
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
     _check_together([path for path in paths if path is not None], sum(map(check_file, files)), size)
 
-    def decode(view: int) -> np.ndarray:
-        path = paths[view]
+    def decode(view: tuple[Path | None, int]) -> np.ndarray:
+        path, turn = view
         if path is None:
             return np.zeros((size[1], size[0], 3), np.uint8)
-        photo = np.ascontiguousarray(turn_picture(decode_image(path, sizes[path]), turns[view]))
+        photo = np.ascontiguousarray(turn_picture(decode_image(path, sizes[path]), turn))
         photo_size = photo.shape[1], photo.shape[0]
         return photo if photo_size == size else resize_to(photo_size, size).photos([photo])[0]
 
-    if _CHANNELS * size[0] * size[1] * len(paths) > _AT_ONCE:
-        return PhotoReader(len(paths), size, decode)
-    return parallel_map(decode, range(len(paths)))
+    views = list(zip(paths, turns, strict=True))
+    different = list(dict.fromkeys(views))
+    if _CHANNELS * size[0] * size[1] * len(different) > _AT_ONCE:
+        return PhotoReader(len(views), size, lambda view: decode(views[view]))
+    decoded = dict(zip(different, parallel_map(decode, different), strict=True))
+    return [decoded[view] for view in views]
 
 
 def decode_small(path: Path, side: int) -> np.ndarray:

@@ -68,7 +68,7 @@ class Format:
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
     finish: Callable[[Path], object] = lambda _: None  # called with the path after all files were renamed
-    holds: Callable[[Path], bool] = lambda _: True  # whether a file with this ending has Gaussians
+    holds: Callable[[Path], bool] | None = None  # whether a file with this ending has Gaussians; None: always
 
     # Content of its files
     # Levels of detail: a single one, one file for each, or all in one output
@@ -92,10 +92,6 @@ class Format:
     rest: Callable[[], int] = lambda: 0  # least bytes besides those of Gaussians
     count: Callable[[int, int], int] | None = None  # bytes, degree -> number of Gaussians; None if content matters
     measure: Callable[[Gaussians, Cameras, Sequence[str]], int] | None = None  # bytes; None: those of ``encode``
-
-    def __post_init__(self) -> None:
-        if self.each and self.max_degree >= 0 and not (self.encode or self.count or self.measure):
-            raise ValueError(f"{self.ending}: expected encode, count or measure, since it has bytes of each Gaussian")
 
     def names(self, path: StrPath) -> bool:
         """Return whether the name of a path has the ending of this format."""
@@ -161,10 +157,10 @@ META = "meta.json"  # of a .sog that is a folder
 SOG_FOLDER = Format(
     META, "a .sog without its zip", _lazy("sog.read_folder"), None, -1, holds=_lazy("sog.is_folder"),
 )  # fmt: skip
-SEVERAL_USES = (".npz", ".glb")  # endings of files that often hold no Gaussians
 FORMATS = (*FILES, HTML, LEVELS, COLMAP, DEPTHS, STATE, SOG_FOLDER)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # results that a page shows
+SEVERAL_USES = tuple(row.ending for row in FORMATS if row.holds)  # endings of files that may hold no Gaussians
 FOLDERS = {row.folder: row for row in FORMATS if row.folder}  # by the name of an output folder
 READ_ENDINGS = tuple(row.ending for row in FORMATS if row.read is not None)
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in (*FILES, DEPTHS) if row.read is not None))
@@ -215,7 +211,8 @@ def is_frame(path: Path) -> bool:
 
 def may_hold_gaussians(path: Path) -> bool:
     """Return whether a file may hold Gaussians: by its ending, and by its content if the ending has other uses."""
-    return path.suffix.lower() in SCENE_SUFFIXES and find_format(path).holds(path)
+    holds = find_format(path).holds
+    return (holds is None and path.suffix.lower() in SCENE_SUFFIXES) or (holds is not None and holds(path))
 
 
 def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:
