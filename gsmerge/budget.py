@@ -10,7 +10,6 @@ from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, 
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 
 LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
-MAX_ADAPTED = 4  # bass-adaptive changes the number of superpixels by at most this factor, up or down
 FEW_PIXELS = 1 << 18  # pixels of a few small photos
 # A scene has few Gaussians below this number per pixel of the photos, counting at most FEW_PIXELS pixels. Then a share
 # of superpixels is a share of pixels, and at most this share of the Gaussians
@@ -158,13 +157,6 @@ def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptio
     per_view = superpixels_per_view(scene, segment)
     total = per_view * count // scene.pixels_per_view if scene.has_own_pixels else per_view * views
     return round(max(views, total) * decode.mean_k)
-
-
-def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:
-    """Return the largest number of Gaussians that a run can give; adaptive superpixels may give more than requested."""
-    if limits.count is not None:
-        return limits.count
-    return min(MAX_ADAPTED * limits.default, limits.max_count) if segment.adapts else limits.default
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:

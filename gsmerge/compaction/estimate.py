@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.budget import largest_count
 from gsmerge.compaction.curve import DROP_SHARES, DROP_STEPS, KNEE_SHARES, KNEE_STEPS, curve_counts
 from gsmerge.compaction.files import Outputs, check_cameras, sized
 from gsmerge.compaction.make_plan import load_networks
@@ -67,8 +66,8 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     choices = choose_for_scene(size, options)
     limits, settings = choices.limits, choices.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)
-    max_count = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
-    count = min(scene.num_gaussians or pixels, max_count)
+    max_count = limits.default if limits.count is None else limits.count
+    count = min(scene.num_gaussians or pixels, pixels if options.method.startswith("unmerged") else max_count)
     at_once, num_rest = gaussians_at_once(pixels, choices.blocks), 3 * scene.gaussians.shN.shape[1]
     drawn = pixels if options.method == "unmerged-fit" else count
     threads, steps = options.threads or available_threads(), choices.fit.steps

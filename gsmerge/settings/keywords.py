@@ -14,7 +14,7 @@ class CompactKeywords(TypedDict, total=False):
     look: Literal["auto", "scene", "photos"]
     extent: Literal["auto", "photos", "beyond"]
     superpixels: int | str
-    segmentation: Literal["rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid"]
+    segmentation: Literal["rdseg", "bass", "bass-st", "slic", "grid"]
     rectangles: float | None
     early_sweeps: int | None
     compactness: float

@@ -18,7 +18,7 @@ Extent = Literal["auto", "photos", "beyond"]
 MatchMethod = Literal["overlap", "aabb", "none"]
 KRule = Literal["saliency", "distortion"]
 
-SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
+SEGMENTATIONS = ("rdseg", "bass", "bass-st", "slic", "grid")
 SHARE = "4.4%"  # superpixels per pixel by default
 AUTO_SHARE = "auto"
 MAX_CHILDREN = 8
@@ -58,8 +58,7 @@ class SegmentOptions(Settings):
 
     superpixels: int | str = setting(SHARE, "Superpixels per view: a number such as 3000, a share of its pixels, or "
         "auto. auto takes 4.4 to 7 %, more the better the depths of the views agree.",
-        "`bass-adaptive` starts from a share and adapts it to each view.", metavar="NUMBER|SHARE|auto",
-        counts=True)  # fmt: skip
+        metavar="NUMBER|SHARE|auto", counts=True)  # fmt: skip
     segmentation: str = setting("rdseg", "Method that cuts views into superpixels; `gsmerge.stages.superpixels` lists "
         "all.", choices=SEGMENTATIONS)  # fmt: skip
     rectangles: float | None = setting(None, "Of `rdseg`: number of rectangles per superpixel at its start.",
@@ -91,11 +90,6 @@ class SegmentOptions(Settings):
         """Superpixels per pixel; the default share where the option gives a number or "auto"."""
         is_share = self.per_view is None and self.superpixels != AUTO_SHARE
         return parse_share(str(self.superpixels) if is_share else SHARE)
-
-    @property
-    def adapts(self) -> bool:
-        """Whether the number of superpixels is adapted to each view: ``bass-adaptive`` with a share of the pixels."""
-        return self.segmentation == "bass-adaptive" and self.per_view is None
 
 
 @dataclass(frozen=True)

@@ -64,23 +64,14 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
     """Cut every view into superpixels: as the options say, or so that they give exactly ``count`` Gaussians.
 
     For an exact count the region tree is cut, which gives a plain wall few superpixels and a fern many. The tree is
-    also cut if pixels differ in importance. If the shared tree is too coarse, a finer tree is built. Adaptive
-    superpixels change the number of Gaussians. If this number exceeds the budget, the tree is cut at the largest
-    allowed count instead.
+    also cut if pixels differ in importance. If the shared tree is too coarse, a finer tree is built.
     """
     limits, options, num_views = choices.limits, choices.options, len(scene)
-    if count is None and scene.importance is not None and not options.adapts:
+    if count is None and scene.importance is not None:
         count = limits.default
     if count is None:
         start_per_view = max(1, int(limits.per_view * choices.start_share))
-        if not options.adapts:
-            return Segmentation(segment(scene.images, options, start_per_view), limits.default, exact=False)
-        # the superpixels adapt to the final number; the fit begins with a share of it
-        groups = segment(scene.images, options, limits.per_view, adapt=start_per_view / limits.per_view)
-        count = round(limits.default * len(groups) / (start_per_view * num_views))
-        if count <= limits.max_count:
-            return Segmentation(groups, count, exact=False)
-        count = limits.max_count
+        return Segmentation(segment(scene.images, options, start_per_view), limits.default, exact=False)
     tree = choices.shared.get(scene, choices) if choices.shared else None
     start_count = max(num_views, int(count * choices.start_share))
     if tree is None or start_count > len(tree):

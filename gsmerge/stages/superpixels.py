@@ -3,14 +3,10 @@
 The default, ``rdseg``, places superpixels where they lower the squared colour error most. It cuts more rectangles than
 requested, the best cuts first, merges them with Ward's rule to the exact number, and then moves border pixels exactly.
 ``bass`` is Bayesian adaptive superpixel segmentation from a hexagonal grid. ``bass-st`` starts from seeds drawn by the
-Shi-Tomasi response instead, as in the paper. ``bass-adaptive`` adds splits and merges to ``bass-st``. ``slic`` is the
-common baseline. ``grid`` makes plain rectangles. If these are a few pixels large and no fit follows, they are as good
-as the other methods and cost nothing. No superpixel is empty, each is 4-connected, and the result is the same bit for
-bit in each run.
-
-The number of superpixels is exactly the requested number, with one exception. If a share of the pixels is requested,
-``bass-adaptive`` finds its own number in each view, between a quarter and four times the share. If a number is
-requested, here or by a budget, it then splits or merges to that number, the highest Hastings ratio first.
+Shi-Tomasi response instead, as in the paper. ``slic`` is the common baseline. ``grid`` makes plain rectangles. If these
+are a few pixels large and no fit follows, they are as good as the other methods and cost nothing. No superpixel is
+empty, each is 4-connected, and the result is the same bit for bit in each run. The number of superpixels is exactly the
+requested number.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ import cv2
 import numpy as np
 
 from gsmerge.arrays import Array, as_array, like
-from gsmerge.budget import MAX_ADAPTED, count_for
+from gsmerge.budget import count_for
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels, refine
 from gsmerge.kernels.superpixels.seeds import (
@@ -44,25 +40,21 @@ RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictur
 SLIC_COMPACTNESS = 10  # scikit-image's default
 
 
-def segment(
-    images: np.ndarray, options: SegmentOptions, count: int | None = None, *, adapt: float | None = None
-) -> Groups:
-    """Cut every view into superpixels: the same number in each, unless they adapt.
+def segment(images: np.ndarray, options: SegmentOptions, count: int | None = None) -> Groups:
+    """Cut every view into superpixels, the same number in each.
 
-    ``images [v,h,w,3]`` are float in [0, 1] or uint8; ``count`` is the number per view, None: the options' number. With
-    ``adapt``, ``bass-adaptive`` starts from ``count`` and may change it; see :func:`superpixels`.
+    ``images [v,h,w,3]`` are float in [0, 1] or uint8; ``count`` is the number per view, None: the options' number.
     """
     if images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
     _, height, width, _ = images.shape
-    if count is None:
-        count, adapt = count_for(options, height, width), 1.0 if options.adapts else None
+    count = count_for(options, height, width) if count is None else count
     rectangles = RECTANGLES if options.rectangles is None else options.rectangles
     early_sweeps = EARLY_SWEEPS if options.early_sweeps is None else options.early_sweeps
 
     cut = partial(
         superpixels, count=count, segmentation=options.segmentation, rectangles=rectangles,
-        early_sweeps=early_sweeps, compactness=options.compactness, adapt=adapt,
+        early_sweeps=early_sweeps, compactness=options.compactness,
     )  # fmt: skip
     labels = parallel_map(cut, images)
     stacked = np.stack(labels) if labels else np.empty((0, height, width), np.int32)
@@ -77,19 +69,16 @@ def superpixels(
     rectangles: float = RECTANGLES,
     early_sweeps: int = EARLY_SWEEPS,
     compactness: float = 1e-5,
-    adapt: float | None = None,
 ) -> Array:
     """Cut an image into exactly ``count`` superpixels, each non-empty and 4-connected.
 
     Args:
         image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
         count: Superpixels, 1 to h·w.
-        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
+        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``slic`` or ``grid``.
         rectangles: For ``rdseg``: rectangles per superpixel that it begins with, at least 1.
         early_sweeps: For ``rdseg``: sweeps over border pixels before rectangles are merged.
         compactness: Weight of squared pixels, relative to squared colours, in [0, 1] (not for the BASS methods).
-        adapt: For ``bass-adaptive``: None: return exactly ``count`` superpixels. Otherwise the method changes ``count``
-            by a factor of a quarter to four, and returns this share of the changed number.
 
     Returns:
         Labels ``[h,w]`` int32 without gaps from 0 on, the same in every run; a tensor for a tensor.
@@ -118,7 +107,7 @@ def superpixels(
     elif segmentation == "slic":
         labels = _slic(pixels, count, compactness)
     else:
-        labels = _bass(pixels, count, segmentation, adapt)
+        labels = _bass(pixels, count, segmentation)
     return like(np.ascontiguousarray(labels[1:-1, 1:-1]), image)
 
 
@@ -196,20 +185,16 @@ def _lab_colours(pixels: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
 
 
-def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None) -> np.ndarray:
+def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:
     """Run BASS from seeds on a hexagonal grid, or drawn by saliency; return padded labels."""
-    from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels
+    from gsmerge.kernels.superpixels.bass import infer_labels
 
     height, width, _ = pixels.shape
     if segmentation == "bass":
         seeds = hexagonal_seeds(height, width, count)
     else:
         seeds = seeds_from_density(seed_density(corner_response(pixels), count), count)
-    colours = _lab_colours(pixels)
-    labels = pad_labels(voronoi(seeds, height, width))
-    if segmentation == "bass-adaptive":
-        return adapt_labels(labels, colours, count, MAX_ADAPTED, adapt)[0]
-    return infer_labels(labels, colours, count)
+    return infer_labels(pad_labels(voronoi(seeds, height, width)), _lab_colours(pixels), count)
 
 
 def _slic(pixels: np.ndarray, count: int, compactness: float) -> np.ndarray:

@@ -18,7 +18,6 @@ SEGMENTATIONS = [
     ("rdseg", {"rectangles": 3.0, "early_sweeps": 1}),
     ("bass", {}),
     ("bass-st", {}),
-    ("bass-adaptive", {}),
 ]
 
 
@@ -64,19 +63,6 @@ def test_exact_count_in_one_piece_each(picture: str, segmentation: str, rounds: 
     for count in counts_of(height * width):
         labels = superpixels(image, count, segmentation, **rounds)
         assert_partition(labels, height, width, count)
-
-
-@pytest.mark.parametrize("picture", PICTURES)
-def test_adaptive_count_is_bounded(picture: str) -> None:
-    """A number of its own: dense labels in one piece each, within a factor of four and one per pixel."""
-    image = PICTURES[picture]
-    height, width, _ = image.shape
-    for start in counts_of(height * width):
-        labels = superpixels(image, start, "bass-adaptive", adapt=1.0)
-        count = int(labels.max()) + 1
-        assert_partition(labels, height, width, count)
-        assert -(-start // 4) <= count <= min(4 * start, height * width)
-        assert np.array_equal(labels, superpixels(image.copy(), start, "bass-adaptive", adapt=1.0))
 
 
 @pytest.mark.parametrize("compactness", [0.0, 1e-3, 1.0])

@@ -35,7 +35,7 @@ def test_similarity(seed: int, exponent: float, options: dict) -> None:
 
 CASES = [
     {"fit_steps": 20, "budget": "10%"}, {}, {"fit": "none", "k": 4, "seed": 3}, {"match": "aabb", "effort": "draft"},
-    {"segmentation": "bass-st", "fit": "none"}, {"segmentation": "bass-adaptive", "fit": "none"},
+    {"segmentation": "bass-st", "fit": "none"},
     {"dropout": 0.2, "k": 2, "seed": 5},
 ]  # fmt: skip
 

@@ -67,17 +67,6 @@ def test_methods_rank_as_published() -> None:
     assert scores[0] > scores[1] + 2
 
 
-@pytest.mark.slow
-def test_splits_and_merges_pay() -> None:
-    image = photos()["coffee"]
-    for density in (5_000, 12_000):
-        for adapt in (1.0, None):
-            labels = superpixels(image, count_at(image, density), "bass-adaptive", adapt=adapt)
-            fixed = superpixels(image, int(labels.max()) + 1, "bass-st")
-            assert proxy_psnr(image, labels) > proxy_psnr(image, fixed) + 1
-            assert splat_psnr(image, labels) > splat_psnr(image, fixed)
-
-
 def test_presets_trade_time_for_quality() -> None:
     image = photos()["china"]
     count = count_at(image, 12_000)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.kernels import elementary
 from gsmerge.kernels.superpixels import bass, kd, merge_tree, regions, seeds, ward
 from gsmerge.kernels.superpixels.regions import pad_labels
 
 SPREAD = np.float32(0.01)
-PRIOR = bass.move_prior()
 ONE = pad_labels(np.zeros((1, 1), int))
 
 
@@ -39,15 +36,10 @@ def all_of_them(height: int, width: int) -> list[np.ndarray]:
     places = seeds.seeds_from_density(seeds.seed_density(response, count), count)
     grown = pad_labels(seeds.voronoi(places, height, width))
     found = bass.infer_labels(grown.copy(), pixels, count)
-    adapted, number = bass.adapt_labels(grown.copy(), pixels, count, 4, 1.0)
-    sums = bass.sum_regions(found, pixels, np.ones((height, width), bool), count)
-    halves = bass.sum_regions(found, pixels, bass.mark_halves(found, count, True), count)
-    ratios = bass.weigh_splits(sums, halves, PRIOR)
-    best = bass.choose_merges(ward.adjacent_pairs(found), sums, PRIOR)
     fitted = bass.fit_regions(found, pixels, np.full(count, 16.0))
     return [
         response, labels, merged, refined, rows[: 2 * count - 1], np.array(error), *tree, cut, places, grown,
-        found, adapted, np.array(number), sums, halves, ratios, *best, fitted,
+        found, fitted,
     ]  # fmt: skip
 
 
@@ -55,7 +47,7 @@ def all_of_them(height: int, width: int) -> list[np.ndarray]:
 def test_same_bits_from_every_library(
     size: tuple[int, int], each_target: Callable[[Callable[[], Sequence[np.ndarray]]], Sequence[np.ndarray]]
 ) -> None:
-    assert len(each_target(lambda: all_of_them(*size))) > 20
+    assert len(each_target(lambda: all_of_them(*size))) == 14
 
 
 def test_no_pixels() -> None:
@@ -68,8 +60,6 @@ def test_no_pixels() -> None:
     assert [len(a) for a in merge_tree.merge_order(np.empty((0, 2), np.int32), sums, 1.0, 1.0, 1.0)] == [0, 0, 0]
     assert len(merge_tree.cut_labels(np.empty(0, np.int32), np.empty(0, bool), 0)) == 0
     assert bass.fit_regions(labels, pixels, np.empty(0)).shape == (0, 9)
-    assert bass.mark_halves(labels, 0, False).shape == (0, 0)
-    assert bass.sum_regions(labels, pixels, np.empty((0, 0), bool), 0).shape == (0, 7)
     assert seeds.dither(np.empty((0, 0))).shape == (0, 0)
     assert seeds.voronoi(np.empty((0, 2), np.int64), 0, 0).shape == (0, 0)
     assert seeds.voronoi(np.empty((0, 2), np.int64), 1, 2).tolist() == [[-1, -1]]
@@ -87,8 +77,6 @@ KERNELS: dict[str, Callable[[np.ndarray, np.ndarray], object]] = {
     "label_pass": lambda labels, pixels: bass.label_pass(
         labels, pixels, np.ones((2, 9), np.float32), bass.simple_point_table(), np.ones(256, np.float32), 1.0
     ),
-    "sum_regions": lambda labels, pixels: bass.sum_regions(labels, pixels, np.ones((3, 4), bool), 2),
-    "mark_halves": lambda labels, pixels: bass.mark_halves(labels, 2, False),
 }  # fmt: skip
 
 
@@ -103,7 +91,7 @@ def test_bad_labels_are_refused(kernel: str, place: tuple[int, int], label: int)
         KERNELS[kernel](labels, pixels)
 
 
-@pytest.mark.parametrize("kernel", sorted(KERNELS.keys() - {"mark_halves"}))
+@pytest.mark.parametrize("kernel", sorted(KERNELS))
 def test_labels_of_another_size_are_refused(kernel: str) -> None:
     with pytest.raises(ValueError, match="outside"):
         KERNELS[kernel](ONE.copy(), make_picture(3, 4))
@@ -124,10 +112,7 @@ def test_bad_indices_are_refused() -> None:
     far = np.array([[0, 4]], np.int32), np.empty(1, np.float32)
     high, pairs = [(merge_tree.merge_growth, tree, 4, 0, 1.0, 1.0, np.empty(2))], [(ward.merge_costs, rows, *far)]
     for pair in (np.array([[0, 2]], np.int32), np.array([[-1, 0]], np.int32)):
-        pairs += [
-            (ward.merge_tree, pair, rows, 2, 1, np.float32(1)),
-            (bass.choose_merges, pair, tree[:2, :7].copy(), PRIOR),
-        ]
+        pairs += [(ward.merge_tree, pair, rows, 2, 1, np.float32(1))]
         pairs += [(merge_tree.merge_order, pair, tree, 1.0, 1.0, 1.0)]
     for match, calls in (("outside", outside), ("below 4", high), ("pairs", pairs)):
         for call, *arguments in calls:
@@ -146,8 +131,6 @@ def test_odd_colours_end_and_stay_inside(value: float) -> None:
     assert set(np.unique(rectangles)) == set(range(-1, number))
     assert set(np.unique(regions.refine(labels.copy(), pixels, count, 2, SPREAD))) == set(range(-1, count))
     assert set(np.unique(bass.infer_labels(labels.copy(), pixels, count))) == set(range(-1, count))
-    adapted, number = bass.adapt_labels(labels.copy(), pixels, count, 4, 1.0)
-    assert set(np.unique(adapted)) == set(range(-1, number))
     rows = np.empty((2 * count, merge_tree.ROW))
     merge_tree.region_sums(labels, pixels, pixels[..., 2].copy(), count, rows)
     parents, _, _ = merge_tree.merge_order(ward.adjacent_pairs(labels), rows, 1.0, 1e-5, 4.0)
@@ -159,12 +142,3 @@ def test_odd_colours_end_and_stay_inside(value: float) -> None:
 
 def test_duplicate_seeds_share_a_pixel() -> None:
     assert seeds.voronoi(np.zeros((9, 2), np.int64), 2, 2).tolist() == [[8, 8], [8, 8]]
-
-
-@pytest.mark.parametrize("n", [1.0, 2.0, 3.0, 11.0, 12.0, 13.0, 100.0, 1e6, 1e12])
-def test_log_gamma(n: float) -> None:
-    """Of the evidence of pixels without colour, all else is simple: a = 1, b = 1 / (2 π), v = 0."""
-    prior = np.array([0.0, 1.0, 0.5 / math.pi, 0.0])
-    actual = bass.log_evidence(np.array([n, 0, 0, 0, 0, 0, 0.0]), prior)
-    expected = math.lgamma(n) - n * elementary.log(n) + 3 * math.lgamma(1 + 0.5 * n)
-    assert actual == pytest.approx(expected, rel=1e-14, abs=1e-13)
