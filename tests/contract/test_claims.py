@@ -27,7 +27,6 @@ from gsmerge.fit import report as fit_report
 from gsmerge.io import bounds, photo_files
 from gsmerge.io.formats import depth_maps, ply
 from gsmerge.kernels.raster import blend
-from gsmerge.kernels.superpixels import bass
 from gsmerge.measure import drawings, error_maps, fog
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
@@ -93,11 +92,6 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         " looks at the scene [from outside]",
         f"{move_poses.SAMPLE_PIXELS:,} pixels of a view are looked up in {word(move_poses.NEIGHBOURS)} neighbours",
         f"bring the greys together at {word(len(move_poses.SIDES))} sizes",
-        f"for {word(bass.NUM_ROUNDS)} rounds superpixels are split and merged in turn, with {word(bass.NUM_PASSES)}"
-        " label passes after each round",
-        f"variance {100 * bass.COLOUR_DEVIATION:g}², 10^{len(str(int(bass.PRIOR_SHAPE))) - 1} pseudo-observations, mean"
-        f" deviation {100 * bass.MEAN_DEVIATION:g}",
-        f"\N{GREEK SMALL LETTER ALPHA} is {bass.ALPHA:g}",
     ),
     LARGE: (
         f"Scenes of more than {million(plan.WHOLE_GAUSSIANS)} Gaussians with pixels are compacted in blocks of views"
