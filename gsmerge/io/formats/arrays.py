@@ -307,11 +307,6 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
     )
 
 
-def turn_half(columns: Columns) -> Columns:
-    """Rotate Gaussians by half a turn about z, from y down to y up."""
-    return turner(np.diag([-1.0, -1.0, 1.0]), columns.harmonics.shape[1])(columns)
-
-
 def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
     """Return a function that rotates Gaussians by an orthogonal matrix ``[3,3]``, which may mirror them."""
     if np.array_equal(rotation, np.eye(3)):

@@ -30,7 +30,6 @@ from gsmerge.io.formats.arrays import (
     to_bytes,
     to_columns,
     to_stored,
-    turn_half,
     turner,
 )
 from gsmerge.kernels.elementary import exp, log, power
@@ -62,7 +61,8 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     Rotations and opacities are 16-bit numbers, which the extension allows. All other values are float32.
     """
     columns = to_columns(gaussians, MAX_DEGREE)
-    attributes = _attributes(turn_half(columns))
+    half_turn = turner(np.diag([-1.0, -1.0, 1.0]), columns.harmonics.shape[1])  # from y down to y up
+    attributes = _attributes(half_turn(columns))
     views, accessors = _describe_arrays(list(attributes.values()))
     for name, bound in (("min", np.min), ("max", np.max)):  # glTF asks for the bounds of positions
         accessors[0][name] = bound(attributes["POSITION"], axis=0).tolist()
@@ -114,13 +114,9 @@ def _attributes(columns: Columns) -> dict[str, np.ndarray]:
     }
     for name, harmonic in zip(HARMONICS[1:], columns.harmonics.transpose(1, 0, 2), strict=False):
         values[name] = harmonic.astype("<f4")
-    rgba = np.concatenate([_to_linear(columns.colors.clip(0, 1)), columns.opacities[:, None]], 1)
-    return values | {"COLOR_0": to_bytes(255 * rgba)}
-
-
-def _to_linear(colors: np.ndarray) -> np.ndarray:
-    """Convert sRGB, 0 to 1, to linear light (IEC 61966-2-1), which glTF uses for vertex colours."""
-    return np.where(colors <= 0.04045, colors / 12.92, power((colors + 0.055) / 1.055, 2.4))
+    srgb = columns.colors.clip(0, 1)  # glTF uses linear light (IEC 61966-2-1) for vertex colours
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, power((srgb + 0.055) / 1.055, 2.4))
+    return values | {"COLOR_0": to_bytes(255 * np.concatenate([linear, columns.opacities[:, None]], 1))}
 
 
 def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:

@@ -198,6 +198,7 @@ def convert_files(
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
     if byte_columns == arrays.NORMALS:
         _spread_low_degree(out["shN"])
+    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS}
     info = FileInfo(
         path=str(path),
         layout=stored.layout,
@@ -206,7 +207,7 @@ def convert_files(
         file_bytes=file_bytes,
         bytes_by_attribute={name: sum(part.sizes[name] for part in parts) for name in stored.sizes},
         columns=names,
-        extra_columns=_extra_columns(names),
+        extra_columns=tuple(name for name in names if name not in used and not name.startswith("f_rest_")),
         extra_elements=stored.extra_elements,
         byte_columns=byte_columns,
         comments=stored.comments,
@@ -274,12 +275,6 @@ def _with_linear_scales(part: StoredRows) -> StoredRows:
     """Return rows whose scales are stored linearly as rows with log scales."""
     adapt = part.adapt
     return replace(part, adapt=lambda rows: log_of_scales(rows) if adapt is None else adapt(log_of_scales(rows)))
-
-
-def _extra_columns(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the columns that do not belong to Gaussians, in the file's order."""
-    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS}
-    return tuple(name for name in names if name not in used and not name.startswith("f_rest_"))
 
 
 def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
