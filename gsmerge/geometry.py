@@ -23,7 +23,6 @@ from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
 State = TypeVar("State")  # state that a descent changes
 MORTON_BITS = 21  # bits for each axis; three axes fit into 63 bits
 DEPTH_SAMPLE = 50_000  # points; the median depth in a view is measured on about so many
-MIN_COSINE = 1e-9  # angles about x and z have the same axis if the cosine of the angle about y is smaller
 DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
 # More values than the first number are narrowed down before the median is taken: to those between two shares of a
 # sample of about the second number, which are so far from a half that the median is practically always between them
@@ -141,17 +140,6 @@ def euler_to_rotmat(degrees: np.ndarray) -> np.ndarray:
     """Return the rotation ``[3,3]`` about the axes x, y and z, in this order, by ``degrees [3]``."""
     about_x, about_y, about_z = motion_matrices(np.pad(np.diag(np.radians(degrees)), ((0, 0), (0, 3))))[:, :3, :3]
     return matmul(about_z, matmul(about_y, about_x))
-
-
-def rotmat_to_euler(rotation: np.ndarray) -> np.ndarray:
-    """Return the ``degrees [3]`` about x, y and z with which :func:`euler_to_rotmat` makes ``rotation [3,3]``."""
-    # cosine of the angle about y; near 0, the other two angles have the same axis, and the angle about z is set to 0
-    cosine = np.sqrt(np.square(rotation[:2, 0]).sum())
-    about_y = arctan2(-rotation[2, 0], cosine)
-    if cosine < MIN_COSINE:
-        return np.asarray(np.degrees([arctan2(-rotation[1, 2], rotation[1, 1]), about_y, 0.0]))
-    about_x, about_z = arctan2(rotation[2, 1], rotation[2, 2]), arctan2(rotation[1, 0], rotation[0, 0])
-    return np.asarray(np.degrees([about_x, about_y, about_z]))
 
 
 def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:

@@ -83,7 +83,7 @@ requirements=$(tools/bin/python - "$root/pyproject.toml" <<'PY'
 import sys, tomllib
 project = tomllib.load(open(sys.argv[1], "rb"))["project"]
 extras = project["optional-dependencies"]
-print("\n".join([*project["dependencies"], *extras["usd"]]))
+print("\n".join(project["dependencies"]))
 PY
 )
 mapfile -t requirements <<<"$requirements"

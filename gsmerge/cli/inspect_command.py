@@ -31,7 +31,7 @@ def inspect(args: opt.Args) -> None:
 
 def _inspect_scene(args: opt.Args, path: Path) -> None:
     """Describe a scene in detail; SceneError if ``compact`` refuses it."""
-    from gsmerge.inspection.file_checks import check_content, list_damage
+    from gsmerge.inspection.file_checks import check_content
     from gsmerge.inspection.inspect import inspect as inspect_scene
     from gsmerge.inspection.inspect import inspection_lines
     from gsmerge.io.formats.table import INDEX
@@ -41,7 +41,7 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
     hints = args.hints()
     with stage_progress(quiet=args.silent) as progress, record_run(progress):
         facts = inspect_scene(path, cameras=args.cameras, images=args.images, opacity=args.opacity, **vars(hints))
-        problems = check_content(path).problems if path.name == INDEX else list_damage(path)
+        problems = check_content(path).problems if path.name == INDEX else ()
     document, lines = {**document_head(), **facts, "problems": list(problems)}, inspection_lines(facts)
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
     if facts["compact"] is None:

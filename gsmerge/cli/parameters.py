@@ -32,7 +32,7 @@ from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, change_settings, flat_settings, join_words, suggest_name
-from gsmerge.settings.stages import CROP_FILES, Engine
+from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
@@ -96,10 +96,6 @@ class Args(SimpleNamespace):
         values = options | pairs
         if "seed" in settings and "seed" not in values and os.environ.get(SEED):  # an empty one counts as not set
             values["seed"] = parse_value(SEED, os.environ[SEED], settings["seed"])
-        if Path(str(values.get("crop"))).suffix.lower() in CROP_FILES:
-            from gsmerge.io.crop_file import read_crop
-
-            values["crop"] = read_crop(Path(values["crop"]))
         return values
 
     def settings(self, **changes: Any) -> CompactOptions:
@@ -395,7 +391,7 @@ AFTER = argument(
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder that holds it.")
 
 # Shared by commands: a text, and names of options
-COMPACT_SCENE = "The compact scene; the ending sets the format: .ply, .spz, .sog, .splat, .glb, .usdc or .usdz."
+COMPACT_SCENE = "The compact scene; the ending sets the format: .ply, .spz, .sog, .splat or .glb."
 READING = "cameras images hint"
 TARGETS = "targets target_images"
 

@@ -66,7 +66,7 @@ class CompactResult:
     def save(self, path: StrPath, *, overwrite: bool = False) -> Path:
         """Write the result with its levels and cameras, as ``-o`` of the command does: all files or none.
 
-        The name chooses the format: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.glb``, ``.usdz``, ``.html`` for a
+        The name chooses the format: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.glb``, ``.html`` for a
         page, ``lod-meta.json`` for levels that stream, or a folder ``colmap``. A format without cameras gets
         ``NAME.cameras.json`` beside its file.
 

@@ -9,33 +9,23 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.io import file_notes
-from gsmerge.io.archives import damaged_member
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.read import read_all_cameras
-from gsmerge.io.cameras.table import CAMERA_ENDINGS, CHUNK
-from gsmerge.io.formats import ply, spz, streamed
+from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.cameras.table import CAMERA_ENDINGS
+from gsmerge.io.formats import ply, streamed
 from gsmerge.io.formats.read import degree_notes
-from gsmerge.io.formats.table import (
-    META,
-    READ_ENDINGS,
-    SCENE_SUFFIXES,
-    SEVERAL_USES,
-    STATE_ENDING,
-    find_format,
-    may_hold_gaussians,
-)
+from gsmerge.io.formats.table import READ_ENDINGS, SCENE_SUFFIXES, STATE, STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.scene.exporters import NO_HINTS
-from gsmerge.scene.files import find_scene_files, list_plys
+from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_files
 from gsmerge.settings.reading import OpacityChoice, ReadHints
 from gsmerge.states.state_file import holds_features, load_state
 
 NETWORKS = ".safetensors"
 CAMERAS = (*CAMERA_ENDINGS, ".bin")
-ARCHIVES = (".sog", ".npz", CHUNK)
 
 
 @dataclass(frozen=True)
@@ -73,36 +63,15 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
         file_check = _read_scene(path, opacity, hints) if holds_scene(path) else _read(path)
     except SceneError as error:
         return FileCheck(str(path), "", problems=(str(error).removeprefix(f"{path}: "),))
-    problems = (*file_check.problems, *list_damage(path))
     size = 0 if path.is_dir() else path.stat().st_size
-    return replace(file_check, file_bytes=file_check.file_bytes or size, problems=problems)
+    return replace(file_check, file_bytes=file_check.file_bytes or size)
 
 
 def holds_scene(path: Path) -> bool:
     """Return whether a path is read as a scene, not as cameras, networks, levels or a state."""
-    suffix = path.suffix.lower()
-    if suffix in SEVERAL_USES:
-        return os.path.exists(path) and may_hold_gaussians(path)
-    if suffix == STATE_ENDING:
+    if STATE.names(path):
         return os.path.isfile(path) and not holds_features(path)
-    if path.name == META:
-        return find_format(path).holds(path)
-    return suffix in SCENE_SUFFIXES or os.path.isdir(path)
-
-
-def list_damage(path: Path) -> list[str]:
-    """List problems that reading a file does not reveal: bytes after its content, and wrong checksums of its parts."""
-    suffix = path.suffix.lower()
-    if os.path.isdir(path):
-        return [f"{file.name}: {problem}" for file in list_plys(path) for problem in list_damage(file)]
-    problem = None
-    if suffix in ARCHIVES:
-        problem = damaged_member(path)
-    elif suffix == ".spz":
-        problem = spz.problem_at_end(path)
-    elif suffix == ".ply" and (surplus := ply.bytes_after_rows(path)):
-        problem = f"{surplus:,} bytes after the last row, which are not read"
-    return [problem] if problem else []
+    return os.path.isdir(path) or may_hold_gaussians(path)
 
 
 def _read(path: Path) -> FileCheck:
@@ -115,7 +84,8 @@ def _read(path: Path) -> FileCheck:
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
     if suffix in CAMERAS:
-        return _read_cameras(path)
+        cameras = read_cameras(path)
+        return FileCheck(str(path), "cameras", len(cameras), cameras.source)
     check_file(path)
     if suffix in SCENE_SUFFIXES:
         find_scene_files(path)  # which says what a file without Gaussians holds
@@ -134,14 +104,6 @@ def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileChe
         str(path), "Gaussians", info.count, info.layout, info.file_bytes, notes=notes,
         num_views=len(load.scene), num_photos=num_photos,
     )  # fmt: skip
-
-
-def _read_cameras(path: Path) -> FileCheck:
-    """Read the cameras of a file; if it has several scenes, read the cameras of all."""
-    count = 0
-    for cameras in read_all_cameras(path):
-        count += len(cameras)
-    return FileCheck(str(path), "cameras", count, cameras.source)
 
 
 def _read_levels(path: Path) -> FileCheck:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import read_budget
 from gsmerge.types import StrPath
 
 # With other methods, zipfile unpacks each piece of packed bytes completely, even if the directory states fewer bytes
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_PIECE = 1 << 14  # bytes that are unpacked in one step of a budget
 
 
 @contextmanager
@@ -38,17 +35,3 @@ def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
     """Read as many bytes of a member as the directory states; ``ZipFile.read`` would unpack more."""
     with archive.open(info) as file:
         return file.read(info.file_size)
-
-
-def damaged_member(path: Path) -> str | None:
-    """Describe the first damaged member of an archive, by the checksums; None without damage."""
-    try:
-        with open_archive(path) as archive:
-            pieces = sum(-(-info.file_size // _PIECE) for info in archive.infolist())
-            read_budget(path).check_steps(pieces, f"pieces of {_PIECE:,} unpacked bytes")
-            name = archive.testzip()
-    except SceneError as error:
-        return str(error).removeprefix(f"{path}: ")
-    except Exception as error:  # a damaged archive may make the library raise any error
-        return f"cannot be unpacked ({' '.join(str(error).split())})"
-    return None if name is None else f"{name}: damaged, since its checksum is wrong"

@@ -13,7 +13,6 @@ import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -24,7 +23,6 @@ from gsmerge.types import StrPath
 
 MAX_TEXT_BYTES = 32 << 20  # of a camera file, far more than any real one has
 MAX_MODEL_BYTES = 256 << 20  # of a COLMAP text file, which also lists the points of every image
-MAX_SETTINGS_BYTES = 1 << 20
 MAX_VIEWS = 10_000
 MAX_FILES = 100_000  # below a folder of photos
 MAX_PIXELS = 1 << 26  # of one image
@@ -32,7 +30,6 @@ MAX_PIXELS = 1 << 26  # of one image
 _ADDRESS = re.compile(r"(https?|s3|gs|ftp|file):/")  # start of a URL
 _FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20
 _FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # steps of 20 microseconds: 5 s, and 2 s for each MB
-_PARTS_PER_STEP = 4000  # squared numbers of parts of dotted TOML keys
 # Bytes of Python's objects for each of these characters in JSON, at most, in CPython 3.10 to 3.14
 _JSON_BYTES = {"[": 88, "{": 130, ":": 110, '"': 30, ",": 34}
 
@@ -159,28 +156,6 @@ def read_json(path: Path) -> Any:
         return parse_json(text, read_budget(path))
     except ValueError as error:
         raise SceneError(path, f"expected JSON, found other text ({error})") from error
-
-
-def read_table(path: Path) -> dict[str, Any]:
-    """Read a table from a ``.json`` file, or from a TOML file with Python 3.11 or later; SceneError on failure."""
-    is_json = path.suffix.lower() == ".json"
-    if not is_json and sys.version_info < (3, 11):
-        found = f"Python {sys.version_info[0]}.{sys.version_info[1]}"
-        raise SceneError(path, f"expected Python 3.11 or later to read TOML, found {found}", "write the file as JSON")
-    text, budget = read_text(path, MAX_SETTINGS_BYTES), read_budget(path)
-    if not is_json:  # the TOML reader compares each part of a dotted key with all parts before it
-        parts = sum(line.count(".") ** 2 for line in text.splitlines())
-        budget.check_steps(parts // _PARTS_PER_STEP, "steps for dotted keys")
-    try:
-        table = parse_json(text, budget) if is_json else import_module("tomllib").loads(text)
-        repr(table)  # raises ValueError for whole numbers with more digits than JSON may have
-    except (ValueError, RecursionError) as error:
-        kind = "JSON" if is_json else "TOML"
-        raise SceneError(path, f"expected {kind}, found a syntax error ({str(error).splitlines()[0]})") from error
-    if not isinstance(table, dict):
-        found = "a list" if isinstance(table, list) else "a single value"
-        raise SceneError(path, f"expected a table of names and values, found {found}", "write an object of JSON")
-    return table
 
 
 def check_pixels(path: StrPath, width: int, height: int) -> None:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import re
+import shlex
 from contextlib import suppress
 from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 
-_PACKED_SCENES = (".spz", ".splat", ".sog", ".ksplat", ".npz", ".glb", ".gsm")
-_PHOTOS = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff")
-NO_TEXT = (".ply", *_PACKED_SCENES, *_PHOTOS, ".torch", ".safetensors", ".bin")  # endings of files that are never text
+_PACKED_SCENES = (".spz", ".splat", ".sog", ".npz", ".glb", ".gsm")
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".ppm"})
+# Endings of files that are never text
+NO_TEXT = (".ply", *_PACKED_SCENES, *IMAGE_SUFFIXES - {".ppm"}, ".torch", ".safetensors", ".bin")
 _START = 1 << 10  # bytes of a file that are compared with the patterns
 _DOWNLOAD = "download it again, in a browser if the page needs a click or a login"
 _UNPACK = "unpack it, and name the scene in it"
@@ -34,11 +36,15 @@ _TRAIN = "train Gaussians on it, or make Gaussians from the photos with a model"
 _WRITE = "write its Gaussians as .ply, with ns-export gaussian-splat (nerfstudio) or the option save_ply (gsplat)"
 _EXPORT = "export the scene from that program as .ply"
 FILM = "a film"
+# A program that reads other formats; remedies may have the path of the file
+PACKAGE = "@playcanvas/splat-transform@3.7"
+_PACKED_BY_OTHERS = "Gaussians in a format that is not read", f"convert it with: npx {PACKAGE} {{path}} -L 0 scene.ply"
 _FILM = FILM, "save its frames as photos, and make a scene from them with a model such as Depth Anything 3"
 # Other files that are often beside scenes, by ending: their content, and the remedy
 FOREIGN: dict[str, tuple[str, str]] = {
     **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"), _FILM),
     **dict.fromkeys((".pt", ".pth", ".ckpt", ".pkl"), ("a checkpoint", _WRITE)),
+    **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), _PACKED_BY_OTHERS),
     **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".ptx"), ("a cloud of points", _TRAIN)),
     **dict.fromkeys((".obj", ".fbx", ".stl", ".dae", ".off", ".blend", ".abc"), ("a mesh", _TRAIN)),
     ".ssproj": ("a project of SuperSplat", _EXPORT),
@@ -62,6 +68,7 @@ OTHER_PICTURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("Targa", (".tga",), r"(?!)"),  # has no mark at its start, so this pattern never matches
     ("SVG", (".svg",), r"(?:<\?xml[^>]*>)?\s*<svg"),
     ("raw", _RAW, r"(?s)FUJIFILMCCD-RAW|.{4}ftypcrx|II[RU][OS\0]"),  # other raw formats start like TIFF
+    ("TIFF", (".tif", ".tiff"), r"II[*+]\0|MM\0[*+]"),
 )
 CONVERT = "convert it to .jpg or .png"
 # They are tried in this order
@@ -80,7 +87,7 @@ OTHER_CONTENTS = (
         "run Lyra with save_gaussians_orig: true, and name the file in gaussians_orig",
         right=(".torch",),
     ),
-    OtherContent("a zip archive", r"PK\x03\x04", _UNPACK, right=(".sog", ".npz", ".usdz", ".torch")),
+    OtherContent("a zip archive", r"PK\x03\x04", _UNPACK, right=(".sog", ".npz", ".torch")),
     OtherContent("a gzip archive", r"\x1f\x8b\x08[\0-\x1f]", _UNPACK, right=(".spz",)),
     OtherContent("a tar archive", r"(?s).{257}ustar", _UNPACK),
     OtherContent("a 7z archive", r"7z\xbc\xaf\x27\x1c", _UNPACK),
@@ -103,21 +110,12 @@ def read_start(path: Path, count: int = 1 << 12) -> bytes:
 
 
 def refuse_picture(path: Path) -> None:
-    """Raise SceneError for a picture of a format that is not read, by its first bytes or else by its name."""
-    names = _list_formats(read_start(path, _START))
-    names += [name for name, endings, _ in OTHER_PICTURES if path.suffix.lower() in endings]
-    if names:
-        raise _unread_picture(path, names[0])
-
-
-def _list_formats(start: bytes) -> list[str]:
-    """List the formats that the first bytes of a file match, of the formats of pictures that are not read."""
-    return [name for name, _, pattern in OTHER_PICTURES if re.match(pattern.encode("latin-1"), start)]
-
-
-def _unread_picture(path: Path, name: str) -> SceneError:
-    """Make the error of a picture of a format that is not read."""
-    return SceneError(path, f"expected an image, found a picture of the format {name}, which is not read", CONVERT)
+    """Raise SceneError for a picture of a format that is not read, by its name or its first bytes."""
+    ending, start = path.suffix.lower(), read_start(path, _START)
+    for name, endings, pattern in OTHER_PICTURES:
+        if ending in endings or re.match(pattern.encode("latin-1"), start):
+            problem = f"expected an image, found a picture of the format {name}, which is not read"
+            raise SceneError(path, problem, CONVERT)
 
 
 def check_first_bytes(path: Path, size: int) -> None:
@@ -130,10 +128,10 @@ def check_first_bytes(path: Path, size: int) -> None:
         raise SceneError(path, "expected content, found an empty file", _AGAIN)
     if ending in FOREIGN:
         content, remedy = FOREIGN[ending]
-        raise SceneError(path, f"expected a scene, found {content}", remedy)
+        raise SceneError(path, f"expected a scene, found {content}", remedy.format(path=shlex.quote(str(path))))
     start = read_start(path, _START)
-    if ending in _PHOTOS and (names := _list_formats(start)):
-        raise _unread_picture(path, names[0])
+    if ending in IMAGE_SUFFIXES:
+        refuse_picture(path)
     for row in OTHER_CONTENTS:
         is_wrong = ending not in row.right and ending in (row.wrong or (ending,))
         match = re.match(row.start.encode("latin-1"), start) if is_wrong else None

@@ -12,10 +12,9 @@ from typing import TypeVar
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import walk_files
-from gsmerge.io.first_bytes import FILM, FOREIGN, OTHER_PICTURES
+from gsmerge.io.first_bytes import FILM, FOREIGN, IMAGE_SUFFIXES, OTHER_PICTURES
 from gsmerge.types import StrPath
 
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of unread formats
 FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content == FILM)
 # Ends of the videos that gsmerge writes, which tell them from films of a capture: a box or element that players skip

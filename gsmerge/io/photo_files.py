@@ -6,11 +6,11 @@ import io
 import struct
 import warnings
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -27,8 +27,7 @@ from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
-_FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # formats whose headers Pillow reads; that of PNG is read here
-_WIDTH_TAG, _HEIGHT_TAG = 256, 257  # of a TIFF; the size that Pillow gives is turned by the orientation tag
+_FORMATS = ("JPEG", "WEBP", "BMP", "PPM")  # formats whose headers Pillow reads; that of PNG is read here
 _ORIENTATION_TAG = 274
 # Turn of each orientation tag: quarter turns counterclockwise, plus 4 if the photo is mirrored first
 _TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
@@ -44,13 +43,8 @@ _COPIES = 2, 3  # of all pixels in memory: with OpenCV, and at most with Pillow 
 _PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # of a pixel by mode; 4 in all other modes
 _COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10  # of a pixel, while decoding
 _EMBEDDED_BYTES = 9  # additional bytes of a pixel while embedded photos are decoded
-_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # first bytes; the last two are those of BigTIFF
 # First bytes of a file -> Pillow's plugin; without a plugin for its first format, Pillow imports those of all formats
-_PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp", **dict.fromkeys(_TIFF, "Tiff")}
-_TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8, 0])  # of a number by type of tag
-_TILE_TAGS = (322, 323)  # width and length of a tile, pixels
-_BITS_TAG, _SAMPLES_TAG = 258, 277
-_MAX_TAGS = 1 << 16  # that are checked; decoders read fewer
+_PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp"}
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 # Bytes of a scene's decoded photos that are allowed in any case, and for each byte of the files: even strongly
 # compressed photos have more than 0.03 bytes per pixel
@@ -116,13 +110,7 @@ def decode_images(paths: Sequence[Path]) -> PhotoArrays:
         if (w, h) != size:
             problem = f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {files[0]}"
             raise SceneError(path, problem, "resize them to one size")
-    if not files:
-        return []
-    _check_together(paths, sum(map(check_file, files)), size)
-    if _CHANNELS * size[0] * size[1] * len(files) > _AT_ONCE:
-        return PhotoReader(len(paths), size, lambda photo: decode_image(paths[photo], size))
-    decoded = dict(zip(files, parallel_map(lambda path: decode_image(path, size), files), strict=True))
-    return [decoded[path] for path in paths]
+    return decode_views(paths, [0] * len(paths), size) if files else []
 
 
 def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
@@ -137,23 +125,27 @@ def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
 def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size) -> PhotoArrays:
     """Decode the photo of each view to ``[h,w,3]`` uint8, turned, and resized to one ``size``; black without a file.
 
-    If photos are large, they are decoded at each use. SceneError as in :func:`decode_images`.
+    If photos are large, they are decoded at each use; else a photo that several views have is decoded once. SceneError
+    as in :func:`decode_images`.
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
     _check_together([path for path in paths if path is not None], sum(map(check_file, files)), size)
 
-    def decode(view: int) -> np.ndarray:
-        path = paths[view]
+    def decode(view: tuple[Path | None, int]) -> np.ndarray:
+        path, turn = view
         if path is None:
             return np.zeros((size[1], size[0], 3), np.uint8)
-        photo = np.ascontiguousarray(turn_picture(decode_image(path, sizes[path]), turns[view]))
+        photo = np.ascontiguousarray(turn_picture(decode_image(path, sizes[path]), turn))
         photo_size = photo.shape[1], photo.shape[0]
         return photo if photo_size == size else resize_to(photo_size, size).photos([photo])[0]
 
-    if _CHANNELS * size[0] * size[1] * len(paths) > _AT_ONCE:
-        return PhotoReader(len(paths), size, decode)
-    return parallel_map(decode, range(len(paths)))
+    views = list(zip(paths, turns, strict=True))
+    different = list(dict.fromkeys(views))
+    if _CHANNELS * size[0] * size[1] * len(different) > _AT_ONCE:
+        return PhotoReader(len(views), size, lambda view: decode(views[view]))
+    decoded = dict(zip(different, parallel_map(decode, different), strict=True))
+    return [decoded[view] for view in views]
 
 
 def decode_small(path: Path, side: int) -> np.ndarray:
@@ -292,12 +284,10 @@ def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
 def _decoder_bytes(image: Image.Image) -> float:
     """Return the measured bytes per pixel that a decoder needs besides its output.
 
-    These bytes hold the frames of a WebP, a strip of a TIFF and its RGBA, or the coefficients of a progressive JPEG.
+    These bytes hold the frames of a WebP, or the coefficients of a progressive JPEG.
     """
     if image.format == "WEBP":
         return _MOVING_WEBP_BYTES if getattr(image, "is_animated", False) else _WEBP_BYTES
-    if (tags := getattr(image, "tag_v2", None)) is not None:
-        return 1 + max(_CHANNELS, _sample_bytes(tags))
     shares = [across * down for _, across, down, _ in getattr(image, "layer", ())]
     return _COEFFICIENT_BYTES * sum(shares) / max(shares, default=1)
 
@@ -334,7 +324,7 @@ def _unreadable(path: Path) -> SceneError:
 
 
 def image_size(path: Path) -> Size:
-    """Read (width, height) from the header of a PNG, JPEG, WebP, BMP, TIFF or PNM file; its orientation is ignored.
+    """Read (width, height) from the header of a PNG, JPEG, WebP, BMP or PNM file; its orientation is ignored.
 
     SceneError if it is another file, if it cannot be read, if its size is impossible, or if its pixels take more memory
     than the file allows.
@@ -375,16 +365,11 @@ def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
         if start[:8] == PNG:  # Pillow refuses a PNG for damage outside its pixels as well
             width, height = struct.unpack(">II", start[16:24])
         else:
-            if start[:4] in _TIFF:
-                _check_tags(path, file)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 image = _open_image(file, _FORMATS)
             pixel_bytes = _decoder_bytes(image)
-            tags = getattr(image, "tag_v2", None)
-            width, height = image.size if tags is None else (tags[_WIDTH_TAG], tags[_HEIGHT_TAG])
-            if tags is not None:
-                _check_tile(ReadBudget(path, file.seek(0, io.SEEK_END)), tags)
+            width, height = image.size
     except (SceneError, MemoryError):
         raise
     except Image.DecompressionBombError as error:
@@ -404,40 +389,6 @@ def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
         import_module(f"PIL.{plugin}ImagePlugin")
         formats = (plugin.upper(),)
     return Image.open(file, formats=tuple(formats))
-
-
-def _check_tags(path: Path, file: BinaryIO) -> None:
-    """Raise SceneError if the tags of a TIFF refer to more bytes than allowed, since its decoder copies all of them.
-
-    ValueError if a tag on which sizes depend is there twice, since decoders differ in which of them they use.
-    """
-    num_bytes = file.seek(0, io.SEEK_END)
-    file.seek(0)
-    start = file.read(16)
-    order, large = "<" if start[:1] == b"I" else ">", 43 in start[2:4]
-    file.seek(*struct.unpack_from(f"{order}8xQ" if large else f"{order}4xI", start))
-    (count,) = struct.unpack(f"{order}{'Q' if large else 'H'}", file.read(8 if large else 2))
-    number = f"{order}u{8 if large else 4}"
-    entry = np.dtype([("tag", f"{order}u2"), ("type", f"{order}u2"), ("count", number), ("value", number)])
-    data = file.read(min(count, _MAX_TAGS) * entry.itemsize)
-    file.seek(0)
-    tags = np.frombuffer(data, entry, len(data) // entry.itemsize)
-    sizes = _TAG_BYTES[np.minimum(tags["type"], len(_TAG_BYTES) - 1)]
-    ReadBudget(path, num_bytes).check_memory(float((tags["count"] * sizes.astype(np.float64)).sum()), "tags")
-    if any((tags["tag"] == tag).sum() > 1 for tag in (_WIDTH_TAG, _HEIGHT_TAG, _BITS_TAG, _SAMPLES_TAG, *_TILE_TAGS)):
-        raise ValueError("a tag twice")
-
-
-def _check_tile(budget: ReadBudget, tags: Mapping[int, Any]) -> None:
-    """Raise SceneError if a tile of a TIFF, for which decoders allocate memory, takes more than the file allows."""
-    width, length = (tags.get(tag, 0) for tag in _TILE_TAGS)
-    num_bytes = max(_CHANNELS + 1, _sample_bytes(tags)) * width * length
-    budget.check_memory(num_bytes, f"a tile of {width} x {length} pixels")
-
-
-def _sample_bytes(tags: Mapping[int, Any]) -> float:
-    """Return the bytes of a pixel in a TIFF."""
-    return float(tags.get(_SAMPLES_TAG, 1) * max(tags.get(_BITS_TAG, (1,))) / 8)
 
 
 def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray | PhotoReader:

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import os
-import struct
 from functools import lru_cache
 from pathlib import Path
 
 from gsmerge.errors import UsageError, is_out_of_memory
 from gsmerge.kernels.build import FOLDER, Target, find_platform, hash_sources
 
-ELF_HEADER = 64  # bytes
-SECTION_TABLE = "<40xQ10xHH"  # position, bytes per entry and number of entries of an ELF file's section table
 REMEDY = "run python tasks.py native, or pip install again"
 
 
@@ -47,7 +44,6 @@ def _open(target: Target) -> ctypes.CDLL:
     folder = Path(os.environ.get("GSMERGE_NATIVE") or FOLDER)
     path = folder / find_platform().library_name(target)
     try:
-        _check_end(path)
         library = ctypes.CDLL(str(path))
         sources_hash = ctypes.c_char_p.in_dll(library, "sources_hash").value or b""
     except (OSError, ValueError) as error:  # ValueError if it is not a library of this package
@@ -55,29 +51,7 @@ def _open(target: Target) -> ctypes.CDLL:
             raise MemoryError from error
         if path.exists():
             raise UsageError(f"{path}: the native library cannot be loaded ({error}); {REMEDY}") from None
-        raise UsageError(f"{path}: the native library is missing; {_find_shadow() or REMEDY}") from None
+        raise UsageError(f"{path}: the native library is missing; {REMEDY}") from None
     if hash_sources().encode() not in (b"", sources_hash):
         raise UsageError(f"{path}: the native library is older than its sources; {REMEDY}")
     return library
-
-
-def _find_shadow() -> str | None:
-    """Return a remedy if this package is a folder of sources that hides the installed package; otherwise None."""
-    from importlib import metadata  # here because it takes 8 ms
-
-    package = FOLDER.parent
-    for installed in metadata.distributions(name=package.name):
-        folder = Path(str(installed.locate_file(package.name)))
-        if (folder / "__init__.py").exists() and folder.resolve() != package.resolve():
-            remedy = f"start Python in another folder, or run pip install -e {package.parent}"
-            return f"the folder {package.parent} hides the package that is installed: {remedy}"
-    return None
-
-
-def _check_end(path: Path) -> None:
-    """Raise OSError if an ELF file is cut off before its section table, since loading it could crash the process."""
-    with path.open("rb") as file:
-        head = file.read(ELF_HEADER).ljust(ELF_HEADER, b"\0")
-    table, entry_bytes, num_entries = struct.unpack_from(SECTION_TABLE, head)
-    if head.startswith(b"\x7fELF") and not 0 < table <= path.stat().st_size - entry_bytes * num_entries:
-        raise OSError("it is cut off")

@@ -132,28 +132,6 @@ def _join(pictures: Sequence[Picture], axis: int) -> Picture:
     return np.concatenate(with_gaps, axis)
 
 
-def draw_borders(labels: np.ndarray, ids: np.ndarray, factor: int) -> NDArray[np.uint8]:
-    """Enlarge ``labels [h,w]`` by a whole factor, and draw borders one pixel wide between different labels.
-
-    A border has the value in ``ids [k]`` uint8 of the label to its right or below it. All other pixels are 0.
-    """
-    (height, width), own = labels.shape, ids.take(labels)
-    right, down = np.zeros((height, width, factor), np.uint8), np.zeros((height, width), np.uint8)
-    np.multiply(own[:, 1:], labels[:, 1:] != labels[:, :-1], out=right[:, 1:, 0])
-    np.multiply(own[1:], labels[1:] != labels[:-1], out=down[1:])
-    drawn = np.empty((height, factor, width * factor), np.uint8)
-    drawn[:] = right.reshape(height, 1, -1)
-    np.maximum(drawn[:, 0], down.repeat(factor, 1), out=drawn[:, 0])
-    return drawn.reshape(height * factor, -1)
-
-
-def mean_colors(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Return the mean colour ``[k,3]`` of each superpixel of ``labels [h,w]`` in ``image [h,w,3]``."""
-    flat = labels.reshape(-1)
-    sizes = np.maximum(np.bincount(flat), 1)
-    return np.stack([np.bincount(flat, channel) / sizes for channel in image.reshape(-1, 3).T], 1)
-
-
 def heat_map(levels: np.ndarray) -> Picture:
     """Colour levels ``[h,w]`` in [0, 1] from black through red to yellow."""
     colored = cv2.applyColorMap((levels * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)

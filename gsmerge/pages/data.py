@@ -13,31 +13,25 @@ from gsmerge.facts.views import even_views
 from gsmerge.frame import Frame, scene_frame
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import middle_depth
-from gsmerge.io.encode_pictures import encode_indexed, encode_picture
+from gsmerge.io.encode_pictures import encode_picture
 from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.error_maps import ErrorReference, draw_errors, expected_errors, make_reference
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, OnImage, Quality, ResultScores, evaluate
 from gsmerge.measure.lpips import lpips_available
-from gsmerge.measure.preview import OUTSIDE, Picture, draw_borders, mean_colors, to_picture
-from gsmerge.pages.marks import Marks, draw_marks, find_marks
-from gsmerge.pages.splats import MAX_GAUSSIANS, drawn_rows, highest_degree, pack_splats, pack_support
-from gsmerge.raster import Splats, make_splats, render
+from gsmerge.measure.preview import OUTSIDE, Picture, to_picture
+from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
+from gsmerge.raster import render
 from gsmerge.raster.metrics import is_worse
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.stages import SegmentOptions
-from gsmerge.stages.superpixels import segment
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 LPIPS = "alex"  # network of LPIPS, if its weights are installed; it takes 0.05 s per picture, "vgg" 0.8 s
 MAX_VIEWS = 32  # of more views, only so many at equal intervals are shown; each takes up to 300 kB
 WEBP_QUALITY = 90  # stills of this quality score within 1 dB of lossless stills
-OUTLINE_SIDE = 1280  # largest longer side of a picture of superpixels' outlines, pixels
-OUTLINE_LEVELS = 5  # levels per channel of an outline's colour; all colours and transparency then fit into a byte
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
-OUTLINE_SHIFT = 0.35  # outlines move by this share from the superpixel's colour to white, or to black if it is light
 
 
 @dataclass(frozen=True)
@@ -54,9 +48,6 @@ class Side:
     covered_share: float | None  # share of the pixels of these views that the input covers
     covered: Quality  # mean over the covered pixels
     seconds: float  # time to draw a view on this machine, with all threads
-    dropped: Mapping[str, int]  # number of Gaussians that ``--drop`` would remove, by its words
-    seen: Mapping[str, int]  # number of Gaussians shown by "none" or by "one" of the input views; empty: not known
-    support: bytes | None  # number of views that show each packed Gaussian, see :func:`pack_support`; None: not known
     new_gain: tuple[float, float] | None = None  # bounds of the expected gain of new views, dB; None: not known
 
 
@@ -72,12 +63,8 @@ class PageView:
     photo: bytes | None  # WebP
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
-    outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None for held-out views
     outside: bool = False  # True for the outside view, which has neither a photo nor scores
-    drops: tuple[bytes | None, ...] = ()  # PNG, one for each side: Gaussians that ``--drop`` would remove, coloured
-    seen: tuple[bytes | None, ...] = ()  # PNG, one for each side: Gaussians that none or one of the input views shows
     maps: tuple[bytes | None, ...] = ()  # WebP, one for each side: see :mod:`gsmerge.measure.error_maps`
-    faded: tuple[bytes | None, ...] = ()  # outside view only: stills with faint Gaussians where no view shows them
 
 
 @dataclass(frozen=True)
@@ -91,7 +78,6 @@ class ViewData:
     num_views: int  # number of measured views; `views` may have fewer
     reference: str  # words for the pictures against which scores are measured
     notes: tuple[str, ...]  # warnings and limits, one sentence each
-    num_superpixels: tuple[int, int] | None = None  # least and largest number in a photo; None without outlines
     lacks_pixels: bool = False  # if True, the scene itself does not cover all pixels of the input views
     agreement: Agreement | None = None  # share of the depth that other views confirm; None: not known
     doubts: tuple[str, ...] = ()  # those of the notes that are warnings
@@ -149,7 +135,7 @@ def collect(
     evaluation = evaluate(
         scene, results, held_out, options, cameras=cameras, progress=progress, on_image=still_keeper(stills)
     )
-    progress("superpixels and the view from outside", 0, 0)
+    progress("the view from outside", 0, 0)
     with use_threads():
         data = page_data(title, scene, results, file_bytes, held_out, evaluation, stills, cameras=cameras, light=light)
     progress("done", 0, 0)
@@ -199,38 +185,29 @@ def page_data(
     canonical = {name: frame.enter(gaussians) for name, gaussians in named.items()}
     scene_cameras = frame.enter_cameras(scene.cameras.numpy())
     inspected = [name for name in named if name != INPUT or not results]
-    photos = pictures if len(pictures) else None
-    marks = {name: Marks() for name in named} | {
-        name: find_marks(canonical[name], scene_cameras, photos, own=name == INPUT and scene.has_own_pixels)
-        for name in inspected
-    }
     split = "context" if held_out is None else "target"
     sides = [
-        _side(result, size, split, canonical[result.name], marks[result.name], scene, scene_cameras, light=light)
+        _side(result, size, split, canonical[result.name], scene, scene_cameras, light=light)
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
     means = canonical[evaluation.results[:2][-1].name].means  # of the first result, or of the scene without results
     views = _page_views(_split_views(scene, pictures, held_out), evaluation, stills, frame, means)
-    shown, num_superpixels = with_outlines(_shown(views), pictures)
+    shown = _shown(views)
     moved = {name: frame.enter_cameras(result_cameras.numpy()) for name, result_cameras in (cameras or {}).items()}
     references = {
         name: make_reference(canonical[name], Views(moved.get(name, scene_cameras), pictures, scene.names), scene.masks)
         for name in (inspected if len(pictures) > 1 else ())
     }
     shown = tuple(replace(view, maps=tuple(_map(references.get(name), view) for name in named)) for view in shown)
-    splats = {name: make_splats(canonical[name]) for name in inspected}
-    *marked, outside = (
-        _with_marks(view, splats, marks) for view in (*shown, _outside_view(scene, named, frame, len(views)))
-    )
-    faded = tuple(_fade(canonical[name], marks[name], outside.camera) for name in named)
+    outside = _outside_view(scene, named, frame, len(views))
     measured_notes = evaluation.notes if results else ()  # they concern results
     notes = (*measured_notes, *_limits(sides, len(shown), len(views)))
     covered_share, _ = evaluation.results[0].mean_covered("context")
     lacks_pixels = covered_share is not None and covered_share < WHOLE
     agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
     return ViewData(
-        title, tuple(sides), tuple(marked), replace(outside, faded=faded), len(views), evaluation.reference, notes,
-        num_superpixels, lacks_pixels, agreement, doubts=evaluation.doubts,
+        title, tuple(sides), shown, outside, len(views), evaluation.reference, notes,
+        lacks_pixels, agreement, doubts=evaluation.doubts,
     )  # fmt: skip
 
 
@@ -244,22 +221,6 @@ def _split_views(
     if held_out is not None:
         splits["target"] = (held_out.cameras.numpy(), held_out.images, held_out.names)
     return splits
-
-
-def _fade(gaussians: Gaussians, marks: Marks, camera: Cameras) -> bytes | None:
-    """Draw canonical Gaussians, faint where no view shows them; None if views show all."""
-    faint = marks.fade(gaussians)
-    return None if faint is None else encode_still(to_picture(render(faint, camera, near=NEAR_PLANE).images[0]))
-
-
-def _with_marks(view: PageView, splats: Mapping[str, Splats], marks: Mapping[str, Marks]) -> PageView:
-    """Add to a view the pictures of the marked Gaussians of each side."""
-    pictures = [
-        draw_marks(splats[name], side_marks, view.camera) if name in splats else (None, None)
-        for name, side_marks in marks.items()
-    ]
-    drops, seen = zip(*pictures, strict=True)
-    return replace(view, drops=drops, seen=seen)
 
 
 def _page_views(
@@ -308,19 +269,6 @@ def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, pl
     )
 
 
-def with_outlines(views: Sequence[PageView], photos: np.ndarray) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
-    """Add outlines of superpixels to the input views with photos; also return their least and largest number."""
-    ids = [i for i, view in enumerate(views) if view.photo and not view.held_out]
-    if not ids:
-        return tuple(views), None
-    pictures = photos[[views[i].place for i in ids]]
-    groups = segment(pictures, SegmentOptions())
-    outlined = list(views)
-    for i, picture, labels in zip(ids, pictures, groups.labels, strict=True):
-        outlined[i] = replace(views[i], outlines=encode_outlines(picture, labels))
-    return tuple(outlined), (min(groups.counts), max(groups.counts))
-
-
 def short_names(names: Sequence[str]) -> list[str]:
     """Remove folders and endings from photo names, if all short names differ."""
     stems = [PurePosixPath(name.replace("\\", "/")).stem or name for name in names]
@@ -330,24 +278,6 @@ def short_names(names: Sequence[str]) -> list[str]:
 def encode_still(picture: Picture) -> bytes:
     """Encode a picture as WebP."""
     return encode_picture(picture, WEBP_QUALITY)
-
-
-def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
-    """Encode the borders of superpixels ``[h,w]`` as an enlarged, transparent PNG.
-
-    A border has the mean colour of its superpixel in ``photo [h,w,3]``, made lighter, or darker if it is light.
-    """
-    means = mean_colors(photo, labels)
-    light = means.mean(1, keepdims=True) > 0.5
-    shifted = means + OUTLINE_SHIFT * (np.where(light, 0.0, 1.0) - means)
-    red, green, blue = np.round((OUTLINE_LEVELS - 1) * shifted).astype(np.int64).T
-    codes = (red * OUTLINE_LEVELS + green) * OUTLINE_LEVELS + blue
-    is_used = np.bincount(codes, minlength=OUTLINE_LEVELS**3) > 0
-    levels = np.stack(np.unravel_index(np.flatnonzero(is_used), (OUTLINE_LEVELS,) * 3), 1)
-    colors, color_ids = (levels * (255 // (OUTLINE_LEVELS - 1))).astype(np.uint8), np.cumsum(is_used, dtype=np.uint8)
-    factor = max(1, OUTLINE_SIDE // max(labels.shape))
-    drawn = draw_borders(labels, color_ids[codes], factor)  # numbers of colours from 1 on
-    return encode_indexed(drawn, np.pad(colors, ((1, 0), (0, 0))))  # index 0 is transparent
 
 
 def _map(reference: ErrorReference | None, view: PageView) -> bytes | None:
@@ -383,20 +313,16 @@ def _side(
     file_bytes: int,
     split: str,
     gaussians: Gaussians,
-    marks: Marks,
     scene: Scene,
     cameras: Cameras,
     *,
     light: bool,
 ) -> Side:
-    """Collect the data of one side of a page: scores, counts of marked Gaussians, and packed canonical Gaussians."""
+    """Collect the data of one side of a page: scores and packed canonical Gaussians."""
     packed = _pack(gaussians, result.name, scene, cameras, light)
-    support = None if marks.support is None or packed[0] is None else pack_support(marks.support[drawn_rows(gaussians)])
-    dropped, seen = ({word: int(mask.sum()) for word, mask in masks.items()} for masks in (marks.drops, marks.seen))
     mean, covered = result.mean(split)[1], result.mean_covered(split)
     return Side(
-        result.name, result.num_gaussians, file_bytes, mean, *packed, *covered, result.render_seconds,
-        dropped, seen, support,
+        result.name, result.num_gaussians, file_bytes, mean, *packed, *covered, result.render_seconds
     )  # fmt: skip
 
 

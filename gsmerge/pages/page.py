@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import hashlib
 import html
 import json
 import re
-import secrets
 from collections.abc import Sequence
 from functools import cache, partial
-from itertools import chain, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,50 +34,22 @@ NONE = "-"  # replaces a missing figure
 FASTER = 1.2  # the headline mentions a ratio of drawing times from this value on
 
 
-class Payloads:
-    """Contents of a page, in base64; short marks stand for them while a template is filled and its scripts hashed."""
-
-    def __init__(self) -> None:
-        self._name, self._contents = secrets.token_hex(8), list[bytes]()
-
-    def add(self, content: bytes) -> str:
-        """Add a content, and return its mark."""
-        self._contents.append(content)
-        return f"{self._name}-{len(self._contents) - 1}-"
-
-    def add_uris(self, pictures: Sequence[bytes | None], kind: str = "image/webp") -> list[str | None]:
-        """Add pictures, and return ``data:`` addresses with their marks; None stays None."""
-        head = f"data:{kind};base64,"
-        return [None if picture is None else head + self.add(picture) for picture in pictures]
-
-    def insert(self, page: str) -> bytes:
-        """Put the contents in place of their marks, each where it stands; the page in UTF-8."""
-        parts = re.split(f"{self._name}-([0-9]+)-", page)
-        texts = (binascii.b2a_base64(self._contents[int(part)], newline=False) for part in parts[1::2])
-        return b"".join(chain.from_iterable(zip_longest(map(str.encode, parts[::2]), texts, fillvalue=b"")))
-
-
 def view_page(data: ViewData) -> bytes:
     """Make the HTML page of a scene and its results, in UTF-8."""
-    payloads = Payloads()
     has_photos = any(view.photo is not None for view in data.views)
     sources = _sources(data, has_photos)
     right = min(int(has_photos) + 1, len(sources) - 1)
     left = max(right - 1, 0)
-    stills = [payloads.add_uris((view.photo, *view.stills)[not has_photos :]) for view in data.shown]
+    stills = [_picture_uris((view.photo, *view.stills)[not has_photos :]) for view in data.shown]
     start_stills = stills[data.start]
     first = {source: start_stills[source] for source in (left, right)}  # in the HTML itself, to appear at once
     start_stills[left] = start_stills[right] = None
 
-    def pictures(of_sides: Sequence[bytes | None], kind: str = "image/webp") -> list[str | None]:
+    def pictures(of_sides: Sequence[bytes | None]) -> list[str | None]:
         """Encode pictures of the sides; the photos, as a source, have none."""
-        return payloads.add_uris([None] * (len(sources) - len(of_sides)) + list(of_sides), kind)
+        return _picture_uris([None] * (len(sources) - len(of_sides)) + list(of_sides))
 
-    splats = {f"splats-{i}": payloads.add(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
-    engine = VIEWER.read_bytes() if splats else None
-    splats |= {
-        f"support-{i}": payloads.add(side.support) for i, side in enumerate(data.sides) if side.support is not None
-    }
+    splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     result_ids = range(min(len(data.sides) - 1, 1), len(data.sides))  # sides; a single scene counts as a result
     results = [_result(data, i) for i in result_ids]
     by_size = sorted(result_ids, key=lambda i: data.sides[i].num_gaussians)
@@ -111,29 +80,25 @@ def view_page(data: ViewData) -> bytes:
         stills=stills,
         speed_words=speed_words(results[0]["speed"]),
         agreement=agreement_words(data),
-        outlines=payloads.add_uris([view.outlines for view in data.shown], "image/png"),
-        drops=[pictures(view.drops, "image/png") for view in data.shown],
-        seen=[pictures(view.seen, "image/png") for view in data.shown],
-        faded=pictures(data.outside.faded),
         maps=[pictures(view.maps) for view in data.shown],
         splats=splats,
-        engine=engine and payloads.add(engine),
+        engine=base64_text(VIEWER.read_bytes()) if splats else None,
     )
-    return payloads.insert(page)
+    return page.encode()
+
+
+def _picture_uris(pictures: Sequence[bytes | None]) -> list[str | None]:
+    """Encode WebP pictures as ``data:`` addresses; None stays None."""
+    return [None if picture is None else data_uri(picture, "image/webp") for picture in pictures]
 
 
 def _sources(data: ViewData, has_photos: bool) -> list[dict[str, Any]]:
     """List the choices for the two sides of a page: the photos if there are any, and each scene."""
     picture = "own colours" if data.reference == ROW_COLORS else "photo"
-    sources: list[dict[str, Any]] = (
-        [{"name": picture, "splats": None, "count": 0, "dropped": {}, "seen": {}, "support": None}]
-        if has_photos
-        else []
-    )
+    sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0}] if has_photos else []
     return sources + [
         {
-            "name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians,
-            "dropped": side.dropped, "seen": side.seen, "support": None if side.support is None else f"support-{i}",
+            "name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians
         }
         for i, side in enumerate(data.sides)
     ]  # fmt: skip

@@ -6,22 +6,17 @@ from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
-import numpy as np
-
 from gsmerge.facts.place_cameras import place_viewpoints
-from gsmerge.facts.support import count_views_in_world
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.arrays import read_new_views
-from gsmerge.io.formats.sog import file_order, sog_bytes
+from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.table import Contents
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
-from gsmerge.pages.marks import MAX_SUPPORT
 from gsmerge.pages.page import VIEWER, base64_text, camera_numbers, data_uri, describe_gain, render_template
-from gsmerge.pages.splats import pack_support
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 
@@ -83,7 +78,6 @@ def site_contents(
     start = 0 if is_free else median_camera(viewpoints)  # the first placed viewpoint is outside
     poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]]).images[0]))
     views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWS)), start})
-    support = np.minimum(count_views_in_world(gaussians.numpy(), viewpoints[views]), MAX_SUPPORT).astype(np.uint8)
     licences = _read_licences()
     files = (sog_bytes(gaussians, comments), VIEWER.read_bytes(), poster, licences)
     contents = dict(zip(NAMES.values(), files, strict=True))
@@ -94,7 +88,6 @@ def site_contents(
         inside={} if apart else {NAMES[name]: base64_text(contents[NAMES[name]]) for name in ("engine", "scene")},
         gain=None if expected is None else describe_gain(*expected.bounds),
         download=f"{title}.sog",
-        support=base64_text(pack_support(support[file_order(gaussians)])) if (support == 0).any() else None,
         json_data={
             "names": NAMES, "free": is_free, "start": views.index(start),
             "views": [

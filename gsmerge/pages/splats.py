@@ -98,11 +98,6 @@ def drawn_rows(gaussians: Gaussians) -> np.ndarray:
     return np.flatnonzero(drawn)
 
 
-def pack_support(support: np.ndarray) -> bytes:
-    """Pack the number of views that show each Gaussian, ``[n]`` uint8, as a gzip stream of one byte per Gaussian."""
-    return spz.gzip_bytes(support.tobytes(), 9, zlib.Z_DEFAULT_STRATEGY)
-
-
 def _pixel_positions(rows: np.ndarray, means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:
     """Return pixels, shifts and log depths ``[4,m]`` of ``rows [m]`` with pixel ``ids [n]``; None if one is behind."""
     positions = np.empty((4, len(rows)), np.uint32)

@@ -29,7 +29,6 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 ONE_AT_A_TIME = 4_000_000  # Gaussians; larger scenes tile one view at a time, since a tiled view takes as much memory
 BAND_PIXELS = 1 << 22  # largest number of pixels drawn at once; larger images are drawn in bands to save memory
-MIN_ALPHA = 0.5  # least opacity of a pixel that counts when superpixels are merged
 
 
 def _needs_gradient(gaussians: Gaussians, cameras: Cameras) -> bool:
@@ -169,13 +168,6 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Seque
         return
     for view in view_ids:
         one_view(view)
-
-
-def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Render the mean depth ``[v,h,w]`` of every pixel, and a mask ``[v,h,w]`` of mostly opaque pixels."""
-    drawn = render(scene.gaussians, scene.cameras, near=NEAR_PLANE, with_depths=True)
-    assert drawn.depths is not None
-    return drawn.depths[..., 0], drawn.alphas[..., 0] > MIN_ALPHA
 
 
 def thin_out(gaussians: Gaussians, count: int) -> Gaussians:

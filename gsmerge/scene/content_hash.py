@@ -17,7 +17,7 @@ from gsmerge.io.cameras.long_lrm import FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
 from gsmerge.scene.photos import images_beside
 
-EXTRA_FILES = (DATAPARSER, *INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files
+EXTRA_FILES = (DATAPARSER, INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files
 
 
 def digest(value: Mapping[str, Any]) -> str:

@@ -378,7 +378,7 @@ def list_plys(folder: Path) -> list[Path]:
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
     plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)]
     plys = plys or _results_in(folder)
-    plys = plys or [path for path in [folder / META] if path.is_file() and find_format(path).holds(path)]
+    plys = plys or [path for path in [folder / META] if path.is_file() and may_hold_gaussians(path)]
     return plys or [folder / place for place in PLY_PLACES if (folder / place).is_file()][:1]
 
 

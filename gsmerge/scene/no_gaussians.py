@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -98,7 +99,7 @@ def _content(folder: Path) -> tuple[str, str] | None:
     foreign = next((path for path in sorted(folder.glob("[!.]*")) if path.suffix.lower() in FOREIGN), None)
     if foreign is not None:
         kind, remedy = FOREIGN[foreign.suffix.lower()]
-        return f"{kind} ({foreign.name})", remedy
+        return f"{kind} ({foreign.name})", remedy.format(path=shlex.quote(str(foreign)))
     has_photos = any(path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES for path in folder.glob("[!.]*"))
     return _PHOTOS if has_photos or any(list_images(folder / place) for place in IMAGE_PLACES) else None
 

@@ -25,7 +25,6 @@ MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # K differs between groups, and is one
 USUAL_K = 1  # the K of "auto", except for a single camera without a long fit
 NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours to compare; measurements: docs/internals/notebook.md
 CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, optionally with three angles in degrees"
-CROP_FILES = (".json", ".toml")  # endings of crop files; only the command line reads them
 CROP_NUMBERS = {"sphere": (4,), "box": (6, 9)}
 DROPS = ("floaters", "sky", "transparent", "unseen")
 
@@ -157,9 +156,8 @@ class CleanOptions(Settings):
     """Settings of clean-up: Gaussians to leave out of the result."""
 
     crop: str | None = setting(None, "Keep only the Gaussians inside sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in "
-        "the scene's world units, or inside the shape in a .json or .toml file. Counts, fit and scores are of these.",
-        "Three more numbers of a box turn it about its centre, in degrees about x, y and z. Only the command line "
-        "reads files.")  # fmt: skip
+        "the scene's world units. Counts, fit and scores are of these.",
+        "Three more numbers of a box turn it about its centre, in degrees about x, y and z.")  # fmt: skip
     drop: str | None = setting(None, "Kinds of Gaussians to leave out, separated by commas: floaters, sky, "
         "transparent, unseen.",
         "`floaters`: isolated, far beyond the scene, or huge and across it; `sky`: what is sky in the photos; "

@@ -33,7 +33,6 @@ def test_example_runs(
         run_here(monkeypatch, put_stand_in(tmp_path / "program", monkeypatch))
     text = getattr(gsmerge, name).__doc__
     monkeypatch.setattr(gsmerge, "compact", compact)
-    monkeypatch.setattr("gsmerge.pages.data.OUTLINE_SIDE", 48)
     example = doctest.DocTestParser().get_doctest(text, {"gsmerge": gsmerge}, name, None, 0)
     assert example.examples
     assert doctest.DocTestRunner().run(example).failed == 0

@@ -189,7 +189,7 @@ QUESTIONS = {
     "several photos of SHARP": "--images", "on a phone": "small.html", "floaters": "--drop floaters",
     "the sky": "--drop sky", "upside down": "--up", "my cameras": "cameras.json", "levels that stream": "lod-meta.json",
     "lose": "dB", "hundreds of views": "blocks", "Blender or Unity": "--up z", "commercially": "licences.md",
-    "Spark": "blurAmount: 0", "trained": "--budget", "join two scenes": "--translate", "Vision Pro": "usdz",
+    "Spark": "blurAmount: 0", "trained": "--budget", "join two scenes": "--translate",
     "train on": "colmap", "faster": "evaluate",
 }  # fmt: skip
 

@@ -76,7 +76,6 @@ def test_the_notebook_runs(root: Path, tmp_path: Path, monkeypatch: pytest.Monke
     It is stored without outputs. Two runs, two measurements and two pages take more than a second.
     """
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gsmerge.pages.data.OUTLINE_SIDE", 24)
     notebook = json.loads((root / "examples" / "notebook.ipynb").read_text(encoding="utf-8"))
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
     assert [(cell["outputs"], cell["execution_count"]) for cell in cells] == [([], None)] * len(cells)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from itertools import chain
 
-from . import arrays, cameras, gaussians, generic, json_cameras, photos, places, ply, sog, tables, tensors
+from . import arrays, cameras, gaussians, generic, json_cameras, photos, places, ply, sog, tensors
 from .case import Damage
 from .sounds import SOUNDS
 
-MODULES = (generic, ply, gaussians, sog, json_cameras, cameras, arrays, photos, tensors, tables, places)
+MODULES = (generic, ply, gaussians, sog, json_cameras, cameras, arrays, photos, tensors, places)
 DAMAGES: dict[str, tuple[str, Damage]] = {  # by its name: the kind of sound file, and what is done to it
     f"{kind}: {name}": (kind, damage)
     for kind, damages in chain.from_iterable(module.DAMAGES.items() for module in MODULES)

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import gzip
-import json
 import struct
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .case import Change, Damage, accept, allow, refuse
-from .changes import document, edit_bytes, edit_json, glb_bytes, pack_at, set_json, write, write_file
-from .sounds import SOME, SPLATTING, SPZ_IN_GLB
+from .changes import document, edit_bytes, edit_json, pack_at, set_json, write
+from .sounds import SOME
 
 SPZ_HEADER = struct.Struct("<3I4B")
 MAGIC = 0x5053474E
 RECORD = 0xADBE0003  # of SPZ_ADOBE_coordinate_system
 SIZES = slice(32, 32 + 16 * 6)  # the table of a file of version 4 with harmonics
 PLACE_OF_COUNT = 8
-PARTS, PART_GAUSSIANS = 40, 600_000  # parts that each keep to what a file may take, and together do not
+SPLATTING = "KHR_gaussian_splatting"
 DEEP = 100_000  # brackets, or nodes in one another
 
 
@@ -187,20 +185,6 @@ def show_twice(parsed: dict[str, Any]) -> None:
     parsed["nodes"] = [{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0}]
 
 
-def write_many_spz(path: Path) -> None:
-    """Many small ``.spz``, each of which unpacks to 12 MB."""
-    parsed, packed = json.loads(document(path.read_bytes())[0]), equal_bytes(PART_GAUSSIANS)
-    size = len(packed) + -len(packed) % 4
-    (one,) = parsed["meshes"][0]["primitives"]
-    views = [{"buffer": 0, "byteOffset": part * size, "byteLength": len(packed)} for part in range(PARTS)]
-    primitives = [json.loads(json.dumps(one)) for _ in range(PARTS)]
-    for part, primitive in enumerate(primitives):
-        primitive["extensions"][SPLATTING]["extensions"][SPZ_IN_GLB]["bufferView"] = part
-    parsed |= {"meshes": [{"primitives": primitives}], "bufferViews": views, "buffers": [{"byteLength": PARTS * size}]}
-    rest = struct.pack("<I4s", PARTS * size, b"BIN\0") + packed.ljust(size, b"\0") * PARTS
-    write_file(path, glb_bytes(json.dumps(parsed).encode(), rest))
-
-
 def of_glb() -> dict[str, Damage]:
     damages = {f"JSON of {value} bytes": refuse(pack_at(12, "<I", value)) for value in (0, 2**31, 2**32 - 1)}
     for value in (float("nan"), 1e300):
@@ -237,17 +221,6 @@ def of_glb() -> dict[str, Damage]:
     }
 
 
-def of_glb_of_spz() -> dict[str, Damage]:
-    view = ("bufferViews", 0)
-    return {
-        "a length of 10^9": refuse(set_json(*view, "byteLength", value=10**9), "truncated"),
-        "a negative offset": refuse(set_json(*view, "byteOffset", value=-900), "truncated"),
-        "an offset of 4": refuse(edit_json(lambda d: d["bufferViews"][0].update(byteOffset=4, byteLength=100)), "gzip"),
-        "forty .spz in one": refuse(write_many_spz, slow=True),
-        "another buffer": refuse(set_json(*view, "buffer", value=1), "truncated"),
-    }
-
-
 DAMAGES = {
-    "spz": of_spz(), "spz 4": of_spz4(), "splat": of_splat(), "glb": of_glb(), "glb of spz": of_glb_of_spz(),
+    "spz": of_spz(), "spz 4": of_spz4(), "splat": of_splat(), "glb": of_glb(),
 }  # fmt: skip

@@ -19,7 +19,7 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b
 PAGE = b"\n<!doctype HTML>\n<head><title>\n Virus scan\n warning</title></head>"
 
 # Endings of kinds
-WITH_JSON, ZIPPED, TEXTS = (".json", ".sog", ".glb"), (".sog", ".npz"), (".txt", ".log")
+WITH_JSON, ZIPPED, TEXTS = (".json", ".sog", ".glb"), (".sog", ".npz"), (".txt",)
 SCENES = (".ply", ".spz", ".splat", ".sog", ".npz", ".glb", ".gsm", ".safetensors")
 PARTS_MAY_BE_SOUND = (*TEXTS, ".splat")  # rows that are read one by one
 ASKED = ("SHARP", "dataparser")  # readers that are asked whether a file has what they know

@@ -80,39 +80,6 @@ def flip(place: int) -> Change:
     return edit_bytes(lambda data: data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
 
 
-def tiff(order: str, tags: list[tuple[int, int, int, int]]) -> bytes:
-    head = struct.pack(f"{order}2sHIH", b"II" if order == "<" else b"MM", 42, 8, len(tags))
-    return head + b"".join(struct.pack(f"{order}HHII", *tag) for tag in tags)
-
-
-def with_tags(order: str) -> bytes:
-    """A TIFF of 240 kB with 4,000 tags that refer to all of it, each."""
-    size, bytes_of_rows = 240_000, WIDTH * HEIGHT
-    rows = {256: WIDTH, 257: HEIGHT, 258: 8, 259: 1, 262: 1, 273: 100_000, 277: 1, 278: HEIGHT, 279: bytes_of_rows}
-    tags = [(tag, 4, 1, value) for tag, value in rows.items()] + [(1000 + i, 7, size - 8, 8) for i in range(4000)]
-    return tiff(order, tags).ljust(size, b"\0")
-
-
-def with_tile(side: int, order: str = "<", *more: tuple[int, int]) -> bytes:
-    """A TIFF of one tile of a few deflated zeros, by far larger than the image, and more tags."""
-    packed = zlib.compress(b"\0")
-    tags = [(256, WIDTH), (257, HEIGHT), (258, 8), (259, 8), (262, 1), (277, 1), (322, side), (323, side)]
-    tags += [(324, 8 + 2 + 12 * (len(tags) + 2 + len(more)) + 4), (325, len(packed)), *more]
-    return tiff(order, [(tag, 4, 1, value) for tag, value in tags]) + bytes(4) + packed
-
-
-def write_masks(data: bytes) -> Change:
-    """The bytes as the mask of every view."""
-
-    def change(path: Path) -> None:
-        folder = path.parent.with_name("masks")
-        folder.mkdir()
-        for name in NAMES:
-            (folder / name).with_suffix(".tiff").write_bytes(data)
-
-    return change
-
-
 def name_one_photo(path: Path) -> None:
     """300 frames that name the same photo of 4 million pixels of one colour, which has 0.2 kB."""
     scene = path.parent.parent
@@ -174,14 +141,6 @@ def of_other_formats() -> dict[str, Damage]:
         ".jpg": claim_jpeg_size(60_000, 60_000), ".bmp": put_numbers(18, "<ii", 60_000, 60_000),
         ".webp": put_numbers(26, "<HH", 16383, 16383), ".ppm": lambda data: data.replace(b"6 4", b"60000 60000", 1),
     }  # fmt: skip
-    tiffs: dict[str, Bytes] = {
-        "whose directory is itself": put_numbers(4, "<I", 0),
-        "whose directory is far away": put_numbers(4, "<I", 2**32 - 1),
-        "whose tags are all of it, little-endian": lambda _: with_tags("<"),
-        "whose tags are all of it, big-endian": lambda _: with_tags(">"),
-        "of a tile of 8192 x 8192": lambda _: with_tile(8192),
-        "of a tile of two sizes": lambda _: with_tile(8192, "<", (322, 16), (323, 16)),
-    }
     return {
         **{
             f"{suffix} that lies": (allow if suffix == ".webp" else refuse)(recode(suffix, lie), place=ALL)
@@ -189,18 +148,6 @@ def of_other_formats() -> dict[str, Damage]:
         },
         ".bmp upside down": accept(recode(".bmp", put_numbers(22, "<i", -HEIGHT))),
         ".bmp of least height": refuse(recode(".bmp", put_numbers(22, "<i", -(2**31))), place=ALL),
-        **{f".tiff {word}": refuse(recode(".tiff", change), place=ALL) for word, change in tiffs.items()},
-        **{
-            f".tiff masks of a tile of 26000 x 26000, {order}": refuse(
-                write_masks(with_tile(26_000, order)),
-                "view_000.tiff",
-                "26000 x 26000",
-                place="masks",
-                compacts=True,
-                slow=True,
-            )
-            for order in "<>"
-        },
     }
 
 

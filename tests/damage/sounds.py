@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import json
 import re
-import struct
 import tempfile
 import warnings
 import zipfile
@@ -42,8 +40,6 @@ from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io import read_cameras, read_gaussians, read_images
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.read import read_sharp_camera
-from gsmerge.io.crop_file import read_crop
-from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.kernels.matrices import invert
 from gsmerge.networks.checkpoint import load_checkpoint
@@ -54,15 +50,13 @@ from gsmerge.states.compactor import Compactor
 from gsmerge.states.state_file import load_state
 from gsmerge.types import Gaussians
 
-from .changes import glb_bytes, pack_members
+from .changes import pack_members
 
-SPLATTING = "KHR_gaussian_splatting"
-SPZ_IN_GLB = f"{SPLATTING}_compression_spz_2"
 NAMES = ("view_000.png", "view_001.png", "view_002.png")
 VIEW_NAMES = [Path(name).stem for name in NAMES]
 TINY = replace(make_tiny(6, 4), names=NAMES)
 SOME = random_gaussians(6, 0, degree=1)
-PHOTO_ENDINGS = ("png", "jpg", "bmp", "webp", "tiff", "ppm")
+PHOTO_ENDINGS = ("png", "jpg", "bmp", "webp", "ppm")
 COMPACT = ("compact", "--dry-run")
 PLAIN = re.compile(r"([\w-]+/){0,2}[\w-]+\.\w+")
 UNPACKING = (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError)
@@ -264,21 +258,6 @@ def write_sharp(folder: Path) -> None:
     )
 
 
-def write_glb_of_spz(folder: Path) -> None:
-    """Write a ``.glb`` whose Gaussians are a ``.spz`` inside, as Cesium's tiles have them."""
-    packed = spz_bytes(SOME)
-    packed += bytes(-len(packed) % 4)
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "extensions": {SPZ_IN_GLB: {"bufferView": 0}}}
-    document = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "extensionsUsed": [SPLATTING],
-        "nodes": [{"mesh": 0}], "buffers": [{"byteLength": len(packed)}],
-        "meshes": [{"primitives": [{"attributes": {}, "mode": 0, "extensions": {SPLATTING: splats}}]}],
-        "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": len(packed)}],
-    }  # fmt: skip
-    rest = struct.pack("<I4s", len(packed), b"BIN\0") + packed
-    (folder / "a.glb").write_bytes(glb_bytes(json.dumps(document).encode(), rest))
-
-
 def write_levels(folder: Path, leaves: int = 1) -> None:
     write_set(folder / "lod-meta.json", [random_gaussians(n, n) for n in (6, 3)], leaves=leaves)
 
@@ -333,21 +312,6 @@ def write_pose_list(folder: Path) -> None:
     lines = (" ".join(map(repr, pose[:3].reshape(-1).tolist())) for pose in TINY.c2w)
     (folder / "camera_poses.txt").write_text("".join(f"{line}\n" for line in lines))
     (folder / "intrinsic.txt").write_text(f"{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}\n")
-
-
-def write_pose_folder(folder: Path) -> None:
-    """Write a file for each pose."""
-    (folder / "pose").mkdir()
-    for view in range(2):
-        (folder / f"pose/{view}.txt").write_text(f"1 0 0 {view}\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-
-
-POSE_LISTS = {
-    "TUM": "# time x y z q\n1.5 0 0 1 0 0 0 1\n1.6 0 0 2 0 0 0 1\n",
-    "RealEstate10K": "https://a.b/c\n100 .9 .9 .5 .5 0 0 1 0 0 0 0 1 0 0 0 0 1 0\n"
-    "200 .9 .9 .5 .5 0 0 1 0 0 0 0 1 0 0 0 0 1 0\n",
-}
-LOG = "0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n1 1 2\n1 0 0 1\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 
 
 def write_moved(folder: Path) -> None:
@@ -417,7 +381,6 @@ def write_text(name: str, text: str) -> Make:
     return lambda folder: (folder / name).write_text(text)
 
 
-BOX = '{"shape": "box", "center": [0, 1, 2], "size": [1, 2, 3], "rotate": [0, 30, 0]}'
 PAIRS = 'k=2\nfit=none\nmin_opacity=0.01\nbudget=300\nquality=high\nphotos=null\nk="auto"\nlevels=1e3\n'
 PLAIN_SCENE, OF_CAMERAS = TINY.save, partial(TINY.save, cameras=False)
 INSPECT = ("inspect",)
@@ -437,7 +400,6 @@ SOUNDS: dict[str, Sound] = {
     "sog": Sound("a.sog", write_some("a.sog"), check_gaussians),
     "splat": Sound("a.splat", write_some("a.splat"), check_gaussians),
     "glb": Sound("a.glb", write_some("a.glb"), check_gaussians),
-    "glb of spz": Sound("a.glb", write_glb_of_spz, check_gaussians, rare=True),
     "levels": Sound("lod-meta.json", write_levels, check_gaussians, packed=True),
     "levels of a tree": Sound("lod-meta.json", partial(write_levels, leaves=2), check_gaussians, rare=True,
                               packed=True),
@@ -465,9 +427,6 @@ SOUNDS: dict[str, Sound] = {
     "Metashape": Sound("cameras.xml", write_metashape, check_metashape, INSPECT),
     "Metashape moved": Sound("cameras.xml", write_metashape_moved, check_metashape, INSPECT, rare=True),
     "Polycam": Sound("keyframes/corrected_cameras", FORMATS["Polycam"].write, check_cameras, (), packed=True),
-    "pose folder": Sound("pose", write_pose_folder, check_cameras, (), packed=True),
-    **{name: Sound("a.txt", write_text("a.txt", text), check_cameras, INSPECT) for name, text in POSE_LISTS.items()},
-    "Tanks and Temples": Sound("a.log", write_text("a.log", LOG), check_cameras, INSPECT),
     "predictions.npz": Sound("predictions.npz", write_vggt, check_arrays, INSPECT),
     "moved Long-LRM": Sound("opencv_cameras.json", write_moved, check_cameras, INSPECT, packed=True, rare=True),
     "dataparser": Sound("transforms.json", write_dataparser, lambda path: read_dataparser(path, path), (), packed=True),
@@ -479,13 +438,12 @@ SOUNDS: dict[str, Sound] = {
     "gsm of features": Sound("a.gsm", write_state("paper"), load_state, INSPECT),
     "checkpoint": Sound("a.safetensors", lambda folder: written(folder / "a.safetensors", noisy()), load_checkpoint,
                         INSPECT),
-    # Photos, crops and lists, which only their readers read
+    # Photos and lists, which only their readers read
     **{f"photo.{ending}": Sound("a.png", write_photo(ending), check_photo, ()) for ending in PHOTO_ENDINGS},
     **{f"photo of {kind}": Sound("a.png", write_photo("png", kind), check_photo, (), rare=True)
        for kind in ("grey", "alpha", "16 bits")},
     **{f"mask.{ending}": Sound("a.png", write_photo(ending), check_mask, (), rare=True) for ending in PHOTO_ENDINGS},
     "mask of alpha": Sound("a.png", write_photo("png", "alpha"), check_mask, (), rare=True),
-    "crop": Sound("a.json", write_text("a.json", BOX), read_crop, ()),
     "list": Sound("list.txt", write_text("list.txt", "a.ply\n# b\nscene c\n\nd.spz\n"), check_list, ()),
     "set": Sound("pairs.txt", write_text("pairs.txt", PAIRS), check_pairs, ()),
 }  # fmt: skip

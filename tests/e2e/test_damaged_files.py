@@ -43,7 +43,7 @@ OFTEN = (
     "splat: 1 TB of zeros", "gsm: 1 TB of zeros", "levels: a chunk by two names",
     "transforms: path that is a device, no images", "transforms: large model, 10,000 frames with poses",
     "COLMAP binary: 18446744073709551615 points", "views.npz: poses as objects", "results.npz: a bomb of floats",
-    "photos: a PNG that claims 60000 x 60000", "photos: .tiff masks of a tile of 26000 x 26000, <",
+    "photos: a PNG that claims 60000 x 60000",
     "scene: a folder with line breaks", "scene: scene.ply as a pipe", "scene: images as a loop",
     "scene: a device as cameras", "scene: the output a pipe",
 )  # fmt: skip

@@ -11,7 +11,7 @@ from sweeps import sweep
 
 from .conftest import Run
 
-FORMATS = ("a.ply", "a.sog", "a.spz", "a.splat", "a.glb", "a.usdc")
+FORMATS = ("a.ply", "a.sog", "a.spz", "a.splat", "a.glb")
 QUICK = ("--effort", "draft", "--set", "fit=none", "-q")
 
 

@@ -17,8 +17,6 @@ import pytest
 from damage import SOUNDS, places
 from damage.random_changes import mutate
 from forked_commands import CommandServer, Limits, refused_by_inspect
-from messages import says
-from tiny_scene import make_tiny
 
 from gsmerge.inspection.file_checks import check_content
 
@@ -107,12 +105,3 @@ def test_a_file_is_read_with_what_is_beside_it(smallest_scene: Path, tmp_path: P
     assert (alone.num_views, alone.count) == (3, whole.count)
     SOUNDS["views.npz"].make(folder)
     assert not check_content(folder / "views.npz").notes
-
-
-def test_all_scenes_of_a_chunk_are_read(tmp_path: Path) -> None:
-    from re10k_chunks import entry, save
-
-    one, other = entry(make_tiny(), "one"), entry(make_tiny(), "other")
-    assert check_content(save(tmp_path, one, other)).count == 6
-    problems = check_content(save(tmp_path, one, other | {"images": other["images"][:2]})).problems
-    assert says(problems[0], "", "3 images", "found 2")

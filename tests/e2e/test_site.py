@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -16,7 +15,6 @@ from browser import CHROMIUM, Browser, browser, needs_browser
 
 import gsmerge
 from gsmerge.measure.evaluate import near_plane
-from gsmerge.pages.site import site_contents
 from gsmerge.raster.metrics import psnr
 
 from .conftest import Run, assert_refused
@@ -132,31 +130,6 @@ def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
     tab.wait(SETTLED)
     box = tab.box("stage")
     assert psnr(tab.screenshot(*(box[name] for name in ("x", "y", "width", "height"))), drawn) > 30
-
-
-@needs_browser()
-def test_what_no_view_shows_can_be_made_faint(tab: Browser, small_scene: Path, tmp_path: Path) -> None:
-    """Every tenth Gaussian again, far behind all cameras: these alone become faint, and come back."""
-    scene = gsmerge.read_scene(small_scene)
-    some, forward = scene.gaussians[::10], scene.cameras.viewmats[:, 2, :3].mean(0)
-    behind = replace(some, means=some.means - 30 * forward.astype(np.float32))
-    both = gsmerge.Gaussians.concat([some, behind])
-    (tmp_path / "page.html").write_text(site_contents(both, scene.cameras, "both", (), apart=False)[0])
-    tab.open(tmp_path / "page.html")
-    tab.wait(SETTLED)
-    each = "mesh.forEachSplat((i, c, s, q, opacity) => all.push([c.x, c.y, c.z, opacity]))"
-    looks = f"(() => {{ const all = []; site.results.get(SCENE).{each}; return all; }})()"
-    plain = np.array(tab.run(looks))
-    tab.run("id('unseen').click()")
-    faint = np.array(tab.run(looks))
-    assert tab.run("[id('unseen').ariaPressed, id('unseen').hidden]") == ["true", False]
-    is_behind = ((plain[:, :3] - scene.cameras.centres.mean(0)) @ forward) < -5
-    lower = faint[:, 3] < 0.5 * plain[:, 3]
-    assert is_behind.sum() == len(some)
-    np.testing.assert_array_equal(lower[is_behind & (plain[:, 3] > 0.05)], True)
-    assert lower[~is_behind].mean() < 0.2  # what hides behind others in all views
-    tab.press("u")
-    np.testing.assert_array_equal(np.array(tab.run(looks)), plain)
 
 
 @needs_browser()

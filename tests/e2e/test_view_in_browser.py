@@ -35,7 +35,7 @@ FRESH = (
     "solid.request = () => {};"
     "for (const one of document.querySelectorAll('.handle, .tag, .back')) one.style.display = '';"
     "for (const name of ['borderRadius', 'width', 'margin']) stage.style[name] = '';"
-    "set('scheme', ''); set('order', 'worst'); set('outlines', ''); set('drops', ''); set('seen', ''); set('maps', '');"
+    "set('scheme', ''); set('order', 'worst'); set('maps', '');"
     "set('pixels', 'screen'); set('shape', 'splats');"
     "set('solid', ''); set('mode', 'swipe'); set('other', false); pick('left', 1); choose(2); zoomTo(1); swipeTo(0.5);"
     "jump(data.start); document.fullscreenElement && document.exitFullscreen(); scrollTo(0, 0)"
@@ -238,54 +238,6 @@ def test_the_speed_of_this_device_is_in_the_headline(opened: tuple[Browser, Any]
     tab.run("solid.software = true")
 
 
-def test_what_would_be_dropped_is_shown_in_colour(opened: tuple[Browser, Any]) -> None:
-    tab, _ = opened
-    assert tab.run("data.sources[3].dropped.floaters") > 0  # the one that reaches in from outside
-    tab.run("choose(3); jump(data.views.findIndex((_, i) => drops[i][3])); set('drops', '1')")
-    layer = "document.querySelector('#right-pane .drops')"
-    assert tab.run(f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/png')]") == [
-        False,
-        True,
-    ]
-    assert tab.run("id('legend').textContent").startswith("floaters: ")
-    tab.press("x")
-    assert tab.run(f"[{layer}.hidden, id('legend').hidden]") == [True, True]
-
-
-def test_what_no_view_shows_is_faint_from_outside(opened: tuple[Browser, Any]) -> None:
-    """In stills and in 3D, without a click after the step back; and in colour where one asks for it."""
-    tab, _ = opened
-    tab.run("choose(3); jump(data.start)")
-    assert tab.run("[data.sources[3].seen.none > 0, state.seen, seenOf(0)]") == [True, "", None]
-    tab.press("b")
-    assert tab.run("[state.seen, id('right').src === faded[3], id('seen-legend').hidden]") == ["fade", True, False]
-    assert tab.run("id('seen-legend').textContent").startswith("no view: ")
-    tab.press("b")
-    assert tab.run("[state.seen, id('seen-legend').hidden]") == ["", True]
-    where = "data.views.findIndex((named, i) => !named.outside && (seen[i] || [])[3])"
-    tab.run(f"jump({where}); set('seen', 'color')")
-    layer = "document.querySelector('#right-pane .seen')"
-    assert tab.run(f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/png')]") == [
-        False,
-        True,
-    ]
-    each = "mesh.forEachSplat((i, c, s, q, o, color) => all.push([o, color.r, color.g]))"
-    looks = f"(() => {{ const all = []; solid.results.get(3).{each}; return all; }})()"
-    tab.run("set('seen', ''); set('solid', '1')")
-    plain = np.array(tab.run(looks))
-    tab.run("set('seen', 'fade')")
-    faint = np.array(tab.run(looks))
-    tab.run("set('seen', 'color')")
-    colored = np.array(tab.run(looks))
-    tab.run("set('seen', '')")
-    none, one = (tab.run(f"data.sources[3].seen.{word} || 0") for word in ("none", "one"))
-    fainter = faint[:, 0] < 0.2 * plain[:, 0] + 0.01
-    assert 0 < fainter.sum() <= none
-    np.testing.assert_array_equal(faint[~fainter], plain[~fainter])
-    assert 0 < (np.abs(colored - plain).max(1) > 0.02).sum() <= none + one
-    np.testing.assert_array_equal(np.array(tab.run(looks)), plain)
-
-
 def test_a_map_of_likely_errors_lies_over_a_result(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     layer = "document.querySelector('#right-pane .maps')"
@@ -341,32 +293,13 @@ def test_keys(opened: tuple[Browser, Any]) -> None:
     assert tab.run("[...id('strip').children].filter(one => one.ariaCurrent === 'true').length") == 1
 
 
-@pytest.mark.slow
-def test_outlines_of_superpixels(opened: tuple[Browser, Any]) -> None:
-    """Lines that are a little off the photo's colours, on stills and in 3D, from the cameras of input photos."""
-    tab, _ = opened
-    tab.run(f"{BARE} set('mode', 'blink'); set('other', false); jump(data.views.findIndex(view => !view.held_out))")
-    for solid in ("''", "'1'"):
-        tab.run(f"set('solid', {solid})")
-        plain = picture(tab)
-        tab.press("o")
-        lines = np.abs(picture(tab) - plain)
-        assert 0.003 < lines.mean() < 0.15  # they are a pixel wide on pictures of 1,280
-        assert tab.run("document.querySelector('[data-set=outlines][data-value=\"1\"]').ariaPressed") == "true"
-        tab.run("jump(data.views.findIndex(view => view.held_out))")
-        assert tab.run("document.querySelector('#left-pane .outlines').hidden") is True
-        tab.press("o")
-        tab.run("jump(data.views.findIndex(view => !view.held_out))")
-        assert psnr(picture(tab), plain) > 45
-
-
 def test_grey_controls_say_why(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
-    tab.run("jump(data.views.findIndex(view => view.held_out)); set('solid', '')")
+    tab.run("jump(data.views.findIndex(view => view.outside)); set('solid', '')")
     grey = "[...document.querySelectorAll('button:disabled')].filter(one => one.checkVisibility())"
     assert tab.run(f"{grey}.length") >= 2
     assert tab.run(f"{grey}.every(one => one.title.length > 5)")
-    assert tab.run("document.querySelector('[data-set=outlines]').title") == "Held-out photos have no superpixels"
+    assert tab.run("document.querySelector('[data-set=maps]').title") == "From a photo's camera only"
     seen = "[...document.querySelectorAll('[data-set=shape], [data-set=pixels]')].map(one => one.checkVisibility())"
     assert tab.run(seen) == [False] * 4  # in 3D only
     tab.run("set('solid', '1')")
@@ -416,7 +349,7 @@ def test_a_phone(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     resize(tab, 390, 844)
     assert tab.box("stage")["y"] < 20
-    for control in ("id('left-source')", "id('right-source')", "document.querySelector('[data-set=drops]')"):
+    for control in ("id('left-source')", "id('right-source')", "document.querySelector('[data-set=maps]')"):
         assert 0 < tab.box(control)["y"] < 844
     for mode, shown in {"swipe": 2, "side": 2, "blink": 1, "difference": 2}.items():
         side = mode == "side"

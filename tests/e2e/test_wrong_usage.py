@@ -68,7 +68,7 @@ USAGE = {
     "compact room --set match=aab": "--set match*'aab'*perhaps aabb",
     "compact room -o -": "--output*got -",
     "compact room -o a.ksplat": "a.ksplat*.ply*lod-meta.json",
-    "convert room a.usda": "a.usda*ends in*.spz*.usdz",
+    "convert room a.usda": "a.usda*ends in*.spz*.glb",
     "compact room --set checkpoint=none --set require_checkpoint=true": 'require_checkpoint*"none"',
     "compact room --set method=magic": "--set method*random*'magic'",
     "compact room --set method=greedy --budget auto": "method greedy*budget auto",

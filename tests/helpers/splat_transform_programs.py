@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import struct
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -13,7 +12,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -22,7 +20,6 @@ from gsmerge.errors import UsageError
 from gsmerge.io.formats import sog, splat_transform
 from gsmerge.io.formats.arrays import Columns, to_columns
 from gsmerge.io.formats.splat_transform import VARIABLE, find_program
-from gsmerge.kernels import elementary
 
 NO_PROGRAM = "no splat-transform on the PATH, which .ci/splat-transform installs"
 EVERYWHERE = {"min": [-1e9] * 3, "max": [1e9] * 3}
@@ -115,74 +112,3 @@ def write_unbundled(folder: Path, columns: Columns, *, mip: bool = False) -> Non
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in sog.sog_files(columns, "mip" if mip else None).items():
         (folder / name).write_bytes(data)
-
-
-def write_sog_1(folder: Path, gaussians: Gaussians) -> None:
-    """Write a ``meta.json`` of version 1, without higher harmonics: scales and colours are bytes of a range."""
-    columns = to_columns(gaussians, 0)
-    write_unbundled(folder, columns)
-    meta = json.loads((folder / "meta.json").read_text())
-    opacities = columns.opacities.clip(1e-6, 1 - 1e-6)
-    logits = elementary.log(opacities / (1 - opacities))
-    count = len(columns)
-    document = {"quats": {**meta["quats"], "shape": [count, 4], "encoding": "quaternion_packed"}}
-    document["means"] = {**meta["means"], "shape": [count, 3]}
-    for key, values in {"scales": columns.log_scales, "sh0": np.concatenate([columns.sh0, logits[:, None]], 1)}.items():
-        low, high = values.min(0), values.max(0)
-        codes = np.rint(255 * (values - low) / np.maximum(high - low, 1e-9)).astype(np.uint8)
-        texture = np.full((-(-count // 4), 4, 4), 255, np.uint8)
-        texture.reshape(-1, 4)[:count, : values.shape[1]] = codes
-        _, data = cv2.imencode(".webp", texture[..., [2, 1, 0, 3]], [cv2.IMWRITE_WEBP_QUALITY, 101])
-        (folder / f"{key}.webp").write_bytes(data.tobytes())
-        document[key] = {"mins": low.tolist(), "maxs": high.tolist(), "files": [f"{key}.webp"]}
-    (folder / "meta.json").write_text(json.dumps(document))
-
-
-def write_ksplat(path: Path, gaussians: Gaussians) -> None:
-    """Write a ``.ksplat`` of one section that is not compressed, without higher harmonics."""
-    columns, count = to_columns(gaussians, 0), len(gaussians)
-    head, section = bytearray(4096), bytearray(1024)
-    struct.pack_into("<4B4IH", head, 0, 0, 1, 0, 0, 1, 1, count, count, 0)
-    struct.pack_into("<4IfH2xI4x2IH", section, 0, count, count, 256, 0, 5.0, 12, 0, 0, 0, 0)
-    rows = np.zeros(count, [("means", "<f4", 3), ("scales", "<f4", 3), ("quats", "<f4", 4), ("colors", "u1", 4)])
-    rows["means"], rows["scales"], rows["quats"] = columns.means, elementary.exp(columns.log_scales), columns.quats
-    rows["colors"] = np.rint(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1).clip(0, 1))
-    path.write_bytes(bytes(head) + bytes(section) + rows.tobytes())
-
-
-def write_lcc(folder: Path, gaussians: Gaussians) -> Path:
-    """Write a ``meta.lcc`` of two levels, the second with every fourth Gaussian, without higher harmonics."""
-    parts = [to_columns(part, 0) for part in (gaussians, gaussians[::4])]
-    scales = elementary.exp(parts[0].log_scales)
-    low, high = scales.min(), scales.max()
-    record = [("means", "<f4", 3), ("colors", "u1", 4), ("scales", "<u2", 3), ("quat", "<u4"), ("normal", "<u2", 3)]
-    data, index = b"", struct.pack("<2h", 0, 0)
-    for part in parts:
-        rows = np.zeros(len(part), record)
-        rows["means"] = part.means
-        rows["colors"] = np.rint(255 * np.concatenate([part.colors, part.opacities[:, None]], 1).clip(0, 1))
-        rows["scales"] = np.rint(65535 * (elementary.exp(part.log_scales) - low) / (high - low))
-        rows["quat"] = 3 << 30 | 512 << 20 | 512 << 10 | 512  # about the identity
-        index += struct.pack("<iqi", len(part), len(data), rows.nbytes)
-        data += rows.tobytes()
-    folder.mkdir(parents=True, exist_ok=True)
-    ranges = {"scale": (low, high), "shcoef": (-1, 1)}
-    attributes = [{"name": name, "min": [float(a)] * 3, "max": [float(b)] * 3} for name, (a, b) in ranges.items()]
-    meta = {"fileType": "Portable", "attributes": attributes, "splats": list(map(len, parts)), "totalLevel": 2}
-    (folder / "meta.lcc").write_text(json.dumps(meta))
-    (folder / "index.bin").write_bytes(index)
-    (folder / "data.bin").write_bytes(data)
-    return folder / "meta.lcc"
-
-
-def write_lcc2(folder: Path, gaussians: Gaussians) -> Path:
-    """Write a ``meta.lcc2`` of two levels, the second with every fourth Gaussian, as ``.sog`` files."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, part in {"fine": gaussians, "coarse": gaussians[::4]}.items():
-        (folder / f"{name}.sog").write_bytes(sog.sog_bytes(part))
-    fine = {"data": {"3dgs": {"name": 0}}}
-    root = {"splatFiles": ["fine.sog", "coarse.sog"], "child": [{"data": {"3dgs": {"name": 1}}, "child": [fine]}]}
-    counts = [len(gaussians), len(gaussians[::4])]
-    meta = {"totalSplats": sum(counts), "lodSplats": counts, "totalLevels": 2, "splatType": ".sog", "root": root}
-    (folder / "meta.lcc2").write_text(json.dumps(meta))
-    return folder / "meta.lcc2"

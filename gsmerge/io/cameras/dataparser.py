@@ -1,8 +1,7 @@
-"""Read how a program moved its cameras into the Gaussians' world, from a file of nerfstudio or Metashape."""
+"""Read how nerfstudio moved its cameras into the Gaussians' world."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +17,17 @@ DATAPARSER = "dataparser_transforms.json"
 
 
 def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
-    """Read the similarities that nerfstudio or Metashape may have applied to the cameras: candidates to be measured.
+    """Read the similarities that nerfstudio may have applied to the cameras: candidates to be measured.
 
     Nerfstudio's ``dataparser_transforms.json`` has the map into the Gaussians' world: X' = scale (transform [X; 1]).
     ``transform`` starts from the world of the capture. A ``transforms.json`` with ``applied_transform`` (and
-    ``applied_scale``) has poses that were moved by these already, so the second candidate undoes them. Metashape's
-    ``.xml`` has the map into the world of its exports, which apply it with or without its scale. Empty if there is no
-    such file. SceneError if a file lacks a rotation, shift and positive scale.
+    ``applied_scale``) has poses that were moved by these already, so the second candidate undoes them. Empty if
+    there is no such file. SceneError if a file lacks a rotation, shift and positive scale.
     """
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
     if path is None:
-        from gsmerge.io.cameras.metashape import read_metashape_world  # few files need it
-
-        world = read_metashape_world(cameras) if cameras is not None and cameras.suffix == ".xml" else None
-        return [] if world is None else [world, replace(world, scale=1.0, shift=world.shift / world.scale)]
+        return []
     data = read_json(path)
     with number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
         transform = _square(data["transform"])

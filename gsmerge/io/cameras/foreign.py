@@ -19,15 +19,14 @@ class Foreign(NamedTuple):
     files: str  # patterns of their names, separated by spaces
     program: str
     remedy: str  # the export of the program that is read
-    start: str = ""  # regular expression that is found in the first bytes of its files
+    start: str = ""  # regular expression that is found in the first bytes of its files, in which $ ends any line
 
 
-POSE_FOLDERS = ("pose", "poses")  # each has a file for each view
-# Places of intrinsics beside poses; the first existing place is read. A folder has a file for each view
-INTRINSICS = ("intrinsic.txt", "intrinsics.txt", "pred_intrinsics.txt", "intrinsic/intrinsic_color.txt", "intrinsics")
+INTRINSICS = "intrinsic.txt"  # of DA3-Streaming, beside its poses
 _DEPTH, _MAX_PATHS = 3, 10_000  # limits of the search for files of PROGRAMS: levels of folders, and paths
 _WRITE = "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
 _MODEL = f"name the COLMAP model that it was made from, or {_WRITE}"
+_NUMBER = r"[-+.\deE]+"
 _NERFSTUDIO = "`ns-process-data {}` of nerfstudio makes a transforms.json of it"
 _KAPTURE = "kapture_import_{}.py and kapture_export_colmap.py of kapture make a COLMAP model of it"
 _OPF = "export OPF from PIX4Dmatic, of which `opf2colmap` of pyopf makes a COLMAP model"
@@ -41,7 +40,7 @@ CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
     "cameras.json", "camera_params.json", "sparse/0", "sparse", "colmap/sparse/0", "colmap", "exports/npz/results.npz",
     "exports/mini_npz/results.npz", "results.npz", "cameras.npz", "camera_poses.txt", "keyframes/corrected_cameras",
-    "keyframes/cameras", "reconstruction.json", "opensfm/reconstruction.json", "cameras.xml", *POSE_FOLDERS, "0", ".",
+    "keyframes/cameras", "reconstruction.json", "opensfm/reconstruction.json", "cameras.xml", "0", ".",
 )  # fmt: skip
 PROGRAMS = (
     Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
@@ -63,7 +62,12 @@ PROGRAMS = (
     Foreign("cameras*.npz", "IDR, NeuS or DTU", _MODEL, "(world|scale|camera)_mat"),
     Foreign("metadata.json *.r3d", "Record3D", _NERFSTUDIO.format("record3d"), '^PK|"(poses|perFrameIntrinsicCoeffs)"'),
     Foreign("*.vrs *_loop_trajectory.csv", "Project Aria", _NERFSTUDIO.format("aria")),
-    Foreign("*.sens", "ScanNet", "its SensReader exports poses and intrinsics, which are read"),
+    Foreign("*.sens", "ScanNet", _WRITE),
+    Foreign("pose/*.txt poses/*.txt", "ScanNet, NSVF or SRN", _WRITE, rf"\A({_NUMBER}\s+){{3,15}}{_NUMBER}\s*$"),
+    Foreign("*.txt", "TUM, ORB-SLAM or MonST3R", "`evo_traj tum` of evo, with its option save_as_kitti, makes"
+            " lines of 12 numbers of it, which are read", rf"\A(#.*\n)*({_NUMBER}[ \t]+){{7}}{_NUMBER}\s*$"),
+    Foreign("*.txt", "RealEstate10K", _WRITE, rf"\Ahttps?:.*\n({_NUMBER}[ \t]+){{18}}{_NUMBER}\s*$"),
+    Foreign("*.log", "Open3D or Tanks and Temples", _WRITE, r"\A\d+[ \t]+\d+[ \t]+\d+\s*$"),
     Foreign("*.traj", "ARKitScenes", _WRITE), Foreign("*.jgz", "CO3D", _WRITE),
     Foreign("*.json", "Open3D", _WRITE, '"PinholeCamera'),
     Foreign("*.json", "3D Scanner App", _WRITE, '"cameraPoseARFrame"'),
@@ -78,32 +82,6 @@ PROGRAMS = (
     Foreign("*.psht", "Postshot", "name the cameras that were loaded into it"),
     Foreign("*.abc *.fbx *.chan *.blend *.ma", "3D programs", "BlenderNeRF, in Blender, writes transforms_train.json"),
 )  # fmt: skip
-
-# Words for positions, rotations and matrices, by which a text file of an unknown format shows that it has poses
-_POSITION = r'\b(position|location|translation|transform|[xyz]|([tp]|loc|pos)[_.]?x)\b|"t":'
-_ROTATION = r'\b(rotation|quaternion|orientation|transform|heading|omega|yaw|(q|r|rot|quat|rotation)[_.]?[wx])\b|"r":'
-_MATRIX = r"\b(extrinsics?|c2w|w2c|cam(era)?_?(to|2)_?world|world_?(to|2)_?cam(era)?|view_?matrix|poses?)\b\W*[\d{[]"
-
-
-def starts_like_poses(path: Path) -> bool:
-    """Return whether a text file seems to have camera poses, by words of its first bytes.
-
-    The first line of a table must have words for position and rotation. JSON and XML must have them several times, or a
-    word for a pose before a number.
-    """
-    suffix, text = path.suffix.lower(), read_start(path).decode("latin-1").lower().lstrip()
-    if suffix in (".csv", ".txt"):
-        return all(re.search(words, text.partition("\n")[0]) for words in (_POSITION, _ROTATION))
-    has_several_words = all(len(re.findall(words, text)) > 1 for words in (_POSITION, _ROTATION))
-    return suffix in (".json", ".xml") and (has_several_words or re.search(_MATRIX, text) is not None)
-
-
-def check_unknown(path: Path) -> None:
-    """Raise SceneError if a file of an unknown format seems to have camera poses."""
-    if starts_like_poses(path):
-        raise SceneError(
-            path, "expected cameras in a supported format, found poses in a format that is not known", _WRITE
-        )
 
 
 def check_program(place: Path) -> None:
@@ -125,4 +103,4 @@ def find_unread(place: Path) -> Path | None:
 
 def _is_of(path: Path, foreign: Foreign) -> bool:
     has_name = any(map(path.match, foreign.files.split())) and path.is_file()
-    return has_name and re.search(foreign.start, read_start(path).decode("latin-1")) is not None
+    return has_name and re.search(foreign.start, read_start(path).decode("latin-1"), re.MULTILINE) is not None

@@ -10,8 +10,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity
-from gsmerge.io.cameras.camera_file import check_count, make_similarity
+from gsmerge.io.cameras.camera_file import check_count
 from gsmerge.io.cameras.camera_source import CameraSource, number_errors
 from gsmerge.io.cameras.view_layout import Entry
 from gsmerge.io.xml_files import read_xml
@@ -57,24 +56,6 @@ def _sensor_values(sensor: Element) -> dict[str, Any]:
     fx, fy = numbers["f"] + numbers.get("b1", 0), numbers["f"]
     values |= {"width": float(size["width"]), "height": float(size["height"]), "fx": fx, "fy": fy}
     return values | {"type": sensor.get("type", "frame")}
-
-
-def read_metashape_world(path: Path) -> Similarity | None:
-    """Read the map from the cameras' world to the world of Metashape's other exports; None if the file has none."""
-    root, cameras = _largest_component(path)
-    component_id = cameras[0].get("component_id") if cameras else None
-    components = [component for component in root.iter("component") if component.get("id") == component_id]
-    transforms = (element.find("transform") for element in (*components, *root.iter("chunk")))
-    transform = next((element for element in transforms if element is not None), None)
-    if transform is None:
-        return None
-    text = "expected rotation, translation and scale of 'transform' as numbers"
-    with number_errors(path, text), np.errstate(all="ignore"):
-        R, shift, scale = (
-            np.array(transform.findtext(tag, default).split(), np.float64)
-            for tag, default in (("rotation", "1 0 0 0 1 0 0 0 1"), ("translation", "0 0 0"), ("scale", "1"))
-        )
-        return make_similarity(path, np.column_stack([R.reshape(3, 3), shift.reshape(3) / scale]), scale.item())
 
 
 def _largest_component(path: Path) -> tuple[Element, list[Element]]:

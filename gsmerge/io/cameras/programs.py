@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,17 +32,15 @@ def list_shots(source: CameraSource) -> list[Entry]:
 
 
 def list_keyframes(source: CameraSource) -> list[Entry]:
-    """List the views of a folder of Polycam, which has a file for each."""
-    paths = natural_order(source.path.glob("*.json"))
+    """List the views of a folder of Polycam, which has a file for each, with a key for each number of its pose."""
+    paths, entries = natural_order(source.path.glob("*.json")), list[Entry]()
     check_count(source.path, len(paths))
-    return [Entry(_read_object(path), name=path.stem, path=path) for path in paths]
-
-
-def _read_object(path: Path) -> dict[str, Any]:
-    values = read_json(path)
-    if not isinstance(values, dict):
-        raise SceneError(path, "expected an object with the values of a view, found something else")
-    return values
+    for path in paths:
+        with number_errors(path, f"view {path.stem}: expected an object with t_00 to t_23, among others"):
+            values = read_json(path)
+            pose = [[values[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
+        entries.append(Entry({**values, "transform": pose}, name=path.stem, path=path))
+    return entries
 
 
 def join_matrices(source: CameraSource) -> list[Entry]:

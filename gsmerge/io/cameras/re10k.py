@@ -5,7 +5,7 @@ torch's loader for weights reads them. It makes only containers, numbers and ten
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +37,16 @@ def read_re10k(source: CameraSource) -> StoredCameras:
         keys = ", ".join(key[:40] for entry in entries[:3] if isinstance(key := entry.get("key"), str))
         problem = f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)"
         raise SceneError(path, problem, "name the .ply as its scene is named")
-    return _read_scene(path, entries[0] if len(entries) == 1 else named[0])
-
-
-def read_scenes(path: Path) -> Iterator[StoredCameras]:
-    """Read the cameras and photos of all scenes of a chunk, as :func:`read_re10k`, one scene at a time."""
-    return (_read_scene(path, entry) for entry in _load(path))
+    entry = entries[0] if len(entries) == 1 else named[0]
+    rows = _rows(path, entry["cameras"])
+    names = [f"view {i}" for i in range(len(rows))]
+    photos = _photos(path, entry.get("images"), names)
+    size = photo_size(photos) or (0, 0)
+    views = [
+        StoredView(name, row[6:].reshape(3, 4), make_pinhole(*row[:4]), size)
+        for name, row in zip(names, rows, strict=True)
+    ]
+    return StoredCameras(views, photos)
 
 
 def _load(path: Path) -> list[Mapping[str, Any]]:
@@ -58,18 +62,6 @@ def _load(path: Path) -> list[Mapping[str, Any]]:
     if not entries or not all(isinstance(entry, Mapping) and "cameras" in entry for entry in entries):
         raise SceneError(path, "expected a list of scenes with 'key', 'cameras' and 'images', found something else")
     return entries
-
-
-def _read_scene(path: Path, entry: Mapping[str, Any]) -> StoredCameras:
-    rows = _rows(path, entry["cameras"])
-    names = [f"view {i}" for i in range(len(rows))]
-    photos = _photos(path, entry.get("images"), names)
-    size = photo_size(photos) or (0, 0)
-    views = [
-        StoredView(name, row[6:].reshape(3, 4), make_pinhole(*row[:4]), size)
-        for name, row in zip(names, rows, strict=True)
-    ]
-    return StoredCameras(views, photos)
 
 
 def _rows(path: Path, cameras: Any) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 from gsmerge.arguments import check_arguments
@@ -11,19 +10,8 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.camera_source import CameraSource, check_objects
-from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program, check_unknown, starts_like_poses
-from gsmerge.io.cameras.table import (
-    CAMERA_ENDINGS,
-    CAMERA_FORMATS,
-    CHUNK,
-    KEYFRAME,
-    LISTS_POSES,
-    LOG,
-    RE10K,
-    SHARP_PLY,
-    is_colmap,
-    is_keyframes,
-)
+from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program
+from gsmerge.io.cameras.table import CAMERA_ENDINGS, CAMERA_FORMATS, CHUNK, KEYFRAME, SHARP_PLY, is_colmap, is_keyframes
 from gsmerge.io.cameras.viewer_cameras import ENDING
 from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.runtime.plugins import lazy_functions
@@ -31,9 +19,9 @@ from gsmerge.types import StrPath
 
 _lazy = lazy_functions(__package__)
 holds_images = _lazy("npz_files.holds_images")
-_holds_poses, _read_scenes = _lazy("npz_files.holds_poses"), _lazy("re10k.read_scenes")
+_holds_poses = _lazy("npz_files.holds_poses")
 _MAX_CANDIDATES = 16  # files in a folder that are searched for cameras
-_CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt", LOG, ".csv")
+_CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt")
 
 
 def find_cameras(folder: Path) -> Path | None:
@@ -53,13 +41,12 @@ def _is_camera_folder(folder: Path) -> bool:
 def find_other_cameras(folder: Path) -> Path | None:
     """Find the only file in a folder that can be read as cameras, whatever its name.
 
-    If no file can be read, return the first file that starts like camera poses of an unknown program. None if there are
-    several files of cameras, or none.
+    None if there are several files of cameras, or none.
     """
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _CANDIDATE_ENDINGS)
-    files = [path for path in files if path.name not in INTRINSICS and not path.name.endswith(ENDING)]
+    files = [path for path in files if path.name != INTRINSICS and not path.name.endswith(ENDING)]
     files = [path for path in files if path.is_file()][:_MAX_CANDIDATES]
-    files = [path for path in files if holds_cameras(path)] or [*filter(starts_like_poses, files)][:1]
+    files = [path for path in files if holds_cameras(path)]
     return files[0] if len(files) == 1 else None
 
 
@@ -95,13 +82,12 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
         (5, 'transforms.json')
     """
     path = _resolve(Path(path))
-    ending = "" if path.is_dir() else path.suffix.lower().replace(LOG, ".txt")
+    ending = "" if path.is_dir() else path.suffix.lower()
     source = CameraSource(path, scene, folder)
     format_ = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
     if format_ is None:
         if isinstance(entries := source.json if ending == ".json" else None, list):
             check_objects(path, entries)
-        check_unknown(path)
         raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
     return format_.cameras(source)
 
@@ -130,21 +116,11 @@ def _folder_of(path: Path) -> Path | None:
     if path.suffix == ".json":
         is_keyframe = is_keyframes(path.parent) and KEYFRAME in CameraSource(path).object
         return path.parent if is_keyframe else None
-    in_model = path.with_suffix(".bin").name in MODEL_NAMES and is_colmap(path.parent)
-    if path.suffix not in (".bin", ".txt") or (not in_model and LISTS_POSES(path)):
+    if path.suffix not in (".bin", ".txt") or path.with_suffix(".bin").name not in MODEL_NAMES:
         return None
     if not is_colmap(path.parent):
-        check_unknown(path)
         raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
     return path.parent
-
-
-def read_all_cameras(path: Path) -> Iterator[CameraFile]:
-    """Read the cameras of a path as :func:`read_cameras`; of a ``.torch`` chunk, those of each of its scenes."""
-    if path.suffix.lower() == CHUNK and os.path.isfile(path):
-        yield from (RE10K.convert(path, scene) for scene in _read_scenes(path))
-    else:
-        yield read_cameras(path)
 
 
 def read_sharp_camera(path: Path) -> CameraFile | None:

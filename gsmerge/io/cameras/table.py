@@ -17,21 +17,13 @@ from gsmerge.io.cameras.embedded import SHARP, read_sharp
 from gsmerge.io.cameras.long_lrm import is_long_lrm, move_to_gaussians
 from gsmerge.io.cameras.programs import join_matrices, list_keyframes, list_shots, set_centred_size
 from gsmerge.io.cameras.read_views import read_views
-from gsmerge.io.cameras.view_layout import (
-    Matrix,
-    MatrixEntries,
-    Pinhole,
-    RotationAndShift,
-    ViewLayout,
-    rotation_of_vector,
-)
+from gsmerge.io.cameras.view_layout import Matrix, Pinhole, RotationAndShift, ViewLayout, rotation_of_vector
 from gsmerge.io.first_bytes import read_start
 from gsmerge.io.formats.table import STATE_ENDING
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
 
 _lazy = lazy_functions(__package__)
 CHUNK = ".torch"  # ending of re10k's chunks
-LOG = ".log"  # ending of Open3D's lists of poses, which are read as ``.txt``
 FFGS = "ffgs cameras.json"  # format of cameras whose photos were resized to cover the model's input, and cropped
 KEYFRAME = "t_00"  # key in files of Polycam, within their first bytes
 
@@ -51,12 +43,8 @@ class CameraFormat:
     def cameras(self, source: CameraSource) -> CameraFile:
         """Read the cameras of a file; SceneError if it is damaged or incomplete."""
         stored = read_views(source, self.read) if isinstance(self.read, ViewLayout) else self.read(source)
-        return self.convert(source.path, stored)
-
-    def convert(self, path: Path, stored: StoredCameras) -> CameraFile:
-        """Convert the cameras that a file stores; SceneError if one of them is invalid."""
         convention = stored.convention or self.convention
-        return make_camera_file(path, self.name, convention, stored.views, stored.images, stored.order)
+        return make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)
 
 
 def is_colmap(folder: Path) -> bool:
@@ -83,7 +71,7 @@ def _has_views_with(source: CameraSource, key: str) -> bool:
 
 _ARRAY_NAMES, _IS_DA3 = _lazy("npz_files.array_names"), _lazy("npz_files.is_da3")
 _READ_COLMAP, _READ_DA3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3")
-LISTS_POSES, _READ_POSES = _lazy("pose_lines.lists_poses"), _lazy("pose_lines.read_poses")
+_LISTS_POSES = _lazy("pose_lines.lists_poses")
 _READ_STATE = LazyFunction("gsmerge.io.formats.gsm", "read_views")
 
 _TRANSFORMS = ViewLayout(
@@ -137,10 +125,7 @@ _OPENSFM = ViewLayout(
     optional=("focal_y", "c_x", "c_y"),
 )
 _POLYCAM = ViewLayout(
-    views=list_keyframes,
-    pose=MatrixEntries([[f"t_{row}{column}" for column in range(4)] for row in range(3)]),
-    K=Pinhole("fx", "fy", "cx", "cy"),
-    size=("width", "height"),
+    views=list_keyframes, pose=Matrix("transform"), K=Pinhole("fx", "fy", "cx", "cy"), size=("width", "height")
 )
 _METASHAPE = ViewLayout(
     views=_lazy("metashape.list_cameras"),
@@ -157,10 +142,6 @@ SHARP_PLY = CameraFormat(
     SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
     "pixels of the photo", lambda file: read_sharp(file) is not None,
 )  # fmt: skip
-RE10K = CameraFormat(
-    "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`; needs torch", CHUNK,
-    _lazy("re10k.read_re10k"), W2C_OPENCV, "divided by the size",
-)  # fmt: skip
 # Rows are tried in this order; a file is read by the first row that has its ending and recognises it
 CAMERA_FORMATS = (
     CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(_READ_COLMAP, suffix=".bin"),
@@ -169,10 +150,9 @@ CAMERA_FORMATS = (
                  C2W_OPENGL, "pixels", lambda file: is_keyframes(file.path)),
     CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(_READ_COLMAP, suffix=".txt"),
                  W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".txt")),
-    CameraFormat("pose folder", "`pose/*.txt` of ScanNet, NSVF", "", _READ_POSES,
-                 C2W_OPENCV, "pixels, in `intrinsic.txt`; may be missing", lambda file: LISTS_POSES(file.path)),
-    CameraFormat("pose list", "poses of KITTI, TUM, RealEstate10K; `.log` of Open3D", ".txt", _READ_POSES, C2W_OPENCV,
-                 "as these"),
+    CameraFormat("pose list", "`camera_poses.txt` of DA3-Streaming, VGGT-Long: 12 or 16 numbers a line", ".txt",
+                 _lazy("pose_lines.read_poses"), C2W_OPENCV, "pixels, in `intrinsic.txt`; may be missing",
+                 lambda file: _LISTS_POSES(file.path)),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", _LONG_LRM, W2C_OPENCV, "pixels", is_long_lrm),
     CameraFormat("transforms.json", "`transforms.json` of nerfstudio, instant-ngp; `transforms_train.json` of Blender",
                  ".json", _TRANSFORMS, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
@@ -200,8 +180,9 @@ CAMERA_FORMATS = (
                  lambda file: _IS_DA3(file.path)),
     CameraFormat("npz of poses", "`.npz` of what VGGT, or MapAnything or AnySplat (camera-to-world), returns",
                  ".npz", _READ_DA3, W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
-    RE10K,
+    CameraFormat("re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`; needs torch", CHUNK,
+                 _lazy("re10k.read_re10k"), W2C_OPENCV, "divided by the size"),
     SHARP_PLY,
     CameraFormat("state", "inside a `.gsm` of gsmerge extend", STATE_ENDING, _READ_STATE, W2C_OPENCV, "pixels"),
 )  # fmt: skip
-CAMERA_ENDINGS = (*dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")), LOG)
+CAMERA_ENDINGS = tuple(dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")))

@@ -15,7 +15,7 @@ import numpy as np
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import motion_matrices
 from gsmerge.io.cameras.camera_file import StoredView
-from gsmerge.io.cameras.camera_source import CameraSource, convert, to_array, to_number
+from gsmerge.io.cameras.camera_source import CameraSource, convert, to_array
 
 Key = str | tuple[str, ...]  # a key, or several keys; the first key with a value counts
 
@@ -53,26 +53,6 @@ class Matrix:
     def _to_matrix(self, value: Any) -> np.ndarray:
         array = to_array(value)
         return array if self.shape is None else array.reshape(self.shape)
-
-
-@dataclass(frozen=True)
-class MatrixEntries:
-    """A matrix with a key for each of its numbers.
-
-    Args:
-        rows: The keys, row by row.
-    """
-
-    rows: Sequence[Sequence[str]]
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """The keys that a view must have."""
-        return tuple(key for row in self.rows for key in row)
-
-    def read(self, values: Mapping[str, Any]) -> np.ndarray:
-        """Read the matrix; errors as in :func:`convert`."""
-        return np.array([[convert(to_number, key, values[key]) for key in row] for row in self.rows])
 
 
 def rotation_of_matrix(numbers: np.ndarray) -> np.ndarray:
@@ -157,7 +137,7 @@ class ViewLayout:
         finish: A function that completes the views from other content of the file or folder; None: nothing to add.
     """
 
-    pose: Matrix | MatrixEntries | RotationAndShift
+    pose: Matrix | RotationAndShift
     K: Pinhole | Matrix
     views: str | Callable[[CameraSource], Sequence[Entry]] = ""
     name: Key = ()

@@ -39,7 +39,6 @@ SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 PLAIN_COLORS = (("red", "green", "blue"), ("r", "g", "b"))  # instead of SH0, in files of nerfstudio and of 4DGT
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
-FILTER = "filter_3D"  # of Mip-Splatting: standard deviation of the filter that is added to all scales
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of compressed PLYs
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
 MAX_STRAY = 0.01  # share of a column's values that may contradict the rest, because of roundings and damage
@@ -161,16 +160,11 @@ class Columns:
 
     def along_curve(self) -> Columns:
         """Return the rows in the order of a space-filling curve, which keeps neighbours in space close in the file."""
-        return self.take(curve_order(self.means))
+        return self.take(np.argsort(morton_codes(self.means), kind="stable"))
 
     def take(self, rows: np.ndarray) -> Columns:
         """Return the rows with the given indices, in that order."""
         return Columns(*(column[rows] for column in vars(self).values()))
-
-
-def curve_order(means: np.ndarray) -> np.ndarray:
-    """Return the order of centres ``[n,3]`` along a space-filling curve."""
-    return np.argsort(morton_codes(means), kind="stable")
 
 
 def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:
@@ -311,11 +305,6 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
         sh0=array(gaussians.sh0)[:, 0],
         harmonics=array(gaussians.shN)[:, : (degree + 1) ** 2 - 1],
     )
-
-
-def turn_half(columns: Columns) -> Columns:
-    """Rotate Gaussians by half a turn about z, from y down to y up."""
-    return turner(np.diag([-1.0, -1.0, 1.0]), columns.harmonics.shape[1])(columns)
 
 
 def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:

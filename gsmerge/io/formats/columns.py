@@ -35,6 +35,11 @@ COLUMN_KINDS = (
         remedy=_MOMENT,  # Gaussians of all times together are the scene at no time
     ),
     ColumnKind(
+        "Mip-Splatting's filter of all scales",
+        "filter_3D",
+        remedy="run create_fused_ply.py of Mip-Splatting, which applies it",
+    ),
+    ColumnKind(
         "anchors, from which a network makes Gaussians",
         r"f_(offset|anchor).*",
         remedy="save the Gaussians of that network as .ply",
@@ -85,7 +90,7 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
     _check_types(path, row)
     by_kind: dict[ColumnKind | None, list[str]] = {}
     for name in row.names or ():
-        if name in arrays.REQUIRED or name.startswith("f_rest_") or name == arrays.FILTER:
+        if name in arrays.REQUIRED or name.startswith("f_rest_"):
             continue
         kind = _find_kind(name)
         if kind is not None or row[name].kind == "f":
@@ -105,7 +110,7 @@ def _check_types(path: Path, row: np.dtype[np.void]) -> None:
     """Raise SceneError if columns of Gaussians are whole numbers; plain colours may be bytes."""
     colors = arrays.color_columns(row.names)
     for name in row.names or ():
-        dtype, is_used = row[name], name in (*arrays.REQUIRED, *colors, arrays.FILTER) or name.startswith("f_rest_")
+        dtype, is_used = row[name], name in (*arrays.REQUIRED, *colors) or name.startswith("f_rest_")
         is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
         if is_used and dtype.kind != "f" and not is_color_byte:
             type_name = _NUMBERS[dtype.kind][dtype.itemsize // 2]

@@ -3,8 +3,7 @@
 The axis y points up in glTF, and down in a ``.ply``. Therefore the writer rotates Gaussians by half a turn about z, and
 the reader rotates them back. Viewers that do not know the extension show points in the base colours.
 
-Drafts of the extension are read as well. They store logarithms of scales, recognised by negative values, and use the
-attributes ``_ROTATION``, ``_SCALE`` and ``COLOR_0``. Cesium writes a ``.spz`` instead of the values.
+Neither drafts of the extension are read, whose scales are logarithms, nor a ``.spz`` in place of the values.
 """
 
 from __future__ import annotations
@@ -21,9 +20,8 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
-from gsmerge.geometry import quat_to_rotmat, rgb_to_sh0
+from gsmerge.geometry import quat_to_rotmat
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
-from gsmerge.io.formats import spz
 from gsmerge.io.formats.arrays import (
     Columns,
     Packed,
@@ -32,7 +30,6 @@ from gsmerge.io.formats.arrays import (
     to_bytes,
     to_columns,
     to_stored,
-    turn_half,
     turner,
 )
 from gsmerge.kernels.elementary import exp, log, power
@@ -42,9 +39,9 @@ from gsmerge.types import Gaussians
 MAX_DEGREE = 3
 NAME = "KHR_gaussian_splatting"
 HARMONICS = [f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for degree in range(MAX_DEGREE + 1) for i in range(2 * degree + 1)]
+_OPACITY = f"{NAME}:OPACITY"
 COLOR_SPACE = "srgb_rec709_display"
-SPZ_NAMES = (f"{NAME}_compression_spz_2", f"{NAME}_compression_spz")  # extensions for a .spz in the binary chunk
-READ_EXTENSIONS = {NAME, *SPZ_NAMES, "KHR_mesh_quantization", "KHR_materials_unlit"}
+READ_EXTENSIONS = {NAME, "KHR_mesh_quantization", "KHR_materials_unlit"}
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # constants of glTF
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _WIDTHS = {name: width for width, name in _TYPES.items()}
@@ -64,7 +61,8 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     Rotations and opacities are 16-bit numbers, which the extension allows. All other values are float32.
     """
     columns = to_columns(gaussians, MAX_DEGREE)
-    attributes = _attributes(turn_half(columns))
+    half_turn = turner(np.diag([-1.0, -1.0, 1.0]), columns.harmonics.shape[1])  # from y down to y up
+    attributes = _attributes(half_turn(columns))
     views, accessors = _describe_arrays(list(attributes.values()))
     for name, bound in (("min", np.min), ("max", np.max)):  # glTF asks for the bounds of positions
         accessors[0][name] = bound(attributes["POSITION"], axis=0).tolist()
@@ -111,18 +109,14 @@ def _attributes(columns: Columns) -> dict[str, np.ndarray]:
         "POSITION": columns.means.astype("<f4"),
         f"{NAME}:ROTATION": np.rint(32767 * np.roll(columns.quats, -1, axis=1)).astype("<i2"),  # xyzw
         f"{NAME}:SCALE": exp(columns.log_scales).astype("<f4"),
-        f"{NAME}:OPACITY": padded_opacities[:, :1],
+        _OPACITY: padded_opacities[:, :1],
         HARMONICS[0]: columns.sh0.astype("<f4"),
     }
     for name, harmonic in zip(HARMONICS[1:], columns.harmonics.transpose(1, 0, 2), strict=False):
         values[name] = harmonic.astype("<f4")
-    rgba = np.concatenate([_to_linear(columns.colors.clip(0, 1)), columns.opacities[:, None]], 1)
-    return values | {"COLOR_0": to_bytes(255 * rgba)}
-
-
-def _to_linear(colors: np.ndarray) -> np.ndarray:
-    """Convert sRGB, 0 to 1, to linear light (IEC 61966-2-1), which glTF uses for vertex colours."""
-    return np.where(colors <= 0.04045, colors / 12.92, power((colors + 0.055) / 1.055, 2.4))
+    srgb = columns.colors.clip(0, 1)  # glTF uses linear light (IEC 61966-2-1) for vertex colours
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, power((srgb + 0.055) / 1.055, 2.4))
+    return values | {"COLOR_0": to_bytes(255 * np.concatenate([linear, columns.opacities[:, None]], 1))}
 
 
 def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:
@@ -150,8 +144,7 @@ def read_rows(path: Path) -> StoredRows:
         content = _Content(budget, file, document, file.tell(), budget.file_bytes)
         for primitive, transform in _walk_splats(document, budget):
             budget.check_steps(_STEPS_PER_PART * len(parts), "steps for meshes")
-            count_before = sum(part.count for part in parts)
-            parts.append(_read_splats(content, primitive, transform, sizes, count_before))
+            parts.append(_read_splats(content, primitive, transform, sizes))
     if not parts:
         problem = f"expected Gaussians ({NAME}), found a .glb of points or a mesh"
         raise SceneError(path, problem, "name the .ply that the model wrote beside it")
@@ -196,23 +189,6 @@ class _Content:
     end: int
     num_read: list[int] = field(default_factory=lambda: [0])  # bytes read so far, at most the size of the chunk
 
-    def packed(self, view_id: int) -> bytes:
-        """Read the bytes of a buffer view, which must lie in the chunk."""
-        view = self.document["bufferViews"][view_id]
-        at, size = self.start + view.get("byteOffset", 0), check_whole(view["byteLength"], "byteLength", 1)
-        self.num_read[0] += size
-        if view["buffer"] != 0 or "uri" in self.document["buffers"][0] or not self.start <= at <= self.end - size:
-            raise _ForeignError(
-                f"a truncated one, or a .spz in another file, of {self.end} bytes without {size} bytes of it"
-            )
-        return self._read(at, size)
-
-    def _read(self, at: int, size: int) -> bytes:
-        if self.num_read[0] > self.end - self.start:
-            raise _ForeignError("one that uses the same values several times")
-        self.file.seek(at)
-        return self.file.read(size)
-
     def values(self, accessor_id: int) -> _Values:
         """Read the values of an accessor, which must lie in the chunk."""
         accessor = self.document["accessors"][accessor_id]
@@ -230,7 +206,10 @@ class _Content:
         in_chunk = self.start <= at and at + span <= self.end
         if not row_bytes <= stride <= _MAX_STRIDE or not (in_view and in_chunk):
             raise _ForeignError(f"a truncated one, of {self.end} bytes without {count} values of {row_bytes} bytes")
-        rows = np.ndarray((count, width), dtype, self._read(at, span), strides=(stride, dtype.itemsize))
+        if self.num_read[0] > self.end - self.start:
+            raise _ForeignError("one that uses the same values several times")
+        self.file.seek(at)
+        rows = np.ndarray((count, width), dtype, self.file.read(span), strides=(stride, dtype.itemsize))
         return _Values(np.ascontiguousarray(rows), np.iinfo(dtype).max if accessor.get("normalized") else 1)
 
 
@@ -282,109 +261,57 @@ def _node_matrix(node: dict[str, Any]) -> np.ndarray:
     return matrix
 
 
-def _read_splats(
-    content: _Content, primitive: dict[str, Any], transform: np.ndarray, sizes: dict[str, int], count_before: int
-) -> Packed:
-    """Read one primitive, apply the matrix ``transform [4,4]``, and add its bytes to ``sizes`` by attribute.
-
-    ``count_before``: number of Gaussians in the primitives before it; all share the file's budget.
-    """
-    spz_extension = _find_spz(primitive["extensions"][NAME])
-    if spz_extension is None:
-        return _read_attributes(_Attributes(content, primitive.get("attributes", {}), sizes), transform)
-    packed = content.packed(spz_extension["bufferView"])
-    rows, _, _, spz_sizes = spz.unpack_rows(content.budget, packed, count_before)
-    sizes.update({name: sizes.get(name, 0) + size for name, size in spz_sizes.items()})
-    transform_columns = _transformer(transform, rows.num_higher)
-    return replace(rows, unpack=lambda block: transform_columns(rows.unpack(block)))
-
-
-def _find_spz(splats: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the extension of a primitive that names a ``.spz``; None if the values are stored as attributes."""
-    kernel, space = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
-    unknown = dict(splats.get("extensions") or {})
-    spz_extension = next((unknown.pop(name) for name in SPZ_NAMES if name in unknown), None)
-    if unknown or (kernel, space) != ("ellipse", COLOR_SPACE):
-        raise _ForeignError(f"Gaussians of another kind ({', '.join(map(str, unknown or (kernel, space)))})")
-    return spz_extension
-
-
 @dataclass(frozen=True)
 class _Attributes:
     """The attributes of a primitive; ``read`` adds the bytes of each to ``sizes``."""
 
     content: _Content
-    accessor_ids: dict[str, Any]  # by name of the attribute
+    ids: dict[str, Any]  # of accessors, by name of the attribute
     sizes: dict[str, int]  # bytes by attribute of Gaussians
 
-    def read(self, kind: str, width: int, *names: str) -> _Values:
-        """Read the first of the named attributes that exists, whose values have ``width`` numbers."""
-        name = next((name for name in names if name in self.accessor_ids), None)
-        if name is None:
-            raise _ForeignError(f"one whose Gaussians have no {names[0]}")
+    def read(self, kind: str, width: int, name: str) -> _Values:
+        """Read the attribute with a name, whose values have ``width`` numbers."""
+        if name not in self.ids:
+            raise _ForeignError(f"one whose Gaussians have no {name}")
         bytes_before = self.content.num_read[0]
-        values = self.content.values(self.accessor_ids[name])
+        values = self.content.values(self.ids[name])
         if values.stored.shape[1] != width:
             raise _ForeignError(f"one with {values.stored.shape[1]} numbers of {name} per Gaussian")
         self.sizes[kind] = self.sizes.get(kind, 0) + self.content.num_read[0] - bytes_before
         return values
 
 
-@dataclass(frozen=True)
-class _Colors:
-    """The attributes of colours and opacities: two attributes, or RGBA as ``sh0`` alone in drafts."""
-
-    sh0: _Values
-    opacities: _Values | None  # None: ``sh0`` is RGBA
-
-    @property
-    def attributes(self) -> list[_Values]:
-        return [self.sh0] if self.opacities is None else [self.sh0, self.opacities]
-
-    def unpack(self, block: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Return harmonics of degree 0 ``[b,3]`` and opacities ``[b]``."""
-        colors = self.sh0[block]
-        if self.opacities is None:
-            return rgb_to_sh0(colors[:, :3]), colors[:, 3]
-        return colors, self.opacities[block][:, 0]
-
-
-def _read_attributes(attributes: _Attributes, transform: np.ndarray) -> Packed:
-    """Read Gaussians that are stored as attributes, and apply the matrix ``transform [4,4]``."""
-    means, scales = attributes.read("means", 3, "POSITION"), attributes.read("scales", 3, f"{NAME}:SCALE", "_SCALE")
-    quats = attributes.read("quats", 4, f"{NAME}:ROTATION", "_ROTATION")
-    harmonic_names = _harmonic_names(attributes.accessor_ids)
-    if harmonic_names:
-        sh0, *harmonics = [attributes.read("shN" if i else "sh0", 3, name) for i, name in enumerate(harmonic_names)]
-        colors = _Colors(sh0, attributes.read("opacities", 1, f"{NAME}:OPACITY"))
-    else:
-        colors, harmonics = _Colors(attributes.read("sh0", 4, "COLOR_0"), None), []
+def _read_splats(content: _Content, primitive: dict[str, Any], transform: np.ndarray, sizes: dict[str, int]) -> Packed:
+    """Read one primitive, apply the matrix ``transform [4,4]``, and add its bytes to ``sizes`` by attribute."""
+    splats, attributes = primitive["extensions"][NAME], _Attributes(content, primitive.get("attributes", {}), sizes)
+    kind = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
+    if splats.get("extensions") or kind != ("ellipse", COLOR_SPACE):
+        raise _ForeignError(f"Gaussians of another kind ({', '.join(map(str, splats.get('extensions') or kind))})")
+    means, scales = attributes.read("means", 3, "POSITION"), attributes.read("scales", 3, f"{NAME}:SCALE")
+    quats, opacities = attributes.read("quats", 4, f"{NAME}:ROTATION"), attributes.read("opacities", 1, _OPACITY)
+    degree = max((degree for degree in range(MAX_DEGREE + 1) if HARMONICS[degree**2] in attributes.ids), default=0)
+    sh0, *harmonics = (attributes.read("shN" if i else "sh0", 3, HARMONICS[i]) for i in range((degree + 1) ** 2))
     count = len(means.stored)
-    if any(len(values.stored) != count for values in (quats, scales, *colors.attributes, *harmonics)):
+    if any(len(values.stored) != count for values in (quats, scales, opacities, sh0, *harmonics)):
         raise _ForeignError(f"one whose attributes do not all have {count} values, one per Gaussian")
-    are_logs, transform_columns = are_logarithms(scales.stored), _transformer(transform, len(harmonics))
+    if are_logarithms(scales.stored):
+        raise _ForeignError("one whose scales are below 0, as those of drafts of the extension")
+    transform_columns = _transformer(transform, len(harmonics))
 
     def unpack(block: slice) -> Columns:
-        sh0, opacities = colors.unpack(block)
-        no_harmonics = np.zeros((len(sh0), 0, 3))
+        means_block = means[block]
         return transform_columns(
             Columns(
-                means=means[block],
+                means=means_block,
                 quats=np.roll(quats[block], 1, axis=1),  # xyzw to wxyz
-                log_scales=scales[block] if are_logs else log(scales[block]),
-                opacities=opacities,
-                sh0=sh0,
-                harmonics=np.stack([values[block] for values in harmonics], 1) if harmonics else no_harmonics,
+                log_scales=log(scales[block]),
+                opacities=opacities[block][:, 0],
+                sh0=sh0[block],
+                harmonics=np.stack([np.zeros_like(means_block), *(values[block] for values in harmonics)], 1)[:, 1:],
             )
         )
 
     return Packed(count, len(harmonics), unpack)
-
-
-def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
-    """List the attributes of harmonics up to the highest degree that a primitive contains; empty for drafts."""
-    degrees = [degree for degree in range(MAX_DEGREE + 1) if HARMONICS[degree**2] in attributes]
-    return HARMONICS[: (max(degrees) + 1) ** 2] if degrees else []
 
 
 def _transformer(transform: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:

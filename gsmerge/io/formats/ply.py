@@ -12,14 +12,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import field
 from functools import partial
-from io import BufferedReader, BytesIO, FileIO, TextIOWrapper
-from itertools import islice
+from io import BufferedReader, FileIO, TextIOWrapper
 from pathlib import Path
 from types import MappingProxyType
 from typing import IO, Any, Literal
 
 import numpy as np
-from plyfile import PlyData, PlyElementParseError, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElementParseError, PlyParseError
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.frozen import dataclass
@@ -91,7 +90,7 @@ def _find_white(path: Path, rows: np.ndarray | arrays.PackedRows) -> tuple[float
     """Find the stored value of a full channel of plain colours; also return notes."""
     colors = arrays.color_columns(rows.dtype.names)
     float_colors = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
-    if float_colors and np.nanmedian(_read_column(path, rows, colors[0])) > 1:
+    if float_colors and np.nanmedian(read_columns(path, rows, colors[:1])[colors[0]]) > 1:
         return 255.0, [f"colours are read as 0 to 255, since half of the values of {colors[0]} are above 1"]
     return 1.0, []
 
@@ -106,10 +105,6 @@ def read_columns(path: Path, rows: np.ndarray | arrays.PackedRows, names: Sequen
             for name in names:
                 out[name][start : start + block_rows] = block[name]
     return out
-
-
-def _read_column(path: Path, rows: np.ndarray | arrays.PackedRows, name: str) -> np.ndarray:
-    return np.asarray(read_columns(path, rows, [name])[name])
 
 
 def _adapt_rows(rows: np.ndarray, *, white: float) -> np.ndarray:
@@ -238,9 +233,7 @@ def open_ply(path: Path) -> PlyData:
             start = file.read(MAX_HEADER_BYTES)
         if start[:4] not in (b"ply\n", b"ply\r"):
             raise no_ply(path)
-        end, text, elements = _check_header(start, budget)
-        if text and (table := _read_text(path, start[:end], elements)) is not None:
-            return table
+        end, text = _check_header(start, budget)
         with _stream(path, end, text=text) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of an empty list, or a number beyond the column's type
             data = PlyData.read(file, mmap="r")
@@ -261,41 +254,10 @@ def open_ply(path: Path) -> PlyData:
         raise SceneError(path, problem, _AGAIN) from error
 
 
-def _read_text(path: Path, header: bytes, elements: Sequence[_Element]) -> PlyData | None:
-    """Read a PLY file of text; None if it has lists, or a row that is not as the ``header`` says.
-
-    NumPy takes a quarter of the parser's time, but says less of faults.
-    """
-    if any(words[0] == "list" for element in elements for words in element.properties):
-        return None
-    without_rows = re.sub(rb"(?m)^(element\s+\S+\s+)\S+", rb"\g<1>0", header)
-    data = PlyData.read(_text_rows(BytesIO(without_rows)))
-    binary = path.open("rb")
-    with _text_rows(binary) as file, warnings.catch_warnings():
-        warnings.simplefilter("error")  # NumPy would take 1.5 for a whole number
-        binary.seek(len(header))
-        lines = iter(file.readline, "")
-        for table, element in zip(data.elements, elements, strict=True):
-            if element.count == 0:
-                continue
-            try:
-                rows = np.loadtxt(islice(lines, element.count), table.dtype(), comments=None, ndmin=1)
-            except (ValueError, Warning):
-                return None
-            if len(rows) < element.count:
-                return None
-            table.data = rows
-    return data
-
-
-def _text_rows(file: IO[bytes]) -> _TextRows:
-    return _TextRows(file, "ascii", "backslashreplace", newline="")
-
-
 def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
     """Open a PLY file for the parser, without bytes beyond ASCII in the header and without empty lines of text."""
     if text:
-        return _text_rows(path.open("rb"))
+        return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
     file = _BinaryRows(FileIO(str(path)))
     file.end = end
     return file
@@ -350,66 +312,49 @@ def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Call
         yield read
 
 
-def bytes_after_rows(path: Path) -> int:
-    """Count the bytes of a binary PLY file after its last row; 0 for text or list rows."""
-    with path.open("rb") as file:
-        end, is_text, _ = _check_header(file.read(MAX_HEADER_BYTES), budget := read_budget(path))
-    if is_text:
-        return 0
-    data = open_ply(path)
-    if any(isinstance(p, PlyListProperty) for element in data.elements for p in element.properties):
-        return 0
-    return budget.file_bytes - end - sum(element.data.nbytes for element in data.elements)
-
-
 def header_counts(path: Path) -> tuple[int, int]:
     """Return the numbers of Gaussians and of ``f_rest`` columns in a PLY file's header; zeros if unreadable."""
-    try:
-        check_file(path)  # reading a pipe would never end
-        with path.open("rb") as file:
-            header = file.read(1 << 16).partition(b"end_header")[0]
-    except (OSError, SceneError):
-        return 0, 0
-    match = re.search(rb"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
-    return int(match[1]) if match else 0, len(re.findall(rb"^property \S+ \w*f_rest_\d+\s*$", header, re.MULTILINE))
+    header = _read_start(path)
+    match = re.search(r"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
+    return int(match[1]) if match else 0, len(re.findall(r"^property \S+ \w*f_rest_\d+\s*$", header, re.MULTILINE))
 
 
 def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
-    """Guess from the first 4 KiB of a PLY file whether it is a result of gsmerge, has Gaussians, or has other columns.
+    """Guess from the header of a PLY file whether it is a result of gsmerge, has Gaussians, or has other columns.
 
     A file that cannot be read, or has a longer header, counts as Gaussians.
     """
-    header, end = _read_start(path)
+    header = _read_start(path)
     if arrays.RESULT_COMMENT in _list_comments(header):
         return "result"
-    columns = re.findall(rb"^property .*?(\w+)\s*$", header, re.MULTILINE) if end else []
-    expected = (b"scale_", b"rot_", b"f_dc_", b"packed_")
+    columns = re.findall(r"^property .*?(\w+)\s*$", header, re.MULTILINE)
+    expected = ("scale_", "rot_", "f_dc_", "packed_")
     has_gaussians = any(stem in name for name in columns for stem in expected)  # names may have a prefix
     return "Gaussians" if has_gaussians or not columns else "other"
 
 
 def is_file_from_gsmerge(path: Path) -> bool:
-    """Return whether the comments of a PLY file say that gsmerge wrote it, in the first 4 KiB."""
-    return is_from_gsmerge(_list_comments(_read_start(path)[0]))
+    """Return whether the comments of a PLY file say that gsmerge wrote it."""
+    return is_from_gsmerge(_list_comments(_read_start(path)))
 
 
-def _read_start(path: Path) -> tuple[bytes, bytes]:
-    """Return the first 4 KiB of a PLY header without its last line, and that line; both are empty if unreadable."""
+def _read_start(path: Path) -> str:
+    """Return a PLY file's header, of at most 64 KiB; empty if it is longer or unreadable."""
     try:
-        check_file(path)
+        check_file(path)  # reading a pipe would never end
         with path.open("rb") as file:
-            header, end, _ = file.read(1 << 12).partition(b"end_header")
+            header, end, _ = file.read(1 << 16).decode("latin-1").partition("end_header")
     except (OSError, SceneError):
-        return b"", b""
-    return header, end
+        return ""
+    return header if end else ""
 
 
-def _list_comments(header: bytes) -> list[str]:
-    return [text.decode("latin-1") for text in re.findall(rb"^comment (.*?)\s*$", header, re.MULTILINE)]
+def _list_comments(header: str) -> list[str]:
+    return re.findall(r"^comment (.*?)\s*$", header, re.MULTILINE)
 
 
-def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool, list[_Element]]:
-    """Return the size of a header in bytes, whether rows are text, and the elements.
+def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
+    """Return the size of a header in bytes, and whether rows are text.
 
     SceneError if the file is too short for its rows. ``start``: the first bytes of the file. The parser checks the rest
     of the header.
@@ -433,7 +378,7 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool, list[_El
         if bytes_left < -1:  # the last row of a text may end without a new line
             expected = f"element '{element.name}' with {element.count} rows"
             raise _truncated(path, expected, bytes_before // row_bytes, "early end of file")
-    return end + len(last_line), is_text, elements
+    return end + len(last_line), is_text
 
 
 @dataclass(frozen=True)

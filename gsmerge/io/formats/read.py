@@ -109,9 +109,9 @@ def degree_notes(info: FileInfo) -> tuple[str, ...]:
 def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto") -> GaussianFile:
     """Read a PLY file of Gaussians, binary or ascii, with harmonics of any degree up to 4.
 
-    The column ``filter_3D`` is applied to scales and opacities; other additional columns are not used. Without
-    harmonics of degree 0, colours may be red, green and blue, or r, g and b (bytes, or floats in [0, 1]). 2D Gaussians
-    have two scales; their third scale becomes a thousandth of the smaller one.
+    Additional columns are not used. Without harmonics of degree 0, colours may be red, green and blue, or r, g and b
+    (bytes, or floats in [0, 1]). 2D Gaussians have two scales; their third scale becomes a thousandth of the smaller
+    one.
 
     Args:
         path: The file.
@@ -152,11 +152,10 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto", scales
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto") -> GaussianFile:
     """Read a file of Gaussians; the ending of its name tells the format.
 
-    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``. The finest
-    level of a ``lod-meta.json`` is read. splat-transform reads ``.ksplat``, ``meta.json`` or its folder,
-    ``.lcc`` and ``.lcc2``. Everything else is read by :func:`read_ply`; only this uses ``opacity``
-    and ``scales``. SceneError if the file cannot be read, is damaged, or holds no finite Gaussian. ValueError for an
-    unknown ``opacity`` or ``scales``.
+    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2)and ``.glb``. The
+    finest level of a ``lod-meta.json`` is read; ``meta.json`` or its folder is a ``.sog`` without its zip. Everything
+    else is read by :func:`read_ply`; only this uses ``opacity`` and ``scales``. SceneError if the file cannot be read,
+    is damaged, or holds no finite Gaussian. ValueError for an unknown ``opacity`` or ``scales``.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
@@ -191,12 +190,12 @@ def convert_files(
     empty = find_empty(path, out)
     encoding, is_guess = _choose_encoding(paths, parts, out["opacities"], empty, opacity)
     _activate(out["opacities"], out["valid"], encoding)
-    filter_notes = _apply_filter(out) if arrays.FILTER in out else ()
     num_nonfinite = clear_invalid(path, out)
     clear_rows(out, empty)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
     if byte_columns == arrays.NORMALS:
         _spread_low_degree(out["shN"])
+    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS}
     info = FileInfo(
         path=str(path),
         layout=stored.layout,
@@ -205,7 +204,7 @@ def convert_files(
         file_bytes=file_bytes,
         bytes_by_attribute={name: sum(part.sizes[name] for part in parts) for name in stored.sizes},
         columns=names,
-        extra_columns=_extra_columns(names),
+        extra_columns=tuple(name for name in names if name not in used and not name.startswith("f_rest_")),
         extra_elements=stored.extra_elements,
         byte_columns=byte_columns,
         comments=stored.comments,
@@ -217,13 +216,13 @@ def convert_files(
         num_clipped_scales=num_clipped,
         num_zero_quats=max(0, num_zero_quats - len(empty)),  # empty rows usually have zero quaternions
         odd_scales="" if judgement.linear else judgement.why,
-        adapted=(*filter_notes, *scale_notes, *stored.notes, *_describe_incomplete(out["valid"])),
+        adapted=(*scale_notes, *stored.notes, *_describe_incomplete(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
 
 def _make_arrays(dtype: np.dtype[Any], n: int, file_bytes: int) -> dict[str, np.ndarray]:
-    """Make the uninitialised arrays of ``n`` Gaussians, with ``valid`` and the filter if the file has one.
+    """Make the uninitialised arrays of ``n`` Gaussians, with ``valid``.
 
     ``dtype``: the columns of the stored rows. ``file_bytes``: the size of the files, which bounds arrays in memory.
     """
@@ -233,8 +232,7 @@ def _make_arrays(dtype: np.dtype[Any], n: int, file_bytes: int) -> dict[str, np.
     shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
     max_bytes = arrays.max_array_bytes(file_bytes)
     out = {"means": make_array((n, 3), np.float64 if has_float64 else np.float32), "valid": np.empty(n, np.bool_)}
-    out |= {name: make_array(shape, np.float32, max_bytes) for name, shape in shapes.items()}
-    return out | ({arrays.FILTER: np.empty(n, np.float32)} if arrays.FILTER in names else {})
+    return out | {name: make_array(shape, np.float32, max_bytes) for name, shape in shapes.items()}
 
 
 def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray]) -> tuple[int, int]:
@@ -276,12 +274,6 @@ def _with_linear_scales(part: StoredRows) -> StoredRows:
     return replace(part, adapt=lambda rows: log_of_scales(rows) if adapt is None else adapt(log_of_scales(rows)))
 
 
-def _extra_columns(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the columns that do not belong to Gaussians, in the file's order."""
-    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS, arrays.FILTER}
-    return tuple(name for name in names if name not in used and not name.startswith("f_rest_"))
-
-
 def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
     """Fill arrays with the rows of a file; return the numbers of clipped Gaussians and of zero quaternions."""
     n, block_rows = len(stored.rows), max(1, ply.BLOCK_BYTES // stored.rows.dtype.itemsize)
@@ -290,11 +282,7 @@ def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) ->
         def convert(start: int) -> tuple[int, int]:
             block = slice(start, min(start + block_rows, n))
             rows = read(block) if stored.adapt is None else stored.adapt(read(block))
-            out_block = {name: array[block] for name, array in out.items()}
-            if arrays.FILTER in out_block:
-                with np.errstate(all="ignore"):
-                    out_block[arrays.FILTER][:] = rows[arrays.FILTER]
-            counts = _convert(rows, out_block)
+            counts = _convert(rows, {name: array[block] for name, array in out.items()})
             if start % FREED_ROWS < block_rows:  # the first block after every FREED_ROWS rows
                 free_pages(out.values())
             return counts
@@ -335,67 +323,38 @@ def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
     )
 
 
-class _FloatColumns:
-    """The columns of rows as float32, which records the rows that need a closer check or were clipped."""
-
-    def __init__(self, rows: np.ndarray) -> None:
-        self.rows = rows
-        self.total = np.zeros(len(rows), np.float32)  # not finite if any column read so far is not finite
-        self.clipped = np.zeros(len(rows), np.bool_)
-
-    def read(self, name: str) -> np.ndarray:
-        """Return a column as float32."""
-        column = self.rows[name].astype(np.float32)
-        np.add(self.total, column, out=self.total)
-        return column
-
-    def read_clipped(self, name: str, limit: float) -> np.ndarray:
-        """Return a column as float32 within +-``limit``."""
-        column = self.read(name)
-        size = np.abs(column)
-        if not size.max() <= limit:  # also for NaN
-            np.logical_or(self.clipped, size > limit, out=self.clipped)
-            np.clip(column, -limit, limit, out=column)
-        return column
-
-
 def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays of rows of any kind, column by column; return counts as :func:`_convert_file`."""
-    columns, num_higher = _FloatColumns(rows), out["shN"].shape[1]
+    """Fill the arrays of rows of any kind; return counts as :func:`_convert_file`.
+
+    A row is valid if all its values are finite, except for infinite logits and scales of zero.
+    """
+    color_names, num_higher = arrays.color_columns(rows.dtype.names), out["shN"].shape[1]
+    rest_names = [f"f_rest_{channel * num_higher + j}" for j in range(num_higher) for channel in range(3)]
+
+    def read(names: Sequence[str]) -> np.ndarray:
+        values = np.empty((len(rows), len(names)), np.float32)
+        for j, name in enumerate(names):
+            values[:, j] = rows[name]
+        return values
+
     with np.errstate(all="ignore"):
+        means, colors, rest, quats = (read(names) for names in (arrays.MEANS, color_names, rest_names, arrays.QUATS))
+        log_scales, opacities = read(arrays.SCALES), read(["opacity"])[:, 0]
+        finite = [np.isfinite(values).all(1) for values in (means, colors, rest, quats)]
+        out["valid"][:] = np.logical_and.reduce([*finite, ~np.isnan(opacities), (log_scales < np.inf).all(1)])
+        limits = ((colors, MAX_HARMONIC), (rest, MAX_HARMONIC), (log_scales, arrays.MAX_LOG_SCALE))
+        is_clipped = np.logical_or.reduce([(np.abs(values) > limit).any(1) for values, limit in limits])
+        for values, limit in limits:
+            np.clip(values, -limit, limit, out=values)
         for j, name in enumerate(arrays.MEANS):
-            column = columns.read(name)
-            out["means"][:, j] = column if out["means"].dtype == np.float32 else rows[name]
-        for j, name in enumerate(arrays.color_columns(rows.dtype.names)):
-            column = columns.read_clipped(name, MAX_HARMONIC)
-            if name not in arrays.SH0:
-                column = rgb_to_sh0(column / (255 if rows.dtype[name].kind == "u" else 1))
-            out["sh0"][:, 0, j] = column
-        for channel in range(3):
-            for j in range(num_higher):
-                name = f"f_rest_{channel * num_higher + j}"
-                out["shN"][:, j, channel] = columns.read_clipped(name, MAX_HARMONIC)
-        for j, name in enumerate(arrays.SCALES):
-            out["scales"][:, j] = exp(columns.read_clipped(name, arrays.MAX_LOG_SCALE))
-        zero_quats = _normalise([columns.read(name) for name in arrays.QUATS], out["quats"])
-        out["opacities"][:] = columns.read("opacity")
-        valid = np.isfinite(columns.total, out=out["valid"])
-        doubtful = np.flatnonzero(~valid)  # the sum also overflows, or has an infinite logit or log scale
-        if len(doubtful):
-            valid[doubtful] = _are_usable(rows[doubtful], num_higher)
-    return int((columns.clipped & valid).sum()), int((zero_quats & valid).sum())
-
-
-def _are_usable(rows: np.ndarray, num_higher: int) -> np.ndarray:
-    """Return which rows are usable: all values are finite, except for infinite logits and scales of zero."""
-    valid = ~np.isnan(rows["opacity"].astype(np.float32))
-    colors = arrays.color_columns(rows.dtype.names)
-    for name in (*arrays.MEANS, *colors, *arrays.QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
-        valid &= np.isfinite(rows[name].astype(np.float32))
-    for name in arrays.SCALES:
-        column = rows[name].astype(np.float32)
-        valid &= np.isfinite(column) | (column == -np.inf)
-    return valid
+            out["means"][:, j] = rows[name]
+        for j, name in enumerate(color_names):
+            full = 255 if rows.dtype[name].kind == "u" else 1
+            out["sh0"][:, 0, j] = colors[:, j] if name in arrays.SH0 else rgb_to_sh0(colors[:, j] / full)
+        out["shN"][:] = rest.reshape(out["shN"].shape)
+        out["scales"][:], out["opacities"][:] = exp(log_scales), opacities
+        is_zero = _normalise(list(quats.T), out["quats"])
+    return int((is_clipped & out["valid"]).sum()), int((is_zero & out["valid"]).sum())
 
 
 def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
@@ -461,21 +420,6 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
         opacities[:] = exp(np.negative(opacities, out=opacities))
         np.add(opacities, 1, out=opacities)
         np.reciprocal(opacities, out=opacities)
-
-
-def _apply_filter(out: dict[str, np.ndarray]) -> tuple[str]:
-    """Add the filter of Mip-Splatting to the scales, and reduce opacities by the growth; return a note."""
-    widths, scales, max_scale = out.pop(arrays.FILTER), out["scales"], np.float32(exp(arrays.MAX_LOG_SCALE))
-    out["valid"] &= np.isfinite(widths)
-
-    def widen(start: int) -> None:
-        block = slice(start, start + FREED_ROWS)
-        before, added = scales[block].copy(), np.minimum(np.abs(widths[block]), max_scale)[:, None]
-        scales[block] = np.sqrt(before * before + added * added)
-        out["opacities"][block] *= (before / scales[block]).prod(1)
-
-    parallel_map(widen, range(0, len(widths), FREED_ROWS))
-    return (f"the column {arrays.FILTER} of Mip-Splatting is applied to scales and opacities",)
 
 
 def _check_raw(path: Path, opacities: np.ndarray) -> None:

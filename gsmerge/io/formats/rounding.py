@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from tempfile import TemporaryDirectory
-
 import numpy as np
 
 from gsmerge.arrays import distinct
 from gsmerge.geometry import medians
-from gsmerge.io.formats.read import read_gaussians
 from gsmerge.io.formats.table import PLY, output_format
-from gsmerge.io.formats.write import write_gaussians
 from gsmerge.types import Gaussians, StrPath
 
 # Renders change above this mean square of the moves of Gaussians: by .05 dB of 27. A move is in units of the Gaussian's
@@ -25,7 +20,8 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
     if len(gaussians) == 0:
         return []
     format_, columns = output_format(path, levels=True, cameras=True), gaussians.numpy()
-    rows = _sample_rows(columns.means)
+    extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # from them formats choose their steps
+    rows = distinct(np.concatenate([np.arange(0, len(gaussians), len(gaussians) // SAMPLE + 1), *extremes]))
     means, (x, y, z) = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0).T
     sizes = np.maximum(np.minimum(x, y), np.minimum(np.maximum(x, y), z))  # the second largest
     with np.errstate(over="ignore"):
@@ -41,20 +37,3 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
         remedy = ("" if format_.round_means is PLY.round_means else "write a .ply, or ") + "crop far Gaussians"
     problem = f"positions so far from the origin lose digits in {format_.ending}"
     return [f"{problem}, and Gaussians move by about {100 * mean_square**0.5:.0f} % of their size; {remedy}"]
-
-
-def _sample_rows(means: np.ndarray) -> np.ndarray:
-    """Return evenly spaced rows, and the rows with the extreme positions, from which formats choose their steps."""
-    extremes = means.argmin(axis=0), means.argmax(axis=0)
-    return distinct(np.concatenate([np.arange(0, len(means), len(means) // SAMPLE + 1), *extremes]))
-
-
-def as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
-    """Write Gaussians in the format of a path and read them back; return them unchanged if rounding is invisible."""
-    if not rounding_notes(path, gaussians):
-        return gaussians
-    format_ = output_format(path, levels=True, cameras=True)
-    name = f"a{format_.kept_as or format_.ending}"
-    with TemporaryDirectory() as folder:
-        write_gaussians(Path(folder) / name, gaussians)
-        return read_gaussians(Path(folder) / name).gaussians

@@ -16,6 +16,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,16 @@ from gsmerge.arrays import to_float32
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.io.archives import new_member, open_archive, read_member
-from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, read_budget, read_errors, read_text
+from gsmerge.io.bounds import (
+    ReadBudget,
+    check_file,
+    check_whole,
+    parse_json,
+    read_budget,
+    read_errors,
+    read_json,
+    read_text,
+)
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.table import META
 from gsmerge.kernels.elementary import expm1, log1p
@@ -117,6 +127,22 @@ def read_unbundled(path: Path) -> SogContent:
         entries = (entry for entry in os.scandir(path.parent) if f'"{entry.name}"' in names or entry.name == path.name)
         size = sum(entry.stat().st_size for entry in entries)
         return _read_content(_Folder(path.parent, size), ReadBudget(path, size))
+
+
+def read_folder(path: Path) -> arrays.StoredRows:
+    """Read the Gaussians of a ``.sog`` without its zip, by its ``meta.json``; SceneError as in :func:`read_rows`."""
+    content, own_bytes = read_unbundled(path), check_file(path)
+    rows = arrays.to_stored([content.packed], f"unzipped .sog version {VERSION}", content.sizes, content.mode)
+    return replace(rows, bytes_beside=content.num_bytes - own_bytes)
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether a ``meta.json`` belongs to a ``.sog``, and not to another program."""
+    try:
+        document = read_json(path)
+    except SceneError:
+        return False
+    return isinstance(document, dict) and {"means", "scales", "quats", "sh0"} <= document.keys()
 
 
 @contextmanager
@@ -245,11 +271,6 @@ def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
         for name, data in sog_files(columns, arrays.render_mode(comments)).items():
             archive.writestr(new_member(name), data)
     return content.getvalue()
-
-
-def file_order(gaussians: Gaussians) -> np.ndarray:
-    """Return the rows ``[n]`` of Gaussians in the order in which :func:`sog_bytes` stores them."""
-    return arrays.curve_order(arrays.to_columns(gaussians, MAX_DEGREE).means)
 
 
 def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, bytes]:

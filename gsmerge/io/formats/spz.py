@@ -12,7 +12,6 @@ The README says that axes are right, up and back. Its converters, splat-transfor
 
 from __future__ import annotations
 
-import gzip
 import math
 import struct
 import zlib
@@ -92,30 +91,18 @@ def read_rows(path: Path) -> arrays.StoredRows:
         if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # other files are refused without reading them
             file.seek(0)
             packed = file.read()
-    rows, header, extensions, sizes = unpack_rows(ReadBudget(path, len(packed)), packed)
+    read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
+    header, parts, extensions = read(ReadBudget(path, len(packed)), packed)
+    sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
     axes = _stored_axes(path, extensions) if header.flags & EXTENSIONS_FLAG else PLY_AXES
     rotate = arrays.turner(_axes_rotation(axes), header.num_higher)
-    rotated = replace(rows, unpack=lambda block: rotate(rows.unpack(block)))
+    rows = arrays.Packed(
+        header.count, header.num_higher, lambda block: rotate(_unpack([part[block] for part in parts], header))
+    )
     mode = arrays.MIP if header.flags & MIP_FLAG else None
-    stored = arrays.to_stored([rotated], f".spz version {header.version}", sizes, mode)
+    stored = arrays.to_stored([rows], f".spz version {header.version}", sizes, mode)
     notes = (f"Gaussians are turned from the file's axes {axes} to those of a .ply, {PLY_AXES}",)
     return stored if axes == PLY_AXES else replace(stored, notes=notes)
-
-
-def unpack_rows(
-    budget: ReadBudget, packed: bytes, count_before: int = 0
-) -> tuple[arrays.Packed, Header, bytes, dict[str, int]]:
-    """Return the Gaussians in the file's axes, header, extensions and bytes by attribute; SceneError if damaged.
-
-    ``budget``: budget of the file with these bytes. ``count_before``: number of Gaussians in earlier parts of the file.
-    """
-    read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
-    header, parts, extensions = read(budget, packed, count_before)
-    sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
-    rows = arrays.Packed(
-        header.count, header.num_higher, lambda block: _unpack([part[block] for part in parts], header)
-    )
-    return rows, header, extensions, sizes
 
 
 def _stored_axes(path: Path, extensions: bytes) -> str:
@@ -141,8 +128,8 @@ def _axes_rotation(axes: str) -> np.ndarray:
     return rotation * (1, -1, -1) if axes in _REVERSED else rotation
 
 
-def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int], count_before: int) -> Header:
-    """Read the header; SceneError if it is invalid, or if the file is too small for all Gaussians so far."""
+def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int]) -> Header:
+    """Read the header; SceneError if it is invalid, or if the file is too small for its Gaussians."""
     path = budget.path
     if len(start) < HEADER.size:
         raise SceneError(path, FOUND_EARLY_END, AGAIN)
@@ -154,16 +141,16 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
         raise SceneError(path, problem, "export it again")
     if header.count == 0:
         raise SceneError(path, f"expected at least one Gaussian in {len(packed)} bytes, found a count of 0", AGAIN)
-    arrays.check_count(budget, count_before + header.count, header.num_higher, sum(header.widths))
+    arrays.check_count(budget, header.count, header.num_higher, sum(header.widths))
     return header
 
 
-def _gzip_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tuple[Header, list[np.ndarray], bytes]:
+def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes]:
     """Read the header, the columns ``[n,width]`` uint8 and the extensions of versions 1 to 3."""
     path = budget.path
     stream = zlib.decompressobj(wbits=31)
     try:
-        header = _read_header(budget, packed, stream.decompress(packed, HEADER.size), (1, 2, 3), count_before)
+        header = _read_header(budget, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
         data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
         extended = header.flags & EXTENSIONS_FLAG
         extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS) if extended else b""
@@ -177,32 +164,11 @@ def _gzip_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tuple[H
     return header, parts, extensions
 
 
-def problem_at_end(path: Path) -> str | None:
-    """Describe errors at the end of a ``.spz`` that readers ignore; None without errors.
-
-    These are a wrong checksum of the stream, and more bytes than the header declares, for example because its version
-    is wrong. Version 4 has neither.
-    """
-    packed = path.read_bytes()
-    if packed[:2] != GZIP_MAGIC:
-        return None
-    try:
-        with gzip.open(path) as file:
-            header = _read_header(ReadBudget(path, len(packed)), packed, file.read(HEADER.size), (1, 2, 3), 0)
-            size = sum(iter(lambda: len(file.read(1 << 20)), 0))
-    except (OSError, EOFError, zlib.error) as error:
-        return f"its gzip stream is damaged or truncated at the end ({error})"
-    extra = size - header.count * sum(header.widths)
-    if not extra or header.flags & ~MIP_FLAG:
-        return None
-    return f"it has {extra:,} bytes more than {header.count:,} Gaussians of version {header.version} need"
-
-
-def _zstandard_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tuple[Header, list[np.ndarray], bytes]:
+def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes]:
     """Read the header, the columns ``[n,width]`` uint8 and the extensions of version 4."""
     import zstandard  # few files need it
 
-    path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,), count_before)
+    path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,))
     sizes = [header.count * width for width in header.widths if width]
     table_start, ends = _read_table(path, packed, header, sizes)
     unpacker = zstandard.ZstdDecompressor()

@@ -67,7 +67,7 @@ class Format:
     write: WriteOutput = WRITE_APART  # by default, writes each level to a separate file
     require: Callable[[], object] = lambda: None  # raises UsageError if the writer's package or program is missing
     finish: Callable[[Path], object] = lambda _: None  # called with the path after all files were renamed
-    holds: Callable[[Path], bool] = lambda _: True  # whether a file with this ending has Gaussians
+    holds: Callable[[Path], bool] | None = None  # whether a file with this ending has Gaussians; None: always
 
     # Content of its files
     # Levels of detail: a single one, one file for each, or all in one output
@@ -75,7 +75,6 @@ class Format:
     # Cameras of views: in a file beside it, inside it, or inside it and required
     cameras: Literal["", "inside", "needed"] = ""
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as the format does
-    kept_as: str = ""  # ending of the format that rounds its Gaussians, if it stores them in another format
     columns: bool = False  # whether the user can choose which of INRIA's columns it has
     marks: Sequence[str] | None = ()  # comments of the input that it keeps; None: all of ``copied_comments``
     lost: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
@@ -93,10 +92,6 @@ class Format:
     count: Callable[[int, int], int] | None = None  # bytes, degree -> number of Gaussians; None if content matters
     measure: Callable[[Gaussians, Cameras, Sequence[str]], int] | None = None  # bytes; None: those of ``encode``
 
-    def __post_init__(self) -> None:
-        if self.each and self.max_degree >= 0 and not (self.encode or self.count or self.measure):
-            raise ValueError(f"{self.ending}: expected encode, count or measure, since it has bytes of each Gaussian")
-
     def names(self, path: StrPath) -> bool:
         """Return whether the name of a path has the ending of this format."""
         name = Path(path).name
@@ -106,8 +101,6 @@ class Format:
 _page, _model = lazy_functions("gsmerge.pages"), lazy_functions("gsmerge.compaction")
 _SOG = 13.0, 22.0, 36.5, 56.5
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
-_READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
-_USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
     each=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes, columns=True, marks=None,
@@ -117,7 +110,7 @@ LEVELS = Format(
     INDEX, "levels of detail in chunks; written by splat-transform",
     _lazy("streamed.read_rows"), None, 3, require=_lazy("splat_transform.find_program"),
     write=_lazy("streamed.write_output"), finish=_lazy("streamed.remove_unused_chunks"), levels="inside",
-    round_means=_lazy("sog.round_means"), kept_as=".sog", marks=(MIP_COMMENT, FLAT_COMMENT),
+    round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
 )  # fmt: skip
 COLMAP = Format(
     POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0,
@@ -129,7 +122,7 @@ COLMAP = Format(
 HTML = Format(
     ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
     write=_page("site.write_output"), levels="", cameras="inside", round_means=_lazy("sog.round_means"),
-    kept_as=".sog", site="index.html", beside=_page("site.files_beside"),
+    site="index.html", beside=_page("site.files_beside"),
     each=tuple(_IN_TEXT * sog_bytes for sog_bytes in _SOG), rest=_page("site.least_bytes"),
     measure=_page("site.measure"),
 )  # fmt: skip
@@ -151,39 +144,21 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
         ".glb", "binary glTF with KHR_gaussian_splatting", _lazy("glb.read_rows"), _lazy("glb.glb_bytes"), 3,
         holds=_lazy("glb.holds_gaussians"), each=(52.1, 88.1, 148.1, 232.2),
     ),
-    Format(
-        ".usdc", "USD with ParticleField3DGaussianSplat, binary", None, _lazy("usd.usdc_bytes"), 3,
-        require=_REQUIRE_USD, each=_USD, kept_as=".ply",
-    ),
-    Format(
-        ".usdz", "USD, a .usdc in an archive", None, _lazy("usd.usdz_bytes"), 3, require=_REQUIRE_USD, each=_USD,
-        kept_as=".ply",
-    ),
 )  # fmt: skip
 STATE = Format(
     STATE_ENDING, "batches of views: Gaussians, cameras and pictures", _lazy("gsm.read_rows"), None, -1, each=(56.0,)
 )
 META = "meta.json"  # of a .sog that is a folder
-BY_PROGRAM = (  # formats that splat-transform reads for gsmerge
-    Format(".ksplat", "by splat-transform", _READ_BY_PROGRAM, None, -1),
-    Format(
-        META, "a .sog without its zip, by splat-transform", _READ_BY_PROGRAM, None, -1,
-        holds=_lazy("splat_transform.holds_sog"),
-    ),
-    Format(".lcc", "the finest level, by splat-transform", _READ_BY_PROGRAM, None, -1),
-    Format(".lcc2", "as `.lcc`", _READ_BY_PROGRAM, None, -1),
+SOG_FOLDER = Format(
+    META, "a .sog without its zip", _lazy("sog.read_folder"), None, -1, holds=_lazy("sog.is_folder"),
 )  # fmt: skip
-SEVERAL_USES = (".npz", ".glb")  # endings of files that often hold no Gaussians
-FORMATS = (*FILES, HTML, LEVELS, COLMAP, STATE, *BY_PROGRAM)
+FORMATS = (*FILES, HTML, LEVELS, COLMAP, STATE, SOG_FOLDER)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # results that a page shows
+SEVERAL_USES = tuple(row.ending for row in FORMATS if row.holds)  # endings of files that may hold no Gaussians
 FOLDERS = {row.folder: row for row in FORMATS if row.folder}  # by the name of an output folder
 READ_ENDINGS = tuple(row.ending for row in FORMATS if row.read is not None)
-SCENE_SUFFIXES = tuple(
-    dict.fromkeys(
-        Path(f"_{row.ending}").suffix for row in (*FILES, *BY_PROGRAM) if row.read is not None and row.ending[0] == "."
-    )
-)
+SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FILES if row.read is not None))
 
 
 def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
@@ -226,7 +201,8 @@ def find_format(path: StrPath) -> Format:
 
 def may_hold_gaussians(path: Path) -> bool:
     """Return whether a file may hold Gaussians: by its ending, and by its content if the ending has other uses."""
-    return path.suffix.lower() in SCENE_SUFFIXES and find_format(path).holds(path)
+    holds = find_format(path).holds
+    return (holds is None and path.suffix.lower() in SCENE_SUFFIXES) or (holds is not None and holds(path))
 
 
 def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:

@@ -64,8 +64,8 @@ def write_gaussians(
 ) -> None:
     """Write Gaussians to a file; the ending of its name, one of ``OUTPUT_FORMATS``, chooses the format.
 
-    All formats except ``.ply`` and USD quantise. In ``.glb`` and USD y points up, so Gaussians are rotated by half a
-    turn about z. Harmonics of degree 4 are left out; only :func:`write_ply` writes them.
+    All formats except ``.ply`` quantise. In ``.glb`` y points up, so Gaussians are rotated by half a turn about z.
+    Harmonics of degree 4 are left out; only :func:`write_ply` writes them.
 
     Args:
         path: The file. It is written completely or not at all.
@@ -76,7 +76,7 @@ def write_gaussians(
         normals: Columns of a ``.ply``, as in :func:`write_ply`.
 
     Raises:
-        UsageError: If the ending is unknown, or if ``usd-core`` is needed and not installed.
+        UsageError: If the ending is unknown.
         SceneError: If the file exists or cannot be written.
         ValueError: If there is no Gaussian, if there is NaN or inf, if a comment is not a line of ASCII, or if comments
             have more than half a million characters.

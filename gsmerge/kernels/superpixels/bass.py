@@ -1,6 +1,6 @@
-"""Bayesian adaptive superpixel segmentation (Uziel et al. 2019), with a fixed number of superpixels.
+"""Cut pictures into superpixels by BASS (Uziel, Ronen and Freifeld 2019), without its splits and merges.
 
-The method is hard expectation maximisation of Gaussians in colour (fixed standard deviation) and position
+Rounds of hard expectation maximisation of Gaussians in colour (fixed standard deviation) and position
 (normal-inverse-Wishart prior), with a Potts term on the borders. A pixel may change its label only if no region is
 disconnected by that. Pixels at the picture's edge may change, too, and no region can become empty.
 """

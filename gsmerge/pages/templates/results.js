@@ -66,30 +66,6 @@ function measureSpeed() {
   showSpeed(before / after, `Medians of frames on this device: ${before.toFixed(1)} and ${after.toFixed(1)} ms`);
 }
 
-// How much would be dropped of what the sides show, and what few views show of it; not where that has no effect.
-function showLegend(reason) {
-  legend("legend", "dropped", Boolean(state.drops) && !reason, (word) => word, true);
-}
-
-function showSeen(reason) {
-  const words = { none: "no view", one: "one view" };
-  legend("seen-legend", "seen", Boolean(state.seen) && !reason, (word) => words[word], state.seen === "color");
-}
-
-// A line for each side that has counts: coloured squares as in the picture, words and numbers.
-function legend(name, counts, isShown, wordOf, isColored) {
-  if (!id(name)) return;
-  const sources = [...new Set([state.left, state.right])].filter((one) => Object.keys(data.sources[one][counts]).length);
-  id(name).hidden = !isShown || !sources.length;
-  if (id(name).hidden) return;
-  id(name).replaceChildren(...sources.flatMap((source) => {
-    const { name: title, count } = data.sources[source];
-    const parts = Object.entries(data.sources[source][counts]).map(([word, number]) =>
-      make("span", `${wordOf(word)}: ${number.toLocaleString("en")}`, { className: isColored ? word : "bare" }));
-    return [sources.length > 1 ? `${title}: ` : "", ...parts, ` of ${count.toLocaleString("en")} Gaussians`, make("br", "")];
-  }));
-}
-
 function markResult() {
   if (id("size")) {
     id("size").value = data.sizes.indexOf(state.result);

@@ -16,9 +16,6 @@ const FOOTPRINT = "vec2 J2 = -(J1 * viewCenter.xy) * invZ;";
 const BOUNDED_FOOTPRINT = `vec2 seen = clamp(clipCenter.xy / clipCenter.w, -1.3, 1.3);
   vec2 principal = vec2(projectionMatrix[2][0], projectionMatrix[2][1]);
   vec2 J2 = J1 * (seen + principal) / vec2(projectionMatrix[0][0], projectionMatrix[1][1]);`;
-const FAINT = 0.1; // of its opacity is left of what no view shows where that fades
-const SEEN = [{ r: 0.9, g: 0.16, b: 0.16 }, { r: 1, g: 0.75, b: 0 }]; // colours of what no view and what one view shows
-const TINT = 0.7; // their share
 const COLORS = { input: [1, 0.78, 0.28], held: [0.42, 0.78, 1], current: [1, 1, 1] };
 
 // Bytes of a script element that holds them in base64; the element's text is given up.
@@ -100,35 +97,6 @@ class SplatView {
     const scene = new Vendor.Scene();
     scene.add(spark, mesh);
     this.results.set(source, { mesh, spark, scene, version: -1, busy: false, points: null });
-  }
-
-  // `counts` says for each Gaussian how many views show it: 0, 1, or 2 for more.
-  support(source, counts) {
-    const result = this.results.get(source);
-    result.own = new Map(); // opacity and colour of those that few show, by index
-    result.shownAs = "";
-    result.mesh.forEachSplat((i, centre, scales, turn, opacity, color) => {
-      if (counts[i] < SEEN.length) result.own.set(i, { count: counts[i], opacity, color: color.clone() });
-    });
-  }
-
-  // Shows what few views show as it is, "", faint, "fade", where none does, or in colours, "color".
-  mark(source, how) {
-    const result = this.results.get(source);
-    if (!result.own || result.shownAs === how) return;
-    const { mesh, own } = result;
-    const { splats } = mesh;
-    mesh.forEachSplat((i, centre, scales, turn) => {
-      const one = own.get(i);
-      if (!one) return;
-      const color = how === "color" ? one.color.clone().lerp(SEEN[one.count], TINT) : one.color;
-      const opacity = how === "fade" && one.count === 0 ? FAINT * one.opacity : one.opacity;
-      splats.setSplat(i, centre, scales, turn, opacity, color);
-    });
-    splats.needsUpdate = true;
-    mesh.updateVersion();
-    [result.shownAs, result.version] = [how, -1];
-    this.request();
   }
 
   // Exactly the camera of a view: roll, principal point and both focal lengths.

@@ -165,10 +165,8 @@ async function start() {
     const settle = (settled) => stage.setAttribute("aria-busy", String(!settled));
     const made = new SiteView(id("canvas"), data.views, frame, settle);
     await made.add(SCENE, scene, data.names.scene);
-    if (id("support")) made.support(SCENE, await gunzip(takeBytes("support")));
     await made.prepare();
     site = made;
-    id("unseen").hidden = !made.results.get(SCENE).own;
     [id("canvas").hidden, id("poster").hidden, id("reset").hidden] = [false, true, false];
     id("canvas").addEventListener("webglcontextlost", () => say("3D was lost: reload the page"));
     say("");
@@ -207,16 +205,8 @@ function listen() {
   document.addEventListener("keydown", onKey);
   window.addEventListener("resize", () => site && site.fit());
   id("reset").addEventListener("click", () => site.reset());
-  id("unseen").addEventListener("click", fadeUnseen);
   id("full").addEventListener("click", () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()));
   id("headset").addEventListener("click", () => site.enter().catch((error) => say(`No VR: ${error.message}`)));
-}
-
-// What no view of the input shows, faint or as it is.
-function fadeUnseen() {
-  const faint = id("unseen").ariaPressed !== "true";
-  id("unseen").ariaPressed = String(faint);
-  site.mark(SCENE, faint ? "fade" : "");
 }
 
 function onKey(event) {
@@ -227,7 +217,6 @@ function onKey(event) {
     arrowleft: () => site.orbit(-KEY_TURN, 0), arrowright: () => site.orbit(KEY_TURN, 0), arrowup: () => site.orbit(0, -KEY_TURN),
     arrowdown: () => site.orbit(0, KEY_TURN), "+": () => site.nearer(KEY_FACTOR), "=": () => site.nearer(KEY_FACTOR),
     "-": () => site.nearer(1 / KEY_FACTOR), r: () => site.reset(),
-    u: () => id("unseen").hidden || fadeUnseen(),
   };
   if (walk) site.fly(...walk.map((by) => STRIDE * by));
   else if (actions[key]) actions[key]();

@@ -7,22 +7,17 @@ const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
   view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
-  order: "worst", overlay: 0, outlines: "", drops: "", seen: "", maps: "", other: false, from: data.start, // the view before the step back
+  order: "worst", overlay: 0, maps: "", other: false, from: data.start, // the view before the step back
   atCamera: true, left: 0, right: 0, scheme: "",
   result: 0, zoom: 1, centre: [0.5, 0.5], // of the stills: what lies in the middle, in shares of the picture
 };
 const BLINK = 700; // milliseconds
 const SOFTWARE_MOST = 150000; // Gaussians: 2 seconds a frame on a processor
 const PIXELS = 8; // of the screen for one of a still, from which on they are drawn as squares
-const OUTLINES = 0.8; // opacity of superpixels' outlines
 const QUIET = 1000; // milliseconds after which a 3D that has come is measured
 const NARROW = 640; // pixels of the stage, below which sides go one above the other
 let stills = null; // per view the pictures of every source; those that are seen first are in the page itself
-let outlines = []; // per view the borders of its superpixels, where there are any
-let drops = []; // per view and source what would be dropped of it, in colour
-let seen = []; // per view and source what one view of the input shows, and what none, in colour
 let maps = []; // per view and source how far off new views are likely to be
-let faded = []; // per source the picture from outside in which that is faint which no view shows
 let solid = null; // the 3D view, once it is there
 let blinking = 0; // the timer
 let chosen = false; // whether the reader has chosen stills or 3D
@@ -31,10 +26,7 @@ const clamp = (value, least, most) => Math.max(least, Math.min(most, value));
 const view = () => data.views[state.view];
 const inSolid = (source) => Boolean(state.solid && solid && solid.has(source));
 
-function stillOf(source) {
-  const faint = state.seen === "fade" && view().outside && faded[source];
-  return stills ? faint || stills[state.view][source] : null;
-}
+const stillOf = (source) => (stills ? stills[state.view][source] : null);
 
 // Whether a source can be seen from here; the photos cannot once the camera has moved, nor what 3D has not taken in.
 const isThere = (source) => inSolid(source) || (state.atCamera && (!stills || Boolean(stillOf(source))));
@@ -99,11 +91,9 @@ function showZoom() {
   id("back").textContent = state.atCamera ? `${zoom.toFixed(1)} × · whole picture` : "Back to the view";
 }
 
-const dropsOf = (source) => (drops[state.view] || [])[source] || null;
 const mapOf = (source) => (maps[state.view] || [])[source] || null;
-const seenOf = (source) => (seen[state.view] || [])[source] || null;
 
-// Lays a picture over a side: the photo, outlines, or what would be dropped of a source.
+// Lays a picture over a side: the photo, or the map of a source.
 function lay(layer, address, opacity, source = "") {
   layer.hidden = !address || opacity === 0;
   if (layer.hidden) return;
@@ -136,9 +126,6 @@ function show() {
     const pane = id(`${side}-pane`);
     pane.hidden = !here;
     lay(pane.querySelector(".overlay"), data.photos && plain && stillOf(0), state.overlay);
-    lay(pane.querySelector(".outlines"), plain && state.outlines && outlines[state.view], OUTLINES);
-    lay(pane.querySelector(".drops"), plain && state.drops && dropsOf(source), OUTLINES, source);
-    lay(pane.querySelector(".seen"), plain && state.seen === "color" && !drawn && seenOf(source), OUTLINES, source);
     lay(pane.querySelector(".maps"), plain && state.maps && mapOf(source), 1, source);
     const tag = id(`${side}-tag`);
     tag.hidden = !here;
@@ -154,10 +141,7 @@ function show() {
   }
   id("outside").setAttribute("aria-pressed", String(view().outside));
   showLimits();
-  if (solid && state.solid) {
-    [left, right].filter(inSolid).forEach((source) => solid.mark(source, state.seen));
-    solid.request();
-  }
+  if (solid && state.solid) solid.request();
 }
 
 // Greys out what has no effect now, and says why; what is about 3D alone is there with it.
@@ -165,24 +149,15 @@ function showLimits() {
   const away = !state.atCamera ? "From a view's camera only: press R" : state.mode === "difference" ? "Not over a difference" : "";
   const none = solid ? "" : id("status").textContent || "3D is not there yet";
   const shown = [state.left, state.right];
-  const examined = (counts) => shown.some((source) => Object.keys(data.sources[source][counts]).length) ? "" : "Results alone are examined: choose one";
-  const unseen = shown.some(dropsOf) ? "" : "Nothing of it is in this picture";
   const outside = view().outside ? "From a photo's camera only" : "";
-  const bare = outlines[state.view] ? "" : outside || (view().held_out ? "Held-out photos have no superpixels" : "Not there yet");
   const mapped = maps.some((one) => one.some(Boolean));
   const unmapped = outside || (shown.some(mapOf) ? "" : mapped ? "Results alone have one: choose one" : "It takes photos of two views");
-  const reasons = {
-    outlines: bare || away, drops: away || examined("dropped") || unseen, maps: away || unmapped,
-    seen: examined("seen") || (state.solid ? "" : away),
-  };
+  const reasons = { maps: away || unmapped };
   for (const field of document.querySelectorAll(".in-3d")) field.hidden = !state.solid;
   for (const button of document.querySelectorAll("[data-set]")) {
     const { set: name, value } = button.dataset;
-    const still = name === "seen" && value === "fade" && !state.solid && !view().outside ? "No view shows any of it: step back" : "";
-    grey(button, name === "solid" && value ? none : reasons[name] || still);
+    grey(button, name === "solid" && value ? none : reasons[name]);
   }
-  showLegend(reasons.drops);
-  showSeen(reasons.seen);
   if (id("map-legend")) id("map-legend").hidden = !state.maps || Boolean(reasons.maps);
   if (id("overlay-share")) grey(id("overlay-share"), outside || away);
   id("full").hidden = !document.fullscreenEnabled;
@@ -195,11 +170,8 @@ function grey(control, reason) {
 
 // To the camera of a view, exactly.
 function jump(index) {
-  const away = view().outside;
   state.view = clamp(index, 0, data.views.length - 1);
   state.atCamera = true;
-  if (!away && view().outside && !state.seen) state.seen = "fade"; // from there a guess passes for surface
-  else if (away && !view().outside && state.seen === "fade") state.seen = "";
   for (const card of id("strip").children) {
     const current = Number(card.dataset.view) === state.view;
     card.setAttribute("aria-current", String(current));
@@ -248,11 +220,7 @@ function toggleFull() {
 // The strip, when the stills have come.
 function startStrip() {
   stills = JSON.parse(id("stills").textContent);
-  outlines = JSON.parse(id("outline-pictures").textContent);
-  drops = JSON.parse(id("drop-pictures").textContent);
-  seen = JSON.parse(id("seen-pictures").textContent);
   maps = JSON.parse(id("map-pictures").textContent);
-  faded = JSON.parse(id("faded-pictures").textContent);
   stills[data.start] = stills[data.start].map((still, source) => still || inPage.get(source) || null);
   const shown = Number(!data.photos && data.sources.length > 1); // without photos the result, not its reference
   for (const card of id("strip").children) {
@@ -270,11 +238,10 @@ function say(words) {
 // Takes in what the sides show; without a GPU nothing that would take minutes for a frame.
 async function load(made) {
   for (const source of [state.left, state.right]) {
-    const { splats, support, count } = data.sources[source];
+    const { splats, count } = data.sources[source];
     const drawable = splats && !(made.software && count > SOFTWARE_MOST);
     if (!drawable || made.has(source) || !id(splats)) continue;
     await made.add(source, await unpackSplats(takeBytes(splats)));
-    if (support) made.support(source, await gunzip(takeBytes(support)));
   }
 }
 

@@ -181,14 +181,6 @@ def test_a_plain_export(tmp_path: Path) -> None:
     assert names(lines["note"], "the depth is wrong")  # each view has one of its own
 
 
-def test_several_gaussians_per_pixel(tmp_path: Path) -> None:
-    rows = export_rows(SMOOTH, np.repeat(PIXELS[:, :, None], 3, 2).reshape(-1))
-    lines = said(save_export(tmp_path, SMOOTH, rows))
-    assert lines["cameras"].endswith("transforms.json: 3 (transforms.json)")
-    assert names(lines["rows"], "several Gaussians per pixel")
-    assert names(lines["alignment"], "3 x 36 x 48")
-
-
 def test_dropped_pixels(tmp_path: Path) -> None:
     kept = np.concatenate([np.flatnonzero(depth_map_mask(d)) + i * d.size for i, d in enumerate(SMOOTH.depths)])
     save_export(tmp_path / "gs_ply", SMOOTH, export_rows(SMOOTH, kept), cameras=False, name="0000.ply")
@@ -218,23 +210,6 @@ def test_the_camera_inside_the_file(tmp_path: Path) -> None:
     assert names(lines["alignment"], "1 x 36 x 36")
 
 
-def test_rows_in_no_order(tmp_path: Path) -> None:
-    some = np.random.default_rng(0).permutation(PIXELS.size)[:3000]
-    lines = said(save_export(tmp_path, SMOOTH, export_rows(SMOOTH, some)))
-    assert names(lines["alignment"], "not", "3 x 36 x 48 = 5184", 3000)
-    assert "note" not in lines
-    assert "rows" not in lines
-
-
-def test_columns_that_no_known_exporter_writes(tmp_path: Path) -> None:
-    """Files whose rows are pixels and others are called unknown in the same words."""
-    rows = export_rows(SMOOTH)
-    for name, kept in (("pixels", rows), ("others", rows[:3000])):
-        save_export(tmp_path / name, SMOOTH, kept)
-    pixels, others = (said(tmp_path / name)["exporter"] for name in ("pixels", "others"))
-    assert pixels == others == "not known: 17-column export"
-
-
 def test_no_cameras(tmp_path: Path) -> None:
     save_export(tmp_path, SMOOTH, export_rows(SMOOTH)[np.lexsort(SMOOTH.gaussians.means.T)], cameras=False)  # no grid
     lines = said(tmp_path)
@@ -242,14 +217,6 @@ def test_no_cameras(tmp_path: Path) -> None:
     assert names(lines["compact"], 228, "4.4 %")
     assert names(lines["method"], "pair by pair", "fit: none")
     assert names(lines["note"], "no cameras", "--cameras", "--images")
-
-
-def test_what_compact_would_refuse(tmp_path: Path) -> None:
-    save_export(tmp_path, SMOOTH, export_rows(SMOOTH))
-    (tmp_path / "transforms.json").write_text("nonsense")
-    lines = said(tmp_path, cameras=tmp_path / "transforms.json")
-    assert "refuse" in lines["compact"]
-    assert lines["exporter"].startswith("not known")
 
 
 def test_our_own_files(tmp_path: Path) -> None:

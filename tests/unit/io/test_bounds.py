@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import tracemalloc
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import bounds
-from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, parse_json, read_lines, read_table, read_text
+from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, parse_json, read_lines, read_text
 from gsmerge.io.image_names import list_images
 from gsmerge.scene.content_hash import content_hash
 
@@ -61,33 +60,6 @@ def test_folders_of_photos_have_an_end(tmp_path: Path, monkeypatch: pytest.Monke
             read(tmp_path / "images")
 
 
-def test_json_and_toml(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text('{"steps": 3, "network": {"width": 16}}')
-    assert read_table(tmp_path / "a.json") == {"steps": 3, "network": {"width": 16}}
-    (tmp_path / "a.toml").write_text("steps = 3\n[network]\nwidth = 16\n")
-    if sys.version_info >= (3, 11):
-        assert read_table(tmp_path / "a.toml") == {"steps": 3, "network": {"width": 16}}
-    else:
-        with pytest.raises(SceneError, match="JSON"):
-            read_table(tmp_path / "a.toml")
-
-
-@pytest.mark.parametrize("text", ["[1]", "{", "3", "[" * 100_000, "\x00"])
-def test_what_is_no_table_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "a.json"
-    path.write_text(text)
-    with refuses(SceneError, path, "JSON" if text in ("{", "\x00") or len(text) > 9 else "a table of names"):
-        read_table(path)
-
-
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
-    (tmp_path / "folder.json").mkdir()
-    for name, found in (("nowhere.json", "no such file"), ("bytes.json", "UTF-8 text"), ("folder.json", "a folder")):
-        with refuses(SceneError, tmp_path / name, found):
-            read_table(tmp_path / name)
-
-
 def test_a_budget_grows_with_the_file() -> None:
     for size, memory, steps in ((0, 64_000_000, 250_000), (10**6, 84_000_000, 350_000)):
         budget = ReadBudget("a", size)
@@ -128,13 +100,3 @@ def test_content_is_names_and_bytes(tmp_path: Path) -> None:
     assert len({before, renamed, content_hash([folder])}) == 3
     with refuses(SceneError, "nothing", "No such file"):
         content_hash([tmp_path / "nothing"])
-
-
-@pytest.mark.skipif(sys.version_info < (3, 11), reason="TOML needs Python 3.11")
-@pytest.mark.parametrize(
-    ("text", "found"), [(".".join("a" * 100_000) + " = 1", "keys"), (f"a = 0x{'f' * 10_000}", "digits")]
-)
-def test_settings_that_take_too_long_or_are_too_large(tmp_path: Path, text: str, found: str) -> None:
-    (tmp_path / "a.toml").write_text(text)
-    with refuses(SceneError, "a.toml", found):
-        read_table(tmp_path / "a.toml")

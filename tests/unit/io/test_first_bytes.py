@@ -21,7 +21,6 @@ ZIP, _ = OTHER_CONTENT["a zip"]
 GLTF = {"a glTF": (b'{"asset": {"version": "2.0"}}', ("glTF", ".glb"))}
 # Of endings that ``tests/damage`` has no sound files of
 CONTENTS = [
-    *((".ksplat", name) for name in OTHER_CONTENT if name not in ("a zip", "a gzip")),
     (".zip", "a zip"), (".gz", "a gzip"), (".gltf", "a glTF"),
 ]  # fmt: skip
 

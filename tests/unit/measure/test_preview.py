@@ -93,11 +93,5 @@ def test_labels_never_widen_a_tile() -> None:
     assert preview.label(wide, "larger on a large tile").shape == (4 + 3 * preview.BAND, 1920, 3)
 
 
-def test_mean_colors() -> None:
-    image = np.repeat(np.array([[0.0, 1.0, 0.2]], np.float32)[..., None], 3, 2)
-    means = preview.mean_colors(image, np.array([[0, 0, 1]]))
-    np.testing.assert_allclose(means[:, 0], [0.5, 0.2], rtol=1e-6)
-
-
 def test_to_picture_clamps() -> None:
     assert preview.to_picture(np.array([[[-1.0, 0.5, 2.0]]], np.float32)).tolist() == [[[0, 128, 255]]]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any
@@ -18,7 +17,6 @@ from messages import noted
 
 from gsmerge import Gaussians, Scene, evaluate, render
 from gsmerge.facts.row_colors import ROW_COLORS
-from gsmerge.facts.support import count_views
 from gsmerge.frame import scene_frame
 from gsmerge.io.formats.spz import UNIX, spz_bytes
 from gsmerge.measure.camera_path import outside_camera
@@ -27,23 +25,10 @@ from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages import data, splats
 from gsmerge.pages.data import ViewData, collect, encode_still, short_names
-from gsmerge.pages.marks import DROPS, FAINT, draw_shares, light_shares
 from gsmerge.pages.page import headline
 from gsmerge.pages.splats import pack_splats
-from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.metrics import psnr
-from gsmerge.settings.stages import CleanOptions
-from gsmerge.stages.clean import clean
-from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Views
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _small_outlines() -> Iterator[None]:
-    """A quarter as wide as on a page: they take most of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(data, "OUTLINE_SIDE", 320)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +150,7 @@ def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) 
     frame = scene_frame(scene)
     assert actual.outside.distance == pytest.approx(distance / frame.unit)
     np.testing.assert_allclose(actual.outside.camera.viewmats, frame.enter_cameras(camera).viewmats)
-    assert (actual.outside.photo, actual.outside.scores, actual.outside.outlines) == (None, (), None)
+    assert (actual.outside.photo, actual.outside.scores) == (None, ())
     assert actual.outside not in actual.views
 
 
@@ -216,50 +201,6 @@ def test_a_light_page_has_no_gaussians_of_the_scene(small: Scene) -> None:
     assert not any("stills only" in note or "harmonics" in note for note in light.notes)
 
 
-def test_what_would_be_dropped_is_drawn(small: Scene) -> None:
-    """Floaters and sky as ``compact --drop`` takes them, in the pictures that show them."""
-    half, frame = small.gaussians[::2], scene_frame(small)
-    entered, camera = frame.enter(half), frame.enter_cameras(small.cameras)
-    _, counts = clean(entered, CleanOptions(drop="floaters,sky"), camera, small.images, frame.leave)
-    shown = collect("room", small, {"half": half}, (2, 1))
-    assert [side.dropped for side in shown.sides] == [{}, {word: n for word, n in counts.items() if n}]
-    assert counts["floaters"] > 0
-    assert all(view.drops[0] is None for view in shown.shown)
-    assert any(view.drops[1] for view in shown.shown)
-    splats, near = make_splats(entered), near_plane(small) / frame.unit
-    tiled = tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=near)
-    mask = draw_shares(light_shares(tiled, {"sky": np.arange(len(half)) < len(half) / 2}), DROPS)
-    picture = cv2.imdecode(np.frombuffer(mask or b"", np.uint8), cv2.IMREAD_UNCHANGED)
-    assert picture.shape == (small.cameras.height, small.cameras.width, 4)
-    alphas = picture[..., 3]
-    assert set(map(tuple, picture[alphas > 0][:, :3])) == {(255, 170, 20)}
-    assert alphas.max() < 200  # what is behind the whole of it is seen
-    assert 0 < alphas[alphas > 0].min() < alphas.max() / 2  # and more where it is a part of the light
-    assert draw_shares(light_shares(tiled, {"floaters": np.zeros(len(half), bool)}), DROPS) is None
-
-
-def test_what_few_views_show_is_counted_drawn_and_faded(small: Scene) -> None:
-    """A result with as many Gaussians behind the cameras: the view from outside sees them, and fades them."""
-    half = small.gaussians[::2]
-    away = small.cameras.viewmats[:, 2, :3].mean(0) * np.linalg.norm(np.ptp(half.means, axis=0))
-    both = Gaussians.concat([half, replace(half[::3], means=half.means[::3] - away.astype(np.float32))])
-    shown = collect("room", small, {"both": both}, (2, 1))
-    counts = count_views(scene_frame(small).enter(both), scene_frame(small).enter_cameras(small.cameras))
-    scene, side = shown.sides
-    assert (scene.seen, scene.support) == ({}, None)
-    assert side.seen == {"none": (counts == 0).sum(), "one": (counts == 1).sum()}
-    assert side.seen["none"] >= len(half[::3])
-    np.testing.assert_array_equal(np.frombuffer(gzip.decompress(side.support or b""), np.uint8), np.minimum(counts, 2))
-    assert all(view.faded == () for view in shown.views)
-    plain, faint = (
-        cv2.imdecode(np.frombuffer(one[1] or b"", np.uint8), 1).astype(int)
-        for one in (shown.outside.stills, shown.outside.faded)
-    )
-    assert (plain - faint).max() > 20
-    assert shown.outside.faded[0] is None
-    assert 0 < FAINT < 1
-
-
 def test_too_many_gaussians_are_left_out(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     half = small.gaussians[::2]
     monkeypatch.setattr(data, "MAX_GAUSSIANS", len(half) + 1)
@@ -303,33 +244,6 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
     whole, _ = pack_splats(half)
     counts = [unpacked(one)[0]["count"] for one in (content, whole)]
     assert counts[0] == counts[1] - 2
-
-
-def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene) -> None:
-    assert actual.num_superpixels == (int(0.044 * 80 * 60),) * 2
-    assert [view.outlines is None for view in actual.views] == [view.held_out for view in actual.views]
-    view = next(view for view in actual.views if view.place == 1)
-    labels = segment(scene.images, SegmentOptions()).labels[1]
-    picture = cv2.imdecode(np.frombuffer(view.outlines or b"", np.uint8), cv2.IMREAD_UNCHANGED)
-    factor = 320 // 80
-    assert picture.shape == (60 * factor, 80 * factor, 4)
-    lines = picture[..., 3] > 0
-    enlarged = labels.repeat(factor, 0).repeat(factor, 1)[lines]
-    counts = np.bincount(labels.reshape(-1))[:, None]
-    sums = [np.bincount(labels.reshape(-1), channel) for channel in scene.images[1].reshape(-1, 3).T]
-    away = picture[lines][:, 2::-1] / 255 - (np.stack(sums, 1) / counts)[enlarged]
-    assert np.abs(away).max() < 0.5  # a third of the way to black or white, in steps of a fifth
-    assert 0.1 < np.abs(away).mean() < 0.35
-    right, below = lines[factor // 2 :: factor, ::factor], lines[::factor, factor // 2 :: factor]
-    np.testing.assert_array_equal(right[:, 1:], labels[:, 1:] != labels[:, :-1])
-    np.testing.assert_array_equal(below[1:], labels[1:] != labels[:-1])
-    assert not lines[factor // 2 :: factor, factor // 2 :: factor].any()  # the middles of pixels
-
-
-def test_without_photos_there_are_no_superpixels(small: Scene) -> None:
-    none = collect("room", replace(small, images=None, pixels=None), {"half": small.gaussians[::2]}, (2, 1))
-    assert none.num_superpixels is None
-    assert {view.outlines for view in none.views} == {None}
 
 
 def test_many_views_are_thinned(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -85,10 +85,6 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
     for address, still in ((shown[0], 1), (shown[1], 0)):
         assert base64.b64decode(address.removeprefix(WEBP)) == data.views[1].stills[still]
     assert base64.b64decode(stills[0][2].removeprefix(WEBP)) == data.views[0].stills[1]
-    outlines = json.loads(block(page, "outline-pictures"))
-    assert [one and base64.b64decode(one.removeprefix(PNG)) for one in outlines] == [
-        view.outlines for view in data.shown
-    ]
     assert page.index("data:image/webp") < page.index("<script")
     for i, side in enumerate(data.sides):
         assert base64.b64decode(block(page, f"splats-{i}")) == side.splats
@@ -177,32 +173,6 @@ def test_how_much_faster_it_draws(before: float, after: float, words: str, data:
     assert speed(replace(data, sides=data.sides[:1])) is None
 
 
-def test_what_would_be_dropped_has_a_switch(data: ViewData) -> None:
-    bare = tuple(replace(side, dropped={}) for side in data.sides)
-    dropping = (bare[0], replace(bare[1], dropped={"sky": 12}))
-    views = tuple(replace(view, drops=(None, b"one")) for view in data.views)
-    page = page_of(replace(data, sides=dropping, views=views))
-    assert 'data-set="drops"' in page
-    assert json.loads(block(page, "drop-pictures"))[0] == [None, None, f"{PNG}b25l"]
-    assert json.loads(block(page, "data"))["sources"][2]["dropped"] == {"sky": 12}
-    assert 'data-set="drops"' not in page_of(replace(data, sides=bare))
-
-
-def test_what_no_view_shows_has_a_switch(data: ViewData) -> None:
-    bare = tuple(replace(side, seen={}, support=None) for side in data.sides)
-    known = (bare[0], replace(bare[1], seen={"none": 7}, support=b"two"))
-    views = tuple(replace(view, seen=(None, b"one")) for view in data.views)
-    outside = replace(data.outside, faded=(None, b"one"))
-    page = page_of(replace(data, sides=known, views=views, outside=outside))
-    assert 'data-set="seen"' in page
-    assert "--drop unseen" in page
-    assert json.loads(block(page, "seen-pictures"))[0] == [None, None, f"{PNG}b25l"]
-    assert json.loads(block(page, "faded-pictures")) == [None, None, f"{WEBP}b25l"]
-    assert base64.b64decode(block(page, "support-1")) == b"two"
-    assert json.loads(block(page, "data"))["sources"][2]["support"] == "support-1"
-    assert 'data-set="seen"' not in page_of(replace(data, sides=bare))
-
-
 def test_colours_are_readable_in_both_schemes(page: str) -> None:
     """Contrast of at least 4.5 of text on what it stands on."""
     style = re.findall("<style>(.*?)</style>", page, re.DOTALL)[0]
@@ -261,18 +231,6 @@ def test_without_photos(data: ViewData) -> None:
     assert "overlay-share" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
 
 
-def test_without_superpixels(data: ViewData, page: str) -> None:
-    bare = page_of(replace(data, num_superpixels=None))
-    for words in ('data-set="outlines"', "<kbd>O</kbd>", "Superpixels: "):
-        assert words in page
-        assert words not in bare
-
-
-@pytest.mark.parametrize(("counts", "words"), [((1234, 1234), "1,234 of each"), ((900, 1234), "900 to 1,234 of each")])
-def test_views_may_differ_in_superpixels(data: ViewData, counts: tuple[int, int], words: str) -> None:
-    assert f"Superpixels: {words} input photo" in page_of(replace(data, num_superpixels=counts))
-
-
 @pytest.fixture(scope="module")
 def alone() -> ViewData:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
@@ -290,8 +248,8 @@ def test_one_scene_is_compared_with_its_photos(alone: ViewData) -> None:
 
 
 def test_one_scene_without_photos_is_compared_with_nothing(alone: ViewData) -> None:
-    views = tuple(replace(view, photo=None, outlines=None) for view in alone.views)
-    data = replace(alone, views=views, num_superpixels=None)
+    views = tuple(replace(view, photo=None) for view in alone.views)
+    data = replace(alone, views=views)
     page = page_of(data)
     assert (data.scored, data.start) == (False, 0)
     assert json.loads(block(page, "stills"))[0] == [None]

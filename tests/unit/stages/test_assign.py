@@ -17,7 +17,6 @@ from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.frame import canonicalise, scene_frame
 from gsmerge.pooling import scene_members
-from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.assign import assign, find_owners, merge_unseen, middle_pixels, owner_pixels
@@ -95,14 +94,6 @@ def test_frame_is_that_of_the_grid(room: Scene) -> None:
     actual, expected = canonicalise(unaligned_scenes.without_order(room))[1], scene_frame(room)
     assert actual.unit == expected.unit
     assert np.abs(actual.origin - expected.origin).max() < 0.5
-
-
-def test_depths_are_those_of_the_surfaces(room: Scene) -> None:
-    depths, valid = seen_depths(unaligned_scenes.without_order(room))
-    _, expected, _ = scenes.trace(scenes.room(), room.cameras)
-    assert valid.mean() > 0.99
-    error = (depths.reshape(3, -1) / expected - 1)[valid.reshape(3, -1)]
-    assert np.median(np.abs(error)) < 0.01
 
 
 def test_density_is_of_the_gaussians_where_those_are_fewer(room: Scene) -> None:

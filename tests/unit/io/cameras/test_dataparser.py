@@ -7,16 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from exports import smooth_scene
 from messages import refuses
-from program_cameras import FORMATS, W2C
 from sweeps import sweep
 from tiny_scene import FLIP, Tiny, frames_of, rotation, write_colmap_text, write_transforms
 
 from gsmerge.errors import SceneError
-from gsmerge.io import read_cameras
-from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.scene.held_out import read_into_frame
 from gsmerge.scene.read import load_scene
 
@@ -123,30 +119,3 @@ def test_a_damaged_file(tmp_path: Path, text: str, found: object) -> None:
     (tmp_path / "dataparser_transforms.json").write_text(text)
     with refuses(SceneError, "dataparser_transforms.json", found):
         load_scene(tmp_path, cameras=tmp_path / "sparse")
-
-
-MOVE = "<transform><rotation>0 -1 0 1 0 0 0 0 1</rotation><translation>2 4 6</translation><scale>2</scale></transform>"
-
-
-@pytest.mark.parametrize("place", ["<chunk>", '<components><component id="1"/><component id="0">'])
-def test_metashape_s_world_is_a_frame_of_its_largest_component(tmp_path: Path, place: str) -> None:
-    """Metashape's other exports are in this world; those of nerfstudio have the cameras' scale."""
-    path = FORMATS["Metashape"].write(tmp_path)
-    end = "</component></components>" if "id" in place else ""
-    text = path.read_text().replace("<chunk>", f"<chunk>{place.replace('<chunk>', '')}{MOVE}{end}")
-    path.write_text(text.replace("<camera id", '<camera component_id="0" id').replace('"0" id="0"', '"1" id="0"'))
-    cameras, frames = read_cameras(path), read_dataparser(tmp_path / "a.ply", path)
-    assert cameras.names == ("1.png", "2.png")
-    np.testing.assert_allclose(cameras.viewmats, W2C[1:], atol=1e-9)
-    assert [frame.scale for frame in frames] == [2, 1]
-    np.testing.assert_allclose([frame.shift for frame in frames], [(2, 4, 6), (1, 2, 3)])
-    np.testing.assert_allclose(frames[0].rotation @ (1, 0, 0), (0, 1, 0), atol=1e-9)
-    assert read_dataparser(tmp_path / "a.ply", FORMATS["Metashape"].write(tmp_path)) == []
-
-
-@pytest.mark.parametrize("value", ["1 0 0", "0 0 0 0 0 0 0 0 0", "nan nan nan nan nan nan nan nan nan", "a"])
-def test_metashape_s_world_is_checked(tmp_path: Path, value: str) -> None:
-    path = FORMATS["Metashape"].write(tmp_path)
-    path.write_text(path.read_text().replace("<chunk>", f"<chunk>{MOVE}").replace("0 -1 0 1 0 0 0 0 1", value))
-    with refuses(SceneError, "cameras.xml", "expected"):
-        read_dataparser(tmp_path / "a.ply", path)

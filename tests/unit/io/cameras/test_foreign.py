@@ -41,7 +41,13 @@ FILES = [
     ("cameras.npz", "PK\3\4 scale_mat_0.npy", "DTU", "views.npz"),
     ("dino_par.txt", "16\ndino0001.png 3310 0 316", "Middlebury", "transforms.json"),
     ("camera/0001.json", '{"orientation": [[1, 0, 0]', "Nerfies", "transforms.json"),
-    ("scene0000_00.sens", "\4\0\0\0", "ScanNet", "SensReader"),
+    ("scene0000_00.sens", "\4\0\0\0", "ScanNet", "transforms.json"),
+    ("pose/0.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "NSVF", "transforms.json"),
+    ("poses/0.txt", "1 0 0 -.5 0 1 0 0 0 0 1 0 0 0 0 1", "SRN", "transforms.json"),
+    ("pred_traj.txt", "# time tx\n0.0 0 0 1e-3 0 0 0 1\n1.0 0 0 2 0 0 0 1\n", "MonST3R", "evo_traj tum"),
+    ("0a1b.txt", "https://www.youtube.com/watch?v=a\n100 .9 .9 .5 .5 0 0 1 0 0 0 0 1 0 0 0 0 1 0\n", "RealEstate10K",
+     "transforms.json"),
+    ("Barn.log", "0 0 0\n1 0 0 0\n", "Tanks and Temples", "transforms.json"),
     ("seq-01/frame-000000.pose.txt", "1 0 0 0\n", "7-Scenes", "kapture_import_7scenes.py"),
     ("sensors/sensors.txt", "# kapture format: 1.1", "kapture", "kapture_export_colmap.py"),
     ("metadata.json", '{"w": 1, "h": 2, "K": [1], "poses": [[', "Record3D", "ns-process-data record3d"),
@@ -57,7 +63,7 @@ FILES = [
     ("transforms_train.json", '[\n {"file_path": "a.png", "transform": [[', "ns-export", "of the capture"),
     ("a.psht", "\0", "Postshot", "loaded into it"),
     ("a.blend", "BLENDER", "3D programs", "BlenderNeRF"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "start", "program", "remedy"), FILES)
@@ -90,42 +96,13 @@ def test_each_layout_that_is_not_read_is_tried() -> None:
     ("name", "start"),
     [
         ("a.csv", "name,price\n"), ("a.json", '{"transform": [[1'), ("a.xml", "<a/>"), ("a.out", "x"),
-        ("metadata.json", "{}"), ("a.db", "x"), ("cameras.npz", "PK\3\4 extrinsics.npy"), ("a.xmp", "<x:xmpmeta>"),
+        ("metadata.json", "{}"), ("notes.txt", "1 2 3"), ("a.db", "x"), ("cameras.npz", "PK\3\4 extrinsics.npy"),
+        ("a.xmp", "<x:xmpmeta>"),
     ],
 )  # fmt: skip
 def test_files_of_others_are_none(tmp_path: Path, name: str, start: str) -> None:
     (tmp_path / name).write_text(start)
     assert find_unread(tmp_path) is None
-
-
-VIEW = '{"position": {"x": 1}, "rotation": {"w": 1}}'
-
-
-@pytest.mark.parametrize(
-    ("name", "start", "poses"),
-    [
-        ("cameras_unity.json", f'{{"cameras": [{VIEW}, {VIEW}]}}', True),
-        ("unreal.json", '{"Cameras": [' + '{"Location": {"X": 1}, "Rotation": {"Yaw": 2}}, ' * 2 + "{}]}", True),
-        ("luma.json", '{"views": [{"cameraToWorld": [1, 0, 0]}]}', True),
-        ("rt.json", '{"a": {"R": [[1]], "t": [0]}, "b": {"R": [[1]], "t": [0]}}', True),
-        ("blender.csv", "frame,loc_x,loc_y,loc_z,quat_w,quat_x\n1,0", True),
-        ("a.txt", "name tx ty tz qw qx qy qz\na 1", True),
-        ("config.json", '{"position_lr_init": 1, "rotation_lr": 1, "rotation": 2, "extrinsics": true}', False),
-        ("viewer.json", f'{{"camera": {VIEW}}}', False),
-        ("README.txt", "The camera's\nposition and rotation\n", False),
-        ("cloud.csv", "x,y,z,nx,ny,nz,red\n", False),
-        ("a.yaml", "extrinsics: [1]", False),
-    ],
-)
-def test_poses_of_a_program_that_is_not_known_are_told_by_words(
-    tmp_path: Path, name: str, start: str, poses: bool
-) -> None:
-    path = tmp_path / name
-    path.write_text(start)
-    (tmp_path / "a.ply").write_text("ply\n")
-    assert find_scene_files(tmp_path / "a.ply").cameras == (path if poses else None)
-    with refuses(SceneError, name, *(("not known", "transforms.json") if poses else ("found",))):
-        read_cameras(path)
 
 
 def test_cameras_of_a_scene_below_are_its_own(tmp_path: Path, tiny: Tiny) -> None:
@@ -145,7 +122,6 @@ def test_cameras_that_are_read_go_first(tmp_path: Path, tiny: Tiny) -> None:
     assert find_scene_files(tmp_path / "a.ply").cameras == tmp_path / "a.nvm"
     write_transforms(tmp_path / "transforms.json", tiny)
     assert find_cameras(tmp_path) == find_scene_files(tmp_path / "a.ply").cameras == tmp_path / "transforms.json"
-    (tmp_path / "unity.json").write_text(f'{{"cameras": [{VIEW}, {VIEW}]}}')
     (tmp_path / "transforms.json").rename(tmp_path / "b.json")
     assert find_other_cameras(tmp_path) == tmp_path / "b.json"
     (tmp_path / "c.json").write_text((tmp_path / "b.json").read_text())

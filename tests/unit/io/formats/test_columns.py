@@ -11,7 +11,7 @@ from plyfile import PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply
-from gsmerge.io.formats.read import file_notes, read_parts
+from gsmerge.io.formats.read import file_notes
 
 from .test_read import NAMES, columns, save
 
@@ -73,25 +73,6 @@ def test_whole_numbers_that_are_unknown_have_no_note(tmp_path: Path) -> None:
 def test_more_gaussians_in_another_element_are_named(tmp_path: Path) -> None:
     path = save(tmp_path / "a.ply", columns(), before=(PlyElement.describe(columns(), "sky"),))
     assert names(file_notes(read_ply(path).info)[0], "element sky")
-
-
-def test_a_filter_widens_as_mip_splatting_does(tmp_path: Path) -> None:
-    path = with_columns(tmp_path / "a.ply", "filter_3D")
-    plain, rows = read_ply(path), columns(6)
-    old = np.zeros(6, [*rows.dtype.descr, ("filter_3D", "<f4")])
-    for name in NAMES:
-        old[name] = rows[name]
-    old["filter_3D"] = (0, 0.1, 0.5, 2, -1, np.nan)
-    save(path, old)
-    for wide in (read_ply(path), read_parts([path])):
-        squared = plain.gaussians.scales[:5].astype(float) ** 2
-        grown = squared + old["filter_3D"][:5, None].astype(float) ** 2
-        np.testing.assert_allclose(wide.gaussians.scales[:5], np.sqrt(grown), rtol=1e-6)
-        factor = np.sqrt(squared.prod(1) / grown.prod(1))
-        np.testing.assert_allclose(wide.gaussians.opacities[:5], plain.gaussians.opacities[:5] * factor, rtol=1e-5)
-        assert wide.valid.tolist() == [True] * 5 + [False]
-        assert wide.info.extra_columns == ()
-        assert names(file_notes(wide.info)[0], "filter_3D")
 
 
 @pytest.mark.parametrize(

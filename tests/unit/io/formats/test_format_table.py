@@ -10,7 +10,7 @@ from gsmerge.io.cameras import read as camera_reader
 from gsmerge.io.cameras import table as camera_table
 from gsmerge.io.cameras.table import CAMERA_FORMATS
 from gsmerge.io.cameras.view_layout import ViewLayout
-from gsmerge.io.formats import glb, sog, splat, spz, streamed, usd
+from gsmerge.io.formats import glb, sog, splat, spz, streamed
 from gsmerge.io.formats.table import FORMATS, LEVELS
 from gsmerge.runtime.plugins import LazyFunction
 
@@ -31,7 +31,7 @@ def test_a_function_that_a_table_names_is_there(function: LazyFunction) -> None:
 
 
 def test_the_table_has_the_degrees_of_the_writers() -> None:
-    writers = {".sog": sog, ".splat": splat, ".spz": spz, ".glb": glb, ".usdc": usd}
+    writers = {".sog": sog, ".splat": splat, ".spz": spz, ".glb": glb}
     degrees = {ending: writer.MAX_DEGREE for ending, writer in writers.items()}
     assert {row.ending: row.max_degree for row in FORMATS if row.ending in degrees} == degrees
     assert LEVELS.max_degree == streamed.MAX_DEGREE

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import scenes
-from former_formats import spz4_bytes
 from slow_readers import drawn
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry import multiply_quats, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.glb import holds_gaussians
-from gsmerge.io.formats.spz import spz_bytes
-from gsmerge.kernels import elementary
-from gsmerge.types import SH_C0
 
 NAME = "KHR_gaussian_splatting"
 NUMBERS = {"<f4": 5126, "|i1": 5120, "|u1": 5121, "<i2": 5122, "<u2": 5123}
@@ -138,25 +133,6 @@ def test_nodes_move_their_gaussians(scene: Scene, tmp_path: Path) -> None:
     np.testing.assert_allclose(actual.scales[:count], 2 * gaussians.scales, rtol=1e-5)
 
 
-def test_drafts_of_the_extension(scene: Scene, tmp_path: Path) -> None:
-    """Scales as logarithms; and names with an underscore, colours and opacities in those of the points."""
-    gaussians = drawn(scene, 0)
-    columns = attributes_of(gaussians)
-    save_glb(tmp_path / "plain.glb", columns)
-    expected = read_gaussians(tmp_path / "plain.glb").gaussians
-    columns[f"{NAME}:SCALE"] = elementary.log(columns[f"{NAME}:SCALE"])
-    save_glb(tmp_path / "log.glb", columns)
-    same(read_gaussians(tmp_path / "log.glb").gaussians, expected)
-    colors = np.concatenate([0.5 + SH_C0 * gaussians.sh0[:, 0], gaussians.opacities[:, None]], 1)
-    early = {"POSITION": columns["POSITION"], "COLOR_0": np.round(255 * colors.clip(0, 1)).astype(np.uint8)}
-    early |= {f"_{part}": columns[f"{NAME}:{part}"] for part in ("ROTATION", "SCALE")}
-    save_glb(tmp_path / "early.glb", early)
-    actual = read_gaussians(tmp_path / "early.glb").gaussians
-    np.testing.assert_allclose(actual.opacities, expected.opacities, atol=0.5 / 255)
-    inside = ((colors[:, :3] > 0) & (colors[:, :3] < 1)).all(1)
-    np.testing.assert_allclose(actual.sh0[inside], expected.sh0[inside], atol=0.51 / 255 / SH_C0)
-
-
 def test_quantised_values(scene: Scene, tmp_path: Path) -> None:
     gaussians = drawn(scene, 0)
     columns = attributes_of(gaussians)
@@ -170,30 +146,6 @@ def test_quantised_values(scene: Scene, tmp_path: Path) -> None:
     assert np.abs((actual.quats * expected.quats).sum(1)).min() > 0.9998
     np.testing.assert_allclose(actual.scales, expected.scales.clip(0, 1), atol=1 / 65535)
     np.testing.assert_allclose(actual.opacities, expected.opacities, atol=0.5 / 255 + 1e-6)
-
-
-def save_glb_of_spz(path: Path, packed: bytes, name: str, **view: Any) -> None:
-    """Write a ``.spz`` as one primitive of a ``.glb``, as Cesium's tiles have it, in a node that moves it."""
-    columns = {"POSITION": np.frombuffer(packed + bytes(-len(packed) % 12), "<f4").reshape(-1, 3)}
-    document = save_glb(path, columns, [{"mesh": 0, "translation": [1, 2, 3]}], extensions={name: {"bufferView": 0}})
-    document["bufferViews"][0].update({"byteLength": len(packed), **view})
-    document["accessors"] = [{"componentType": 5126, "count": 2, "type": "VEC3"}]
-    put(path, document | {"extensionsRequired": [NAME, name]}, columns["POSITION"].tobytes())
-
-
-@pytest.mark.parametrize("name", [f"{NAME}_compression_spz_2", f"{NAME}_compression_spz"])
-@pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
-def test_a_spz_inside(scene: Scene, tmp_path: Path, name: str, write: Callable[[Gaussians], bytes]) -> None:
-    """Its axes are those of glTF."""
-    path, packed = tmp_path / "a.glb", write(drawn(scene, 3))
-    (tmp_path / "a.spz").write_bytes(packed)
-    save_glb_of_spz(path, packed, name)
-    inside = read_gaussians(tmp_path / "a.spz").gaussians
-    save_glb(tmp_path / "b.glb", attributes_of(inside), [{"mesh": 0, "translation": [1, 2, 3]}])
-    actual = read_gaussians(path)
-    same(actual.gaussians, read_gaussians(tmp_path / "b.glb").gaussians)
-    assert holds_gaussians(path)
-    assert actual.info.file_bytes == path.stat().st_size
 
 
 def test_whether_it_holds_gaussians(scene: Scene, tmp_path: Path) -> None:

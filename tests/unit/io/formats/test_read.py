@@ -16,7 +16,6 @@ from slow_readers import drawn, read_splat, read_spz
 from gsmerge.errors import SceneError
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
-from gsmerge.io.formats import ply
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.read import file_notes, read_parts
 from gsmerge.kernels import elementary
@@ -103,38 +102,6 @@ def test_every_binary_and_text_form_reads_alike(tmp_path: Path) -> None:
     assert read_ply(tmp_path / "d.ply").gaussians.scales.dtype == np.float32
     assert read_ply(tmp_path / "b.ply").info.format == "binary big-endian"
     assert read_ply(tmp_path / "t.ply").info.format == "ascii"
-
-
-TEXTS = {  # rows of x, y and a label, and whether the parser reads them row by row
-    "plain": ("0.1 -2e-3 7\n1e39 nan 255\n", False), "empty lines, tabs": ("\n0.1\t2 7\r\n\n inf 3 0 \n", False),
-    "1_000": ("1_000 2 7\n0 0 0\n", True), "a float as label": ("1 2 7.0\n0 0 0\n", True),
-    "a number too many": ("1 2 7 8\n0 0 0\n", True), "a word": ("1 2 7\n0 x 0\n", True),
-    "a row too few": ("1.0000 2.0000 7\n", True), "faces": ("1 2 7\n0 0 0\n3 0 1 1\n", True),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", TEXTS)
-def test_text_reads_as_by_the_parser(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the same bits, the same header and the same errors; the parser itself is needed for faults and lists."""
-    (text, is_slow), path, calls = TEXTS[case], tmp_path / "a.ply", list[int]()
-    columns = "property float x\nproperty double y\nproperty uchar label\n"
-    faces = "element face 1\nproperty list uchar int ids\n" if case == "faces" else ""
-    head = f"ply\nformat ascii 1.0\ncomment by \N{SNOWMAN}\nelement vertex 2\n{columns}{faces}end_header\n"
-    path.write_bytes((head + text).encode())
-
-    def outcome() -> tuple[str, ...]:
-        try:
-            data = ply.open_ply(path)
-        except SceneError as error:
-            return (str(error),)
-        return data.header, *(str(data["vertex"][name].tolist()) for name in ("x", "y", "label"))
-
-    read = PlyElement._read_txt
-    monkeypatch.setattr(PlyElement, "_read_txt", lambda *args: (calls.append(args[0].count), read(*args))[1])
-    actual = outcome()
-    assert any(calls) == is_slow
-    monkeypatch.setattr(ply, "_read_text", lambda *_: None)
-    assert actual == outcome()
 
 
 def test_float64_positions_keep_their_digits(tmp_path: Path) -> None:

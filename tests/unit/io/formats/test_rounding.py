@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from messages import noted
 
-from gsmerge.io.formats.rounding import as_written, rounding_notes
+from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.splat_transform import VARIABLE
 from gsmerge.io.formats.table import COLMAP, INDEX, OUTPUT_FORMATS
 from gsmerge.types import Gaussians
@@ -39,22 +39,10 @@ def near() -> Gaussians:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_near_the_origin_nothing_is_lost_or_copied(near: Gaussians, name: str) -> None:
-    pytest.importorskip("pxr", reason="usd-core is not installed") if "usd" in name else None
+def test_far_from_the_origin_digits_are_lost(near: Gaussians, name: str) -> None:
     assert rounding_notes(name, near) == []
-    assert as_written(name, near) is near
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_far_from_it_positions_are_those_of_the_file(near: Gaussians, name: str) -> None:
-    pytest.importorskip("pxr") if "usd" in name else None
     far = replace(near, means=near.means + 3e6 * np.array([1, -1, 1]))
     assert noted(rounding_notes(name, far), "--translate=-3000000,3000000,-3000000")
-    actual = as_written(name, far)
-    assert len(actual) == len(far)
-    assert np.abs(actual.means).min() > 2e6
-    if name in ("a.ply", "a.splat", "a.glb", "a.usdc"):
-        np.testing.assert_array_equal(actual.means, far.means.astype(np.float32))
 
 
 def test_colmap_keeps_float64(near: Gaussians) -> None:
@@ -66,4 +54,3 @@ def test_what_is_far_apart_takes_digits_of_a_spz_alone(near: Gaussians) -> None:
     apart = replace(near, means=near.means * factor, scales=near.scales * factor)
     assert noted(rounding_notes("a.spz", apart), "write a .ply")
     assert [rounding_notes(name, apart) for name in ("a.ply", INDEX)] == [[], []]
-    assert len(np.unique(as_written("a.spz", apart).means[:150])) < 20

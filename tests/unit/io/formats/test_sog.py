@@ -17,6 +17,7 @@ from slow_readers import corners, drawn
 from gsmerge import Gaussians
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.sog import fit_codebook, fit_palette, nearest_codes, sog_bytes
+from gsmerge.scene.files import find_scene_files
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +47,19 @@ def test_sog_textures_lose_nothing(gaussians: Gaussians) -> None:
     places = labels.reshape(-1, 3)[: len(gaussians), ::-1].astype(int) @ (1, 256, 0)
     np.testing.assert_array_equal(places, np.arange(len(gaussians)))
     assert (meta["count"], meta["shN"]["bands"], len(meta["shN"]["codebook"])) == (len(gaussians), 3, 256)
+
+
+def test_a_sog_without_its_zip_is_read(gaussians: Gaussians, tmp_path: Path) -> None:
+    """By the path of its ``meta.json``, or of the folder."""
+    write_gaussians(tmp_path / "a.sog", gaussians)
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(tmp_path / "a")
+    expected, actual = (read_gaussians(tmp_path / name) for name in ("a.sog", "a/meta.json"))
+    for column, other in zip(vars(expected.gaussians).values(), vars(actual.gaussians).values(), strict=True):
+        np.testing.assert_array_equal(column, other)
+    assert actual.info.file_bytes == sum(path.stat().st_size for path in (tmp_path / "a").iterdir())
+    assert find_scene_files(tmp_path / "a").ply == tmp_path / "a" / "meta.json"
+    assert read_gaussians(tmp_path / "a").info == actual.info
 
 
 def test_a_codebook_is_nearly_the_best_one() -> None:

@@ -59,7 +59,7 @@ def test_a_compressed_ply_is_read_and_not_written(scene: Scene, tmp_path: Path) 
     assert (actual.info.layout, actual.info.comments) == ("compressed, SH degree 3", ("SplatRenderMode: mip",))
     assert psnr(scene, gaussians, actual.gaussians) > 34
     for name in ("b.compressed.ply", "B.USDA"):
-        with refuses(UsageError, name, "a name that ends in", ".usdz"):
+        with refuses(UsageError, name, "a name that ends in", ".glb"):
             write_gaussians(tmp_path / name, gaussians)
     assert [one.name for one in tmp_path.iterdir()] == ["a.compressed.ply"]
 
@@ -129,7 +129,7 @@ def test_names_ask_for_formats() -> None:
     for name, ending in (("a.ply", ".ply"), ("A.SPZ", ".spz"), ("x/b.splat", ".splat")):
         assert output_format(name).ending == ending
     for name in ("a", "a.ksplat", "ply", "a.ply.gz", "spz/a"):
-        with refuses(UsageError, name, ".ply, .spz, .sog, .splat, .glb, .usdc or .usdz"):
+        with refuses(UsageError, name, ".ply, .spz, .sog, .splat or .glb"):
             output_format(name)
 
 
@@ -142,7 +142,6 @@ def test_models_need_cameras(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
 def test_failures_leave_existing_files_and_nothing_else(ending: str, tmp_path: Path) -> None:
-    pytest.importorskip("pxr", reason="usd-core is not installed") if "usd" in ending else None
     bad, path = replace(corners(), opacities=np.array([0.0, float("nan"), 0.5], np.float32)), tmp_path / f"a{ending}"
     with refuses(ValueError, "", "finite", 1):
         write_gaussians(path, bad)
