@@ -62,7 +62,7 @@ def test_a_scene_too_large_for_the_machine_is_noted_before_it_is_read(
 ) -> None:
     said = "this machine has 0.1 GB"
     assert said not in run("inspect", smallest_copy).out
-    monkeypatch.setattr("gsmerge.runtime.estimate.machine_memory", lambda: 10**8)
+    monkeypatch.setattr("gsmerge.runtime.memory.machine_memory", lambda: 10**8)
     outcome = run("compact", smallest_copy, *QUICK, "--overwrite", code=0)
     assert [line for line in outcome.err.splitlines() if said in line] == outcome.err.splitlines()[:1]
     assert said in run("inspect", smallest_copy).out
