@@ -1,7 +1,4 @@
-"""Photos that come with scikit-image and scikit-learn, and what superpixels of them are worth.
-
-Shared by the tests and ``benchmarks/adaptive_superpixels.py``.
-"""
+"""Photos that come with scikit-image and scikit-learn, and what superpixels of them are worth."""
 
 from __future__ import annotations
 
