@@ -29,9 +29,6 @@ ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
 # Least and largest extent of an orbit to the sides, and up and down, as shares of the distance to its centre. With the
 # least a single photo still looks right. The largest turns the view by 14 degrees to each side.
 HORIZONTAL, VERTICAL = (0.06, 0.25), (0.03, 0.125)
-LEVEL = 0.01  # squared sine of the cameras' turn; above it, their horizons decide "up" more than their mean up does
-MIN_RADIUS = 0.1  # least radius of a turntable, as a share of the depth
-MIN_LEVEL = 0.1  # least length of the level part of a unit direction that can serve as the level direction
 SAME = 1e-9  # cameras count as one up to this distance, as a share of a path's length
 
 

@@ -16,7 +16,6 @@ from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.evidence.pictures import show_views
 from gsmerge.facts.compare_photos import compare_photos, find_matching_views
 from gsmerge.facts.row_colors import ROW_COLORS
-from gsmerge.fit import FitOptions, fit_photos
 from gsmerge.frame import canonicalise
 from gsmerge.types import PicturedScene
 
@@ -194,24 +193,9 @@ def test_sky_stays_where_most_are_wrong(room: Scene) -> None:
     assert "clean" not in same.report.choices
 
 
-def test_an_unaligned_scene_does_without_one(room: Scene) -> None:
-    right, wrong = (
-        compact(with_photos(room, change, aligned=False), **FIT) for change in (lambda photos: photos, one_black)
-    )
-    assert wrong.report.choices["photos_left_out"] == [room.names[3]]
-    assert novel_psnr(wrong.gaussians) > novel_psnr(right.gaussians) - 1
-
-
 def test_no_note_on_good_photos(unspoilt: CompactResult) -> None:
     assert [note for note in unspoilt.report.notes if note != unspoilt.report.worse] == []
     assert "photos_left_out" not in unspoilt.report.choices
-
-
-def test_the_views_of_a_fit(room: Scene) -> None:
-    full, half = fit_photos(PicturedScene.with_pictures(room, room.images, None), FitOptions(), (0, 2, 5))
-    np.testing.assert_array_equal(full.images, room.images[[0, 2, 5]])
-    assert len(half) == 3
-    np.testing.assert_array_equal(half.viewmats, room.cameras.viewmats[[0, 2, 5]])
 
 
 @pytest.mark.slow

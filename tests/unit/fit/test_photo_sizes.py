@@ -19,7 +19,6 @@ from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale, tr
 from gsmerge.fit.schedule import DrawMode, prepare_fit
 from gsmerge.geometry import project
 from gsmerge.raster.photos import EPS2D, MASKED, scene_photos, score_photos
-from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import LargePhotos, PicturedScene
 
@@ -75,15 +74,6 @@ def test_less_than_asked_for_is_said(
     actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=True)
     assert actual == pytest.approx(expected, rel=0.02)
     assert problem.startswith(reason)
-
-
-def test_larger_photos_are_recorded(scene: Scene) -> None:
-    for scale, levels in ((1.0, 2), (2.0, 3)):
-        with record_run() as record:
-            photos = fit_photos(with_large(scene, 2), FitOptions(photo_scale=scale))
-        assert len(photos) == levels
-        assert record.choices == ({"photo_scale": scale} if scale > 1 else {})
-        assert len(record.notes) == levels - 2
 
 
 def test_photos_of_the_views_size_are_no_larger(scene: Scene) -> None:

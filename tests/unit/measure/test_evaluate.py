@@ -130,14 +130,6 @@ def test_without_photos_and_pixels_the_input_s_renders_are_the_reference(scene: 
     assert document["results"][0]["mean"]["context"]["psnr"] is None  # strict JSON knows no infinity
 
 
-def test_views_of_another_world_are_noted(scene: Scene) -> None:
-    away = held_out()
-    viewmats = away.cameras.viewmats.copy()
-    viewmats[:, 0, 3] -= 50
-    away = replace(away, cameras=replace(away.cameras, viewmats=viewmats))
-    assert "world" in evaluate(scene, {}, away, PLAIN).notes[0]
-
-
 def test_a_scene_in_no_order(scene: Scene, half: Gaussians) -> None:
     unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     actual = evaluate(unaligned, {"half": half}, held_out(), PLAIN)
@@ -155,11 +147,6 @@ def test_units_change_nothing(factor: float, scene: Scene, half: Gaussians) -> N
     usual = evaluate(scene, {"half": half}, None, PLAIN)
     for one, other in zip(actual.results[1].scores, usual.results[1].scores, strict=True):
         assert one.full.psnr == pytest.approx(other.full.psnr, abs=0.05)
-
-
-def test_targets_alone(scene: Scene) -> None:
-    actual = evaluate(scene, {}, held_out(), replace(PLAIN, context=False))
-    assert actual.num_views == {"target": 2}
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -395,13 +382,6 @@ def test_what_results_are_compared_with(scene: Scene) -> None:
     assert evaluate(unaligned, {}, held_out(), PLAIN).reference == "photos, and renders of the input in its own views"
     assert evaluate(bare, {}, held_out(), PLAIN).reference == f"photos, and {ROW_COLORS} in its own views"
     assert evaluate(bare, {}, held_out(), replace(PLAIN, context=False)).reference == "photos"
-
-
-def test_means_leave_out_what_was_not_measured(actual: Evaluation) -> None:
-    full, masked = actual.results[1].mean("target")
-    scores = [s for s in actual.results[1].scores if s.split == "target"]
-    assert full.psnr == pytest.approx(np.mean([s.full.psnr for s in scores]))
-    assert masked.lpips_vgg is None
 
 
 def test_scores_are_described_in_one_line(scene: Scene, actual: Evaluation) -> None:

