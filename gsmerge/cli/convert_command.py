@@ -24,11 +24,10 @@ class PhotoOptions(Settings):
 
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
-                 "Files or folders of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb, lod-meta.json, "
-                 ".ksplat, meta.json, .lcc or .lcc2. Several files in one coordinate frame are joined. The last path "
-                 "is the output, and its name sets the format: .ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html (a "
-                 "page to send), lod-meta.json, a folder, or a folder named colmap. Or a .gsm of gsmerge extend, and "
-                 "a .npz for the arrays of its Feature Gaussians."),
+                 "Files or folders of Gaussians, such as a .ply, .spz or .sog. Several files in one coordinate frame "
+                 "are joined. The last path is the output, and its name sets the format, also .html (a page to send), "
+                 "lod-meta.json, a folder, or a folder named colmap. Or a .gsm of gsmerge extend, and a .npz for the "
+                 "arrays of its Feature Gaussians."),
     opt.changed("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
     opt.changed("hint", help="How the files store opacity and scales, if it is not recognised: opacity=logit or "

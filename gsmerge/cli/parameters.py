@@ -390,12 +390,12 @@ def named_or_none(text: str) -> Path | str:
 
 BEFORE = argument("before", Path, "BEFORE", "The scene: a .ply, or the folder that holds it.")
 AFTER = argument(
-    "after", list[Path] | None, "[AFTER]...", "Its compact files: .ply, .spz, .sog, .splat or .glb.", default=None
+    "after", list[Path] | None, "[AFTER]...", "Its compact files, such as small.ply or small.spz.", default=None
 )
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder that holds it.")
 
 # Shared by commands: a text, and names of options
-COMPACT_SCENE = "The compact scene; the ending sets the format: .ply, .spz, .sog, .splat, .glb, .usdc or .usdz."
+COMPACT_SCENE = "The compact scene; the ending sets the format, such as .ply, .spz or .sog."
 READING = "cameras images hint"
 TARGETS = "targets target_images"
 
