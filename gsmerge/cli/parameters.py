@@ -281,8 +281,8 @@ def setting_option(
     kinds = [kind for kind in declared.kinds if kind is not NoneType]
     metavar = metavar or (METAVARS[kinds[0]] if kinds else "|".join(declared.words))
     wording = wording or (None if declared.default is None else str(declared.default))
-    parse = partial(parse_value, flags[0], declared=declared)
-    return option(name, str, declared.help, *flags, metavar=metavar, wording=wording, parser=parse, **more)
+    more = {"parser": partial(parse_value, flags[0], declared=declared)} | more
+    return option(name, str, declared.help, *flags, metavar=metavar, wording=wording, **more)
 
 
 def switch(name: str, help: str, *short: str, **more: Any) -> Declared:
@@ -422,7 +422,8 @@ _TABLE = (
     panel(
         COUNT,
         setting_option("k", metavar="1-8|mixed|auto"),
-        setting_option("budget", metavar="40000|2%|5MB|DEVICE|auto"),
+        # A text, as reports and finished batches have it
+        setting_option("budget", metavar="40000|2%|5MB|DEVICE|auto", parser=str),
         setting_option("quality", metavar="30dB|-0.2dB"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),
     ),
