@@ -24,10 +24,9 @@ class PhotoOptions(Settings):
 
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
-                 "Files or folders of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb, lod-meta.json, "
-                 "meta.json. Several files in one coordinate frame are joined. The last path "
-                 "is the output, and its name sets the format: .ply, .spz, .sog, .splat, .glb, .html (a "
-                 "page to send), lod-meta.json, a folder, or a folder named colmap."),
+                 "Files or folders of Gaussians, such as a .ply, .spz or .sog. Several files in one coordinate frame "
+                 "are joined. The last path is the output, and its name sets the format, also .html (a page to send), "
+                 "lod-meta.json, a folder, or a folder named colmap."),
     opt.changed("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
     opt.changed("hint", help="How the files store opacity and scales, if it is not recognised: opacity=logit or "

@@ -277,8 +277,8 @@ def setting_option(
     kinds = [kind for kind in declared.kinds if kind is not NoneType]
     metavar = metavar or (METAVARS[kinds[0]] if kinds else "|".join(declared.words))
     wording = wording or (None if declared.default is None else str(declared.default))
-    parse = partial(parse_value, flags[0], declared=declared)
-    return option(name, str, declared.help, *flags, metavar=metavar, wording=wording, parser=parse, **more)
+    more = {"parser": partial(parse_value, flags[0], declared=declared)} | more
+    return option(name, str, declared.help, *flags, metavar=metavar, wording=wording, **more)
 
 
 def switch(name: str, help: str, *short: str, **more: Any) -> Declared:
@@ -386,12 +386,12 @@ def named_or_none(text: str) -> Path | str:
 
 BEFORE = argument("before", Path, "BEFORE", "The scene: a .ply, or the folder that holds it.")
 AFTER = argument(
-    "after", list[Path] | None, "[AFTER]...", "Its compact files: .ply, .spz, .sog, .splat or .glb.", default=None
+    "after", list[Path] | None, "[AFTER]...", "Its compact files, such as small.ply or small.spz.", default=None
 )
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder that holds it.")
 
 # Shared by commands: a text, and names of options
-COMPACT_SCENE = "The compact scene; the ending sets the format: .ply, .spz, .sog, .splat or .glb."
+COMPACT_SCENE = "The compact scene; the ending sets the format, such as .ply, .spz or .sog."
 READING = "cameras images hint"
 TARGETS = "targets target_images"
 
@@ -418,7 +418,8 @@ _TABLE = (
     panel(
         COUNT,
         setting_option("k", metavar="1-8|mixed|auto"),
-        setting_option("budget", metavar="40000|2%|5MB|DEVICE|auto"),
+        # A text, as reports and finished batches have it
+        setting_option("budget", metavar="40000|2%|5MB|DEVICE|auto", parser=str),
         setting_option("quality", metavar="30dB|-0.2dB"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),
     ),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 from messages import refuse_all, refuses
 
-from gsmerge.cli.parameters import Args, parse_pairs
+from gsmerge.cli.parameters import OPTIONS, Args, parse_pairs
 from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
@@ -64,6 +65,13 @@ def test_options_and_set_are_one() -> None:
         (Args(k=2, set=["k=3"]).settings, "--set k", "--k"), (Args(set=["iou=2"]).settings, "--set iou", "0 to 1", 2),
         (lambda: Args(set=["fit=full"]).settings(fit="none"), "--set fit", "unknown", "--set help"),
     ])  # fmt: skip
+
+
+def test_words_of_options_become_values() -> None:
+    """A budget stays a text: batches compare it with that of finished results."""
+    words = {"budget": "300", "k": "2", "seed": "3", "effort": "fast", "cameras": "none", "images": "a/b"}
+    values = {name: OPTIONS[name].read(word, ()) for name, word in words.items()}
+    assert values == {"budget": "300", "k": 2, "seed": 3, "effort": "fast", "cameras": "none", "images": Path("a/b")}
 
 
 def test_several_kinds_of_settings() -> None:
