@@ -9,7 +9,7 @@ mean colour, because wrong depth displaces few Gaussians across a block.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -18,6 +18,7 @@ from gsmerge.evidence.pictures import Pairs
 from gsmerge.evidence.scores import stands_out
 from gsmerge.frozen import dataclass
 from gsmerge.kernels.matrices import matmul, solve
+from gsmerge.runtime.threads import parallel_map
 
 BLOCKS = 12  # along the longer side
 SOLID = 0.2  # least opacity of a block that is compared; fainter blocks show only a few Gaussians
@@ -37,13 +38,14 @@ class Blocks:
     pictures: np.ndarray  # [v,H,W,3] colours of the Gaussians
     solid: np.ndarray  # [v,H,W] True where a block is opaque enough to be compared
 
-    def errors(self) -> np.ndarray:
-        """Return the mean difference ``[n]`` between photo and picture, for each block; NaN if faint."""
-        return self.distances(self.pictures)
+    def errors(self, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
+        """Return the mean difference ``[n]`` between photo and picture, for each block of some views; NaN if faint."""
+        return self.distances(self.pictures, views)
 
-    def distances(self, colors: np.ndarray) -> np.ndarray:
+    def distances(self, colors: np.ndarray, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
         """Return the mean difference ``[n]`` between photos and ``colors [v,H,W,3]``, for each block; NaN if faint."""
-        return np.where(self.solid, np.abs(self.photos - colors).mean(-1), np.nan).reshape(-1)
+        differences = np.abs(self.photos - colors).mean(-1)
+        return np.where(self.solid, differences, np.nan)[views].reshape(-1)
 
 
 def is_visible(errors: np.ndarray) -> bool:
@@ -96,10 +98,17 @@ def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
     return np.asarray((matmul(flat, matrix[:3]) + matrix[3]).reshape(photo.shape), np.float32)
 
 
-def tone_blocks(pairs: Pairs) -> Blocks:
-    """Return blocks of photos after a tone curve; see :func:`_cross_fit`."""
-    shown = pairs.shown
-    return cut_blocks(pairs.with_photos(_cross_fit(pairs.photos, shown.pictures, shown.weights, _tone_change)))
+def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
+    """Return blocks of photos after a tone curve for each group of views; see :func:`_cross_fit`."""
+    toned = pairs.photos.copy()
+
+    def fit(group: Sequence[int]) -> None:
+        group_pairs = pairs[group]
+        shown = group_pairs.shown
+        toned[group] = _cross_fit(group_pairs.photos, shown.pictures, shown.weights, _tone_change)
+
+    parallel_map(fit, groups)
+    return cut_blocks(pairs.with_photos(toned))
 
 
 def map_blocks(blocks: Blocks) -> Blocks:

@@ -47,7 +47,6 @@ WINDOW = np.full(5, 1 / 5, np.float32)
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
 MIDDLE_GREY = 128  # level of 255 at which notes report the change of tone
-MOSTLY = 0.5  # share of a photo that differs from its Gaussians, above which none of it counts
 LEAST_PERCENT = 1  # of a photo; no note says that less of it differs
 STRAY_PHOTOS = "do not show what the Gaussians show"  # said of photos that are not used
 
@@ -71,12 +70,11 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     stray = [view for view in photo_views if view not in matching]
     if stray and not _leave_out(scene, stray, photo_views):
         return scene, ()
-    tone = find_tone(scene, pairs, matching)
-    changes = [PhotoChange(tone if view in matching else None) for view in range(len(scene))]
-    if tone is not None:
-        factor = float(tone[:, MIDDLE_GREY].mean()) / (MIDDLE_GREY / 255)
-        cause = "another tone than their Gaussians (exposure, gamma or linear light)"
-        note(f"the photos have {cause}, which is corrected; middle grey times {factor:.2f}")
+    tones = find_tones(pairs, matching)
+    if pairs.shown.drawn and not have_other_tones(scene, matching):
+        tones = [None] * len(pairs)
+    changes = [PhotoChange(curve) for curve in tones]
+    _note_tones(scene, changes, matching)
     hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
     if scene.has_own_pixels:
         hidden, pictures = _find_hidden(scene, changes)
@@ -87,22 +85,26 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching)
 
 
-def find_tone(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> np.ndarray | None:
-    """Find the tone curve ``[3,256]`` from the photos of some views to their Gaussians; None if they have one tone.
+def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
+    """Find the tone curves ``[3,256]`` from photos to their Gaussians; None for a photo with the right tone.
 
-    A curve that changes photos by less than a step does not count, because models have a tone of their own. A curve
-    also has to work in the other direction, from Gaussians to photos. Otherwise the cause is noise, which flattens the
-    colours of the Gaussians. Single photos of another tone differ from their Gaussians in most pixels, see
-    :func:`_find_hidden`.
+    Drawings have one curve for all photos. If no photo changes by at least a step, no curve counts, because models have
+    a tone of their own. A curve also has to work in the other direction, from Gaussians to photos. Otherwise the cause
+    is noise, which flattens the colours of the Gaussians.
     """
-    pairs = pairs[views]
-    stored, toned, back = cut_blocks(pairs), tone_blocks(pairs), tone_blocks(pairs.exchange())
-    before = stored.errors()
-    is_tone = explains(before, toned.errors()) and stands_out(before - back.errors())
-    if not is_tone or np.nanmedian(stored.distances(toned.photos)) <= STEP or not have_other_tones(scene, views):
-        return None
-    colors, targets = (images.reshape(-1, 3) for images in (pairs.photos, pairs.shown.pictures))
-    return fit_tones(colors, targets, pairs.shown.weights.reshape(-1))
+    curves, is_clear = list[np.ndarray | None]([None] * len(pairs)), False
+    stored, groups = cut_blocks(pairs), _group(pairs, views)
+    groups = [group for group in groups if is_visible(stored.errors(group))]
+    toned, back = tone_blocks(pairs, groups), tone_blocks(pairs.exchange(), groups)
+    for group in groups:
+        before = stored.errors(group)
+        if explains(before, toned.errors(group)) and stands_out(before - back.errors(group)):
+            is_clear |= bool(np.nanmedian(stored.distances(toned.photos, group)) > STEP)
+            colors, targets = (images[group].reshape(-1, 3) for images in (pairs.photos, pairs.shown.pictures))
+            curve = fit_tones(colors, targets, pairs.shown.weights[group].reshape(-1))
+            for view in group:
+                curves[view] = curve
+    return curves if is_clear else [None] * len(pairs)
 
 
 def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
@@ -121,6 +123,14 @@ def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
     colors = sh0_to_rgb(scene.gaussians.sh0[rows, 0]).clip(0, 1)
     curve = fit_tones(levels, colors, np.ones(len(levels), np.float32))
     return bool(np.median(np.abs(map_tones(curve, levels) - levels).mean(1)) > STEP)
+
+
+def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
+    """Group the views by tone curve: one group if their pictures are drawings, because these show tones less exactly.
+
+    Otherwise each view is a group of its own.
+    """
+    return [list(views)] if pairs.shown.drawn else [[view] for view in views]
 
 
 def find_matching_views(
@@ -171,7 +181,7 @@ def _is_mapped(pairs: Pairs) -> bool:
     stored = cut_blocks(pairs)
     if not is_visible(stored.errors()):
         return False
-    toned, mapped = tone_blocks(pairs), map_blocks(stored)
+    toned, mapped = tone_blocks(pairs, _group(pairs, range(len(pairs)))), map_blocks(stored)
     simpler = toned, plain_blocks(stored)
     return is_visible(toned.errors()) and all(explains(blocks.errors(), mapped.errors()) for blocks in simpler)
 
@@ -186,6 +196,22 @@ def _leave_out(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence
         result = f", so no photo is used: {listed}; check their names and order"
     note(f"{len(stray)} of {len(photo_views)} photos {STRAY_PHOTOS}{result}")
     return are_few
+
+
+def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Sequence[int]) -> None:
+    """Note by which factors the tones of photos change."""
+    toned = {view: changes[view].tones for view in views if changes[view].tones is not None}
+    if not toned:
+        return
+    factors = [
+        float(curve[:, MIDDLE_GREY].mean()) / (MIDDLE_GREY / 255) for curve in toned.values() if curve is not None
+    ]
+    low, high = min(factors), max(factors)
+    factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
+    note(
+        f"{len(toned)} of {len(views)} photos have another tone than their Gaussians (exposure, gamma or linear"
+        f" light), which is corrected; middle grey times {factor}: {list_some([scene.names[view] for view in toned])}"
+    )
 
 
 def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int]) -> None:
@@ -228,7 +254,6 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     known = shown & (scene.gaussians.opacities[pixels.fronts] > FAINT) & inside
     hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
     picture_rows(scene, differ_drawn, np.asarray((hidden | ~inside).any((1, 2))))
-    hidden[hidden.mean((1, 2)) > MOSTLY] = True  # the photo has another tone
     return hidden, pictures
 
 

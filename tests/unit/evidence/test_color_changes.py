@@ -42,6 +42,9 @@ def mix(photos: np.ndarray) -> np.ndarray:
     return np.asarray(0.1 + photos @ np.array([[0.2, 0.5, 0.1], [0.3, 0.1, 0.6], [0.4, 0.2, 0.1]], np.float32))
 
 
+GROUPS = [[0, 1, 2, 3]]
+
+
 def test_a_curve_joins_quantiles() -> None:
     pairs = pair(gamma)
     colors, targets = pairs.photos.reshape(-1, 3), pairs.shown.pictures.reshape(-1, 3)
@@ -79,13 +82,13 @@ def test_a_map_is_least_squares() -> None:
 def test_a_change_explains_what_it_made(change: Change) -> None:
     pairs = pair(change, noise=0.02)
     stored = cut_blocks(pairs)
-    after = tone_blocks(pairs) if change is gamma else map_blocks(stored)
+    after = tone_blocks(pairs, GROUPS) if change is gamma else map_blocks(stored)
     assert is_visible(stored.errors())
     assert explains(stored.errors(), after.errors())
     assert not is_visible(after.errors())
     if change is mix:
         assert explains(plain_blocks(stored).errors(), after.errors())
-        assert is_visible(tone_blocks(pairs).errors())
+        assert is_visible(tone_blocks(pairs, GROUPS).errors())
 
 
 def test_noise_is_explained_by_nothing() -> None:
