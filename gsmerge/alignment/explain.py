@@ -6,6 +6,7 @@ import numpy as np
 
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import Alignment, AlignmentInput, check_pairs, sample_pixels
+from gsmerge.alignment.unaligned import MAX_FRONT_RATIO, check_cameras
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import FileInfo
@@ -24,14 +25,20 @@ def count_error(ply: FileInfo, cameras: Cameras) -> SceneError:
 
 
 def check_frame(inputs: AlignmentInput, camera_file: CameraFile) -> None:
-    """Raise SceneError if the rows are in order the pixels of some cameras, but not of most of the file's cameras."""
+    """Raise SceneError if the rows are in order the pixels of some cameras, but not of most of the file's cameras.
+
+    The views may be in another order if photos show the colours of the rows.
+    """
     cameras = inputs.cameras
     if inputs.order == "none" or len(inputs.gaussians) != len(cameras) * cameras.width * cameras.height:
         return
     pairs = sample_pixels(inputs.gaussians, cameras, inputs.valid)
     alignment, first_view = check_pairs(pairs, cameras), pairs.select(pairs.views == 0)
-    are_most_wrong = float(np.nanmedian([*alignment.median_px, np.inf])) >= alignment.limit_px
-    if are_most_wrong and projective_error(first_view.points, first_view.pixels) < _SOME_CAMERA * alignment.limit_px:
+    if float(np.nanmedian([*alignment.median_px, np.inf])) < alignment.limit_px:
+        return
+    are_pixels = projective_error(first_view.points, first_view.pixels) < _SOME_CAMERA * alignment.limit_px
+    shown = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True)
+    if are_pixels and not shown.color_ratio <= MAX_FRONT_RATIO:
         raise misalignment_error(camera_file.path, alignment, None)
 
 

@@ -307,18 +307,18 @@ def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence
     """
     from gsmerge.alignment.explain import check_frame, count_error
     from gsmerge.alignment.unaligned import choose_cameras
-    from gsmerge.alignment.upright import solve_upright
+    from gsmerge.alignment.upright import solve_upright, upright_rotation
 
     camera_file, inputs = source.camera_file, source.inputs(grid)
-    if not len(inputs.images):  # photos show by their colours whether the cameras see the Gaussians
-        check_frame(inputs, camera_file)
+    check_frame(inputs, camera_file)
     if source.scale is not None:
         grid = replace(grid, cameras=scale_by(source.scale).move(grid.cameras))
     no_pixels, more_notes = count_error(source.ply.info, grid.cameras), list[str]()
-    upright = solve_upright(inputs)
-    if upright is None:
+    rotation = upright_rotation(inputs)
+    if rotation is None:
         place, more_notes = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), no_pixels)
     else:
+        upright = solve_upright(inputs, rotation, source.ply.info.path)
         place = PlacedGrid(grid, upright, "photos' colours")
     cameras, camera_file = place.cameras, place.grid.camera_file
     if place.frame is not IDENTITY:

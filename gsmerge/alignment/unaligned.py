@@ -30,7 +30,7 @@ _SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to count those that cam
 _COMPARED_GAUSSIANS = 5000
 _MIN_GAUSSIANS, _MAX_PROJECTED = 200, 4_000_000  # least number of Gaussians, and most Gaussians times cameras
 _MIN_SEEN = 0.5  # share of the Gaussians that must be in some camera
-_MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, but for only the foremost Gaussians in a frame chosen by colours
+MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, but for only the foremost Gaussians in a frame chosen by colours
 # Largest depth of a foremost Gaussian, divided by the least depth in its cell; and mean number of Gaussians per cell
 _FRONT, _PER_CELL = 1.05, 3
 _SCALES = np.geomspace(1 / 30, 30, 55)  # of the cameras' positions, tried in turn
@@ -212,7 +212,7 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels
     ``name`` describes the cameras in words. The message begins with the problem of ``no_pixels``.
     """
     ratio = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True).color_ratio
-    if ratio > _MAX_FRONT_RATIO:
+    if ratio > MAX_FRONT_RATIO:
         measured = (
             f"even with cameras {name} the colours of the foremost Gaussians are {ratio:.2f} times as far from the"
             " photos as from random pixels"

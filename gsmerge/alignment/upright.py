@@ -18,6 +18,7 @@ import numpy as np
 from gsmerge.alignment.frames import UPRIGHT, ray_directions, solve_frame
 from gsmerge.alignment.layouts import TRIMS
 from gsmerge.alignment.score import AlignmentInput, Correspondences, pixel_errors, pixel_limit
+from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.geometry import Similarity, sh0_to_rgb
 from gsmerge.kernels.matrices import matmul
@@ -53,7 +54,7 @@ class _Stretch:
     high: int  # end of the places, exclusive
 
 
-def _find_rotation(inputs: AlignmentInput) -> Similarity | None:
+def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
     """Find the camera from which rows were centred, rescaled and turned upright; return the rotation, or None."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
     sample = means[:: max(1, len(means) // _ROUGH_ROWS)]
@@ -73,19 +74,18 @@ def _deviation(points: np.ndarray) -> float:
     return max(float(np.abs(np.median(points, 0)).max()), abs(quantile - 1))
 
 
-def solve_upright(inputs: AlignmentInput) -> Similarity | None:
-    """Solve for the frame of upright rows from their colours in the photos.
-
-    None for rows in another frame, without photos, and if too few stretches agree.
-    """
-    rotation = _find_rotation(inputs) if len(inputs.images) else None
-    if rotation is None:
-        return None
-    for pixels, stretches in _possible_orders(len(inputs.gaussians), inputs.cameras):
+def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Similarity:
+    """Solve for the frame of upright rows from their colours in the photos; SceneError if too few stretches agree."""
+    for pixels, stretches in _possible_orders(len(inputs.gaussians), inputs.cameras) if len(inputs.images) else ():
         frame = _solve_agreed_frame(inputs, *_match(inputs, stretches, pixels), rotation)
         if frame is not None:
             return frame
-    return None
+    raise SceneError(
+        path,
+        "expected cameras in the frame of the Gaussians, found Gaussians that were centred, rescaled and turned upright"
+        " by amounts that no file states, and no photos that show where they lie",
+        "give the photos that the model saw, or cameras in the frame of the Gaussians",
+    )
 
 
 def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray, list[_Stretch]]]:

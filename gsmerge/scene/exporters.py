@@ -88,7 +88,6 @@ _WITH_CAMERAS = "read without pixels; photos are used where cameras are named"
 _TRAINED = "iteration_*/point_cloud.ply", "cameras.json of the run has the cameras: name its folder, or the file itself"
 
 _EXPORTERS = (
-    # Its own renderer uses the stored rotations as they are, so they are never read in another convention.
     Exporter(
         "da3",
         (
@@ -96,19 +95,13 @@ _EXPORTERS = (
                 "Depth Anything 3", "ByteDance-Seed/Depth-Anything-3 2c21ea8; `utils/export/gs.py` 831637d",
                 "`gs_ply/0000.ply` without borders and the farthest tenth of each view; cameras of the nested model in"
                 " another unit, in `exports/*/results.npz` or COLMAP's files where they are asked for",
-                'read right with `export_format="npz-gs_ply"`, `"mini_npz-gs_ply"` or `"colmap-gs_ply"`; `gs_ply` alone'
-                ' without the farthest tenth; of `"npz"` alone the depth maps',
+                'read right with `export_format="npz-gs_ply"`, `"mini_npz-gs_ply"` or `"colmap-gs_ply"`, and alone',
                 "0000.ply", 'export_format="npz-gs_ply" writes its cameras beside the file',
-            ),
-            Model(
-                "DA3-Streaming", "ByteDance-Seed/Depth-Anything-3 2c21ea8, `da3_streaming/`",
-                "`camera_poses.txt`, `intrinsic.txt`, and `results_output/frame_N.npz` with `save_depth_conf_result`",
-                "the depth maps of all chunks, as one scene",
             ),
             Model(
                 "Lyra 2", "nv-tlabs/lyra 67392d9",
                 "`reconstructed_scene.ply` of half the size, without borders; `cameras.npz`",
-                "read right with its frames",
+                f"{_NO_PIXELS}, with its frames",
                 "reconstructed_scene.ply", "its cameras.npz has the cameras: keep it beside the file",
             ),
         ),
@@ -127,7 +120,7 @@ _EXPORTERS = (
         (
             Model(
                 "pixelSplat's figure script", "dcharatan/pixelsplat 32b1b66",
-                "`point_clouds/SCENE/gaussians.ply`, far pixels dropped; no cameras", _NAME_CAMERAS,
+                "`point_clouds/SCENE/gaussians.ply`, far pixels dropped; no cameras", _WITH_CAMERAS,
             ),
         ),
         "raw", "view-fastest",
@@ -137,7 +130,7 @@ _EXPORTERS = (
         (
             Model(
                 "MVSplat", "donydchen/mvsplat 175b17a",
-                "`point_clouds/SCENE/gaussians.ply` of two views, far pixels dropped; no cameras", _NAME_CAMERAS,
+                "`point_clouds/SCENE/gaussians.ply` of two views, far pixels dropped; no cameras", _WITH_CAMERAS,
             ),
         ),
         "raw", "view-fastest",
@@ -188,7 +181,7 @@ _EXPORTERS = (
         (
             Model(
                 "ReSplat", "copies: mohammed1916/resplat, baoxperceptionio/resplat",
-                "`gaussians.ply` on a grid of a quarter of the photos' size; `input/`; no cameras", _NAME_CAMERAS,
+                "`gaussians.ply` on a grid of a quarter of the photos' size; `input/`; no cameras", _WITH_CAMERAS,
             ),
         ),
         "logit", "view-major", degrees=(3,),
@@ -218,7 +211,7 @@ _EXPORTERS = (
             Model(
                 "VicaSplat", "WU-CVGL/VicaSplat d1e9368; `demo.py` 4282959, `ply_export.py` 0db1ad3",
                 "opacities from 0.005 on, sorted; harmonics in axes of their own; `transforms.json` as a list of poses"
-                " without intrinsics, `context/`", f"{_NO_PIXELS}; the focal length is searched",
+                " without intrinsics, `context/`", f"{_NO_PIXELS}; add the focal length to its poses",
             ),
             Model("NAS3R", "mxlcanfly/NAS3R 2ad17fa", "as VicaSplat, with raw opacities; no cameras", _WITH_CAMERAS),
         ),

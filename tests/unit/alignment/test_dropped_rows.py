@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exports import da3_rows, export_rows, of_pixels, save_export, smooth_scene
-from messages import noted
 from sweeps import sweep
 
 from gsmerge.alignment.dropped_rows import find_dropped_grid
@@ -31,20 +30,6 @@ def test_dropped_pixels(tmp_path: Path, dropped: float | str, size: tuple[int, i
     same = np.intersect1d(actual, kept)
     right = np.abs((of_pixels(scene, "opacities") - tiny.gaussians.opacities)[same]) < 1e-5
     assert float(right.mean()) > 0.99
-
-
-def test_rows_alone(tmp_path: Path) -> None:
-    """Cameras and pixels without any file beside the rows, of which the farthest tenth and borders are missing."""
-    tiny = smooth_scene(64, 48)
-    kept = da3_rows(tiny)
-    loaded = load_scene(save_export(tmp_path, tiny, export_rows(tiny, kept), cameras=False) / "scene.ply")
-    scene = loaded.pixel_scene()
-    assert loaded.cameras is not None
-    assert loaded.cameras.source == "estimated from the grid"
-    assert noted(loaded.notes, "own grid")
-    assert scene.num_gaussians >= 0.99 * len(kept)
-    assert np.allclose(scene.cameras.Ks[:, 0, 0], tiny.K[0, 0], rtol=0.02)
-    assert np.allclose(scene.cameras.centres, tiny.c2w[:, :3, 3], atol=0.05)
 
 
 def test_gaussians_anywhere_in_their_pixels() -> None:

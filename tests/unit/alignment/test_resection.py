@@ -32,29 +32,14 @@ def shown(noise: float, seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarra
     return points, pixels
 
 
-def test_exact_pixels_give_the_poses():
+@pytest.mark.parametrize(
+    ("guess", "free"), [(K, 0), (K * [[1.4, 1, 1], [1, 1.4, 1], [1, 1, 1]], ONE_FOCAL),
+                        (np.array([[330.0, 0, 150], [0, 280, 126], [0, 0, 1]]), ALL_INTRINSICS)],
+)  # fmt: skip
+def test_exact_pixels_give_poses_and_intrinsics(guess: np.ndarray, free: int):
     points, pixels = shown(0.0)
-    starts = np.stack([start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)])
-    near_K, poses = refine_poses(points, pixels, K, starts)
-    np.testing.assert_array_equal(near_K, K)
-    np.testing.assert_allclose(poses, TRUE, atol=1e-9)
-
-
-def test_the_focal_length_is_found():
-    points, pixels = shown(0.0)
-    guess = np.diag([1.4, 1.4, 1]) @ (K * [[1], [1], [1]])
-    guess[:2, 2] = K[:2, 2]
     starts = np.stack([start_pose(p, q, guess) for p, q in zip(points, pixels, strict=True)])
-    near_K, poses = refine_poses(points, pixels, guess, starts, free=ONE_FOCAL)
-    np.testing.assert_allclose(near_K, K, atol=1e-6)
-    np.testing.assert_allclose(poses, TRUE, atol=1e-7)
-
-
-def test_all_intrinsics_are_found():
-    points, pixels = shown(0.0)
-    guess = np.array([[330.0, 0, 150], [0, 280, 126], [0, 0, 1]])
-    starts = np.stack([start_pose(p, q, guess) for p, q in zip(points, pixels, strict=True)])
-    near_K, poses = refine_poses(points, pixels, guess, starts, free=ALL_INTRINSICS)
+    near_K, poses = refine_poses(points, pixels, guess, starts, free=free)
     np.testing.assert_allclose(near_K, K, atol=1e-5)
     np.testing.assert_allclose(poses, TRUE, atol=1e-6)
 

@@ -79,7 +79,7 @@ def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured
     if photos == "none":
         for photo in (folder / "images").rglob("*.png"):
             photo.unlink()
-    with refuses(SceneError, "scene.ply", "cameras"):
+    with refuses(SceneError, "scene.ply", "upright", "photos"):
         load_scene(folder, cameras=folder)
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from exports import (
-    da3_rows,
     depth_map_mask,
     export_rows,
     home,
@@ -26,7 +25,6 @@ from sweeps import sweep
 from tiny_scene import Tiny, edited_json, rotation, write_npz
 
 from gsmerge.errors import SceneError
-from gsmerge.io import read_ply
 from gsmerge.scene.read import load_scene, read_scene
 
 
@@ -34,39 +32,6 @@ from gsmerge.scene.read import load_scene, read_scene
 def smooth() -> Tiny:
     """Three views of 48 x 36 of a smooth surface."""
     return smooth_scene(48, 36)
-
-
-def test_depthsplat(tmp_path: Path) -> None:
-    smooth = smooth_scene(64, 48)
-    h, w = smooth.height, smooth.width
-    inner = np.arange(3 * h * w).reshape(3, h, w)[:, 8:-8, 8:-8].reshape(3, -1)
-    rows = export_rows(smooth, inner.T.reshape(-1))
-    turn = smooth.w2c[0, :3, :3]
-    loaded = load_scene(save_export(tmp_path, smooth, turned(rows, turn)))
-    scene = loaded.pixel_scene()
-    assert home(scene, smooth) == 1
-    assert [d.name for d in loaded.exporters] == ["depthsplat"]
-    assert loaded.recovery.frame.kind == "first"
-    assert scene.num_gaussians == int(scene.pixels.shown.sum()) == inner.size
-    assert int((~scene.pixels.shown).sum()) == 3 * h * w - inner.size
-    # the Gaussians stay where the file has them, and the cameras are moved
-    assert np.array_equal(scene.gaussians.means[0], read_ply(tmp_path / "scene.ply").gaussians.means[0])
-    assert np.allclose(scene.cameras.viewmats[0, :3, :3], np.eye(3), atol=1e-6)
-    assert np.isfinite(scene.gaussians.means).all()
-
-
-def test_depth_anything_in_another_unit(tmp_path: Path) -> None:
-    """Its nested model stores cameras in another unit than its Gaussians; their own grid shows which."""
-    tiny = smooth_scene(48, 36)
-    kept = da3_rows(tiny)
-    save_export(tmp_path / "gs_ply", tiny, export_rows(tiny, kept), cameras=False, name="0000.ply")
-    w2c = tiny.w2c[:, :3].astype(np.float32)
-    w2c[:, :, 3] *= 1.7
-    write_npz(tmp_path / "exports/npz/results.npz", tiny, extrinsics=w2c, image=tiny.images)
-    loaded = load_scene(tmp_path / "gs_ply/0000.ply")
-    assert home(loaded.pixel_scene(), tiny, kept) > 0.99
-    assert loaded.recovery.frame.scale == pytest.approx(1 / 1.7, rel=2e-3)
-    assert [d.name for d in loaded.exporters] == ["da3"]
 
 
 def test_depth_anything_every_other_view(tmp_path: Path) -> None:
@@ -175,13 +140,6 @@ def test_infinite_opacities_and_nan_scales(tmp_path: Path) -> None:
     assert not scene.pixels.shown[1, 8, 8]  # nothing draws it
     assert not scene.pixels.shown[:, 8, 9].any()
     assert int(scene.pixels.shown.sum()) == scene.num_gaussians == len(rows) - 4
-
-
-def test_byte_normals_are_long_lrm(tmp_path: Path, smooth: Tiny) -> None:
-    rows = export_rows(smooth, rest=45, normals="u1")
-    loaded = load_scene(save_export(tmp_path, smooth, rows))
-    assert [d.name for d in loaded.exporters] == ["longlrm"]
-    assert home(loaded.pixel_scene(), smooth) == 1
 
 
 def test_a_scene_can_be_given_as_unaligned(tmp_path: Path, smooth: Tiny) -> None:

@@ -186,7 +186,7 @@ def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder
     strange = tiny.c2w.copy()
     strange[:, :3, 3] += np.array([[0.3], [-0.2], [0.4]])
     write_transforms(tiny_folder / "transforms.json", replace(tiny, c2w=strange))
-    with refuses(SceneError, "scene.ply", "as far from the photos", "--cameras none"):
+    with refuses(SceneError, "transforms.json", "median", "1.5 px", "convention"):
         read_scene(tiny_folder, order="view-major", cameras=tiny_folder)
 
 
