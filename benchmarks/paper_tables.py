@@ -80,7 +80,6 @@ MIXED = recipe("mixed K, by thirds", k="mixed")
 VARIANTS = (
     recipe("no merging across views", k=1, match="none"),
     recipe("the 8 nearest neighbours instead of one", k=1, neighbors=8),
-    recipe("BASS with splits and merges", k=1, segmentation="bass-adaptive"),
     recipe("the encoder's latents zero", silent="latent", k=1),
     *(recipe(f"without the {name}", silent=name, k=1) for name in ("merger", "refiner", "heads")),
 )

@@ -23,7 +23,7 @@ TOP: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-
 LAB: dict[str, Any] = TOP["lab"].commands
 COMMANDS = {name: command for name, command in TOP.items() if name != "lab"}
 COMMANDS |= {f"lab {name}": command for name, command in LAB.items()}
-FEW, OF_COMPACT = 129, 23  # options of all commands, and of compact
+FEW, OF_COMPACT = 138, 23  # options of all commands, of which each has --progress, --json and --quiet; and of compact
 
 
 def shown(command: str, name: str) -> Any:

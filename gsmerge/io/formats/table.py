@@ -155,7 +155,8 @@ SOG_FOLDER = Format(
 FORMATS = (*FILES, HTML, LEVELS, COLMAP, STATE, SOG_FOLDER)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # results that a page shows
-SEVERAL_USES = tuple(row.ending for row in FORMATS if row.holds)  # endings of files that may hold no Gaussians
+# Endings of files that may hold no Gaussians; models write cameras and depth maps into .npz
+SEVERAL_USES = (".npz", *(row.ending for row in FORMATS if row.holds))
 FOLDERS = {row.folder: row for row in FORMATS if row.folder}  # by the name of an output folder
 READ_ENDINGS = tuple(row.ending for row in FORMATS if row.read is not None)
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FILES if row.read is not None))

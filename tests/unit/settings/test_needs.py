@@ -12,9 +12,9 @@ def test_values_for_parts_of_a_scene_are_possible() -> None:
 
 
 def test_settings_that_need_the_scene_in_one_piece_are_named() -> None:
-    asked = {"method": "voxel", "budget": 100, "crop": "sphere:0,0,0,1", "drop": "floaters, unseen"}
+    asked = {"method": "greedy", "budget": 100, "crop": "sphere:0,0,0,1", "drop": "floaters, unseen"}
     named = CompactOptions().with_settings(asked).whole_only
-    assert set(named) == {"method voxel", "crop", "drop floaters", "drop unseen"}
+    assert set(named) == {"method greedy", "crop", "drop floaters", "drop unseen"}
     levels = CompactOptions().with_settings({"levels": 2, "quality": "30dB"})
     assert set(levels.whole_only) == {"levels", "quality 30dB"}
     assert CompactOptions().whole_only == CompactOptions().uncut == []
