@@ -422,8 +422,6 @@ class Similarity:
     scale: float  # Positive
     shift: np.ndarray  # [3] in units of the Gaussians
     description: str = ""  # Text for people; empty if both frames are the same
-    # "same", "scaled" or "shifted"; "first", "middle" or "upright" if rotated into the frame of this camera; or "other"
-    kind: str = "same"
 
     def move_points(self, points: np.ndarray) -> np.ndarray:
         """Move points ``[n,3]`` or ``[3]`` into the frame of the Gaussians."""
@@ -507,4 +505,4 @@ def mean_pose_frame(viewmats: np.ndarray) -> Similarity:
     farthest = float(np.abs(matmul(centres, rotation.T) + shift).max())
     scale = 1 / farthest if farthest > 0 else 1.0
     text = "moved into their mean pose and scaled to lie within 1"
-    return Similarity(rotation, scale, scale * shift, text, "other")
+    return Similarity(rotation, scale, scale * shift, text)

@@ -39,7 +39,7 @@ _VIEWER = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])  # rotation of the wor
 def scale_by(scale: float, note: str = "") -> Similarity:
     """Return the similarity that only scales."""
     text = f"positions scaled by {scale:.4g}{note}"
-    return Similarity(np.eye(3), scale, np.zeros(3), text, "scaled")
+    return Similarity(np.eye(3), scale, np.zeros(3), text)
 
 
 def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Similarity]:
@@ -50,17 +50,17 @@ def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Simila
     """
     unit, first, middle = scale or 1.0, cameras.viewmats[0], cameras.viewmats[len(cameras) // 2]
     rotations = (
-        (first[:3, :3], "rotated into the first camera", "first"),
-        (middle[:3, :3], "rotated into the middle camera", "middle"),
-        (matmul(UPRIGHT, first[:3, :3]), "rotated upright from the first camera", "upright"),
-        (np.diag([1.0, -1, -1]), "turned to y up, as .spz files are", "other"),
-        (_VIEWER, "turned for a viewer, as by Splatter Image", "other"),
+        (first[:3, :3], "rotated into the first camera"),
+        (middle[:3, :3], "rotated into the middle camera"),
+        (matmul(UPRIGHT, first[:3, :3]), "rotated upright from the first camera"),
+        (np.diag([1.0, -1, -1]), "turned to y up, as .spz files are"),
+        (_VIEWER, "turned for a viewer, as by Splatter Image"),
     )
     return [
         IDENTITY if scale is None else scale_by(scale, ", as given"),
-        *(Similarity(rotation, unit, np.zeros(3), name, kind) for rotation, name, kind in rotations),
+        *(Similarity(rotation, unit, np.zeros(3), name) for rotation, name in rotations),
         *([mean_pose_frame(cameras.viewmats)] if scale is None else []),
-        Similarity(first[:3, :3], unit, unit * first[:3, 3], "moved into the first camera", "first"),
+        Similarity(first[:3, :3], unit, unit * first[:3, 3], "moved into the first camera"),
     ]
 
 
@@ -69,7 +69,7 @@ def fit_frame(cameras: Cameras, poses: np.ndarray, scale: float | None) -> Simil
     frame = fit_similarity(cameras.viewmats, poses, scale or 1.0)
     angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
     text = f"rotated by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted"
-    return replace(frame, description=text, kind="other")
+    return replace(frame, description=text)
 
 
 def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:

@@ -64,7 +64,7 @@ def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
         rotation = matmul(UPRIGHT, viewmat[:3, :3])
         if _deviation(matmul(sample, rotation)) < _ROUGH / 2 and _deviation(matmul(means, rotation)) < _TOLERANCE:
             source = "the first camera" if view == 0 else f"camera {view + 1}"
-            return Similarity(rotation, 1.0, np.zeros(3), f"rotated upright from {source}", "upright")
+            return Similarity(rotation, 1.0, np.zeros(3), f"rotated upright from {source}")
     return None
 
 
@@ -235,4 +235,4 @@ def _solve_agreed_frame(
     if frame is None or (counts >= _MIN_STRETCHES).sum() < _MIN_VIEWS or len(best) < _MIN_AGREEING * len(stretches):
         return None
     text = f"{rotation.description}, positions scaled by {frame.scale:.4g} and shifted"
-    return replace(frame, description=text, kind=rotation.kind)
+    return replace(frame, description=text)

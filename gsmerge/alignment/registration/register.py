@@ -117,7 +117,7 @@ def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
     squares = ((moved - q) ** 2).sum(2) / np.minimum(second_depths, scales[:, None] * first_depths) ** 2
     closeness = (1 - squares / CLOSE**2).clip(0).sum(1)
     best = np.argsort(-closeness, kind="stable")[:TRIALS]
-    return [Similarity(rotations[i], float(scales[i]), shifts[i], kind="other") for i in best]
+    return [Similarity(rotations[i], float(scales[i]), shifts[i]) for i in best]
 
 
 def _between(similarities: Similarities, scenes: Sequence[int]) -> Similarity:
@@ -282,7 +282,7 @@ def _make_step(step: np.ndarray) -> Similarity:
     """Make the similarity of a step ``[7]``: rotation vector, shift and logarithm of the scale."""
     rotation = motion_matrices(np.concatenate([step[:3], np.zeros(3)])[None])[0, :3, :3]
     scale = float(exp(step[6:].clip(-1, 1))[0])
-    return Similarity(rotation, scale, step[3:6], kind="other")
+    return Similarity(rotation, scale, step[3:6])
 
 
 def _normal_equations(

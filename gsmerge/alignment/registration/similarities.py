@@ -43,13 +43,13 @@ def compose(second: Similarity, first: Similarity) -> Similarity:
     """Compose two similarities: apply ``first``, then ``second``."""
     rotation = matmul(second.rotation, first.rotation)
     shift = second.move_points(first.shift)
-    return Similarity(rotation, second.scale * first.scale, shift, kind="other")
+    return Similarity(rotation, second.scale * first.scale, shift)
 
 
 def invert_similarity(similarity: Similarity) -> Similarity:
     """Invert a similarity."""
     shift = -matmul(similarity.rotation.T, similarity.shift) / similarity.scale
-    return Similarity(similarity.rotation.T, 1 / similarity.scale, shift, kind="other")
+    return Similarity(similarity.rotation.T, 1 / similarity.scale, shift)
 
 
 def round_similarity(similarity: Similarity, unit: float) -> Similarity:
@@ -59,4 +59,4 @@ def round_similarity(similarity: Similarity, unit: float) -> Similarity:
     """
     quat = normalize(rotmat_to_quat(similarity.rotation[None]).round(DIGITS))
     shift = unit * (similarity.shift / unit).round(DIGITS)
-    return Similarity(quat_to_rotmat(quat)[0], round(similarity.scale, DIGITS), shift, kind="other")
+    return Similarity(quat_to_rotmat(quat)[0], round(similarity.scale, DIGITS), shift)

@@ -208,9 +208,9 @@ def check_count(path: StrPath, count: int) -> None:
         raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found more")
 
 
-def missing_intrinsics(path: StrPath, reason: str = "") -> SceneError:
-    """Make the SceneError for cameras without a focal length; ``reason`` says why none was estimated."""
-    problem = f"expected intrinsics of the cameras (fx, fy, cx, cy), found none{reason}"
+def missing_intrinsics(path: StrPath) -> SceneError:
+    """Make the SceneError for cameras without a focal length."""
+    problem = "expected intrinsics of the cameras (fx, fy, cx, cy), found none"
     return SceneError(path, problem, "add them in pixels, for all views or for each")
 
 
@@ -446,4 +446,4 @@ def make_similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
     is_similarity = is_orthonormal(R) and determinant(R) >= 0 and 0 < scale < MAX_NUMBER
     if not is_similarity or not np.all(np.abs(matrix) < MAX_NUMBER):
         raise SceneError(path, "expected 'transform' to rotate and shift and 'scale' to be positive, found another map")
-    return Similarity(R, scale, scale * matrix[:3, 3], f"moved into the Gaussians' frame by {path.name}", "other")
+    return Similarity(R, scale, scale * matrix[:3, 3], f"moved into the Gaussians' frame by {path.name}")

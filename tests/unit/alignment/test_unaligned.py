@@ -87,7 +87,7 @@ def test_without_photos_no_other_frame_is_tried(tmp_path: Path) -> None:
 
 def test_no_other_frame_stands_against_the_foremost_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever chooses a frame: where the photos are far from what they should show, it is refused."""
-    wrong = Similarity(np.eye(3), 1.0, np.array([0.9, 0.4, 0.0]), "somewhere else", "shifted")
+    wrong = Similarity(np.eye(3), 1.0, np.array([0.9, 0.4, 0.0]), "somewhere else")
     rows = voxels()
     rows["x"] += np.random.default_rng(0).uniform(-0.05, 0.05, len(rows))  # a pixel to each side
     folder = save_export(tmp_path, SMOOTH, rows)
