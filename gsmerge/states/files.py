@@ -98,6 +98,8 @@ def extend_file(
 def lock_state(path: Path) -> AbstractContextManager[bool]:
     """Let one process at a time into the block for a state."""
     path = Path(os.path.realpath(path))
+    if not path.parent.is_dir():  # a new state in a new folder, which is made with the file
+        return nullcontext(True)
     return lock_file(path.with_name(f".gsmerge-{digest({'name': path.name})[:16]}.lock"))
 
 
