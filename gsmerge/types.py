@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -21,7 +21,6 @@ import numpy as np
 
 from gsmerge.arguments import check_fields
 from gsmerge.arrays import Array, as_array, as_index, as_pictures, as_tensor, check_shape, concat_rows
-from gsmerge.frozen import dataclass
 
 if TYPE_CHECKING:
     import torch

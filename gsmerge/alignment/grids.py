@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ import numpy as np
 from gsmerge.alignment.cameras import Poses, describe_other_convention
 from gsmerge.alignment.layouts import ESTIMATED
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, sizes_of, to_cameras
 from gsmerge.io.cameras.table import FFGS
@@ -22,7 +21,7 @@ _STRETCHES = 0.1  # relative difference of the scales of width and height above 
 _MAX_ENLARGED = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grid:
     """The cameras and the photo transform for one size of the pixel grid."""
 

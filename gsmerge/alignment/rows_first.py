@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ from gsmerge.alignment.score import (
     pixel_errors,
 )
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Similarity, median
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
@@ -51,7 +50,7 @@ _MIN_PLACED = 0.99  # share of the rows that must have a pixel
 _MOST_PLACES = 1 << 27  # largest product of rows and views that are followed; each takes four bytes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RowSource:
     """The Gaussians, the cameras and the photos of a scene, and hints about the rows; see :func:`align`."""
 
@@ -104,7 +103,7 @@ class Recovery:
         return f"{words}: median {self.alignment.middle_px:.2f} px from the pixels"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AlignmentResult:
     """Result of :func:`align`: the pixel of every row, or for rows without pixels the cameras that see them."""
 

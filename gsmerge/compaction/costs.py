@@ -6,13 +6,13 @@ They are means of whole runs, on any settings, and right within a factor of abou
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from gsmerge.budget import LEVEL_FACTOR, CountLimits
 from gsmerge.compaction.curve import DROP_SHARES, DROP_STEPS, KNEE_SHARES, KNEE_STEPS, curve_counts
-from gsmerge.frozen import dataclass
 from gsmerge.measure.coverage import shares_inside
 from gsmerge.runtime.record import Part
 from gsmerge.settings.compact import OURS

@@ -8,14 +8,13 @@ photos that were left out, over the pixels that the rows cover.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from gsmerge.compaction.left_out import LEAST_SEEN, can_leave_out, choose_views, leave_out, mean_seen
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import subset
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_distances
 from gsmerge.io.formats.arrays import ExpectedScores
 from gsmerge.kernels.elementary import power

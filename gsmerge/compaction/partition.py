@@ -7,11 +7,10 @@ from the rim of the graph; each step adds the view that shares most with the blo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_centres, project
 from gsmerge.kernels.reproject import see_points
 from gsmerge.runtime.memory import free_pages

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from gsmerge.fit.outside import Outside
-from gsmerge.frozen import dataclass
 from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
 
@@ -16,7 +15,7 @@ SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, in units of one 
 HAZE = 0.05  # far fog above which a result gets a note, because it is plain to see in a viewer
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FitReport:
     """Facts about a fit and its scores."""
 

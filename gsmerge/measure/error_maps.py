@@ -7,11 +7,10 @@ the render. Where no other photo shows the surface, only the view's own photo su
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.pictures import blur
 from gsmerge.kernels.reproject import add_photo_errors
 from gsmerge.measure.preview import Picture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import count
 
 import numpy as np
@@ -17,7 +17,6 @@ from gsmerge.facts.prepare import scored_pictures
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.facts.views import pick_views
 from gsmerge.frame import scene_frame
-from gsmerge.frozen import dataclass
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
 from gsmerge.measure.visibility import context_points, visible_pixels
@@ -105,7 +104,7 @@ class ResultScores:
         return [score for score in self.scores if score.split == split]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evaluation:
     """Scores of several results on the same views.
 

@@ -8,6 +8,7 @@ import html
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.frozen import dataclass
 from gsmerge.pages.data import PageView, ViewData
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.types import Cameras

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from gsmerge.arrays import Array as AnyArray
 from gsmerge.arrays import as_array
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.raster import blend as kernels
 from gsmerge.kernels.raster import sh
 from gsmerge.raster.tiled_view import Array, Splats, TiledView, make_splats, pieces, tile_ranges
@@ -128,7 +128,7 @@ def list_contributions(tiled: TiledView) -> Array:
     return totals.T
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rendering:
     """Rendered images of c views.
 

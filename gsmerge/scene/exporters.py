@@ -7,12 +7,11 @@ To add a model, add a :class:`Model` to the exporter whose columns, order and en
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from gsmerge.alignment import ESTIMATED
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.table import FFGS
 from gsmerge.settings.reading import SCENE_ARGUMENTS, Order, ReadHints
 from gsmerge.settings.setting import join_words, suggest_name

@@ -7,7 +7,7 @@ of any size are compared with the pictures of a grid, which are the colours of i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -16,7 +16,6 @@ from gsmerge.alignment import TRIMS
 from gsmerge.evidence.offsets import correlate_parts
 from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import stands_out
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.photo_files import PhotoTransform, Size, resize_and_crop, resize_to
 

@@ -10,7 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path, PurePath
 from typing import Any
@@ -23,7 +23,6 @@ from gsmerge.evidence.assign import Assigner, Assignment, Candidates, assign_pho
 from gsmerge.evidence.offsets import SIDE, correlate_parts
 from gsmerge.evidence.pictures import ViewPictures, show_views
 from gsmerge.evidence.scores import stands_out
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import read_cameras

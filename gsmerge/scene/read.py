@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,7 +14,6 @@ from gsmerge.alignment import ESTIMATED, Alignment, AlignmentResult, Recovery, a
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
 from gsmerge.evidence.assign import Assignment
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import (
     CameraFile,
     drop_repeats,
@@ -114,7 +113,7 @@ def find_larger_and_masks(
     return large, *read_masks(files, camera_file.names, photos, stored, cut, cameras)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Window:
     """The window of a photo's file that a view shows."""
 

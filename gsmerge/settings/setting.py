@@ -7,7 +7,7 @@ declarations. This package imports neither NumPy nor torch, so that ``--help`` i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import Field, field, fields, is_dataclass, replace
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from inspect import cleandoc
 from math import inf
@@ -15,8 +15,6 @@ from numbers import Integral, Real
 from operator import ge, gt, le, lt
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
-
-from gsmerge.frozen import dataclass
 
 T = TypeVar("T")
 KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}

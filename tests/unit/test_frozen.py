@@ -7,14 +7,12 @@ import dataclasses
 import inspect
 import pickle
 from collections.abc import Callable
-from dataclasses import FrozenInstanceError, field, fields, replace
+from dataclasses import FrozenInstanceError, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pytest
-
-from gsmerge.frozen import dataclass
 
 Decorator = Callable[..., Any]
 

@@ -16,7 +16,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ import numpy as np
 
 from gsmerge.arrays import to_float32
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io.archives import new_member, open_archive, read_member
 from gsmerge.io.bounds import (
     ReadBudget,

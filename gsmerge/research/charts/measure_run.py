@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ from typing import Any
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.left_out import LEAST_VIEWS, choose_views
 from gsmerge.facts.views import subset
-from gsmerge.frozen import dataclass
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate
