@@ -8,11 +8,10 @@ frame and back changes no bit.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths, lower_median, move_region, project
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map
@@ -23,7 +22,7 @@ ROWS = 65536  # Gaussians per task
 MAX_VIEWS = 32  # most views by which the unit is chosen, if views have no Gaussians of their own
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """Canonical frame: x_canonical = (x_world - origin) / unit."""
 

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 
 from gsmerge.arrays import Array
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.raster.sh import view_colors
@@ -426,7 +425,7 @@ def descend(
     return state
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Similarity:
     """A map ``x_gaussians = scale * rotation @ x_cameras + shift`` between frames."""
 

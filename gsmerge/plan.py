@@ -8,7 +8,7 @@ gets its own part of the plan, and no stage knows the options of another.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +21,6 @@ from gsmerge.facts.row_colors import RENDERS
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
-from gsmerge.frozen import dataclass
 from gsmerge.runtime.record import note
 from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.compact import OURS, CompactOptions

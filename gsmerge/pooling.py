@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from gsmerge.arrays import to_float32
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.pool import decompose, pool
@@ -25,7 +25,7 @@ MEAN, COVAR, WEIGHT, MASS, EXTINCTION, FOOTPRINT, COLUMNS = slice(0, 3), slice(3
 FULL_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # entries of an upper triangle xx xy xz yy yz zz in a flattened 3 x 3 matrix
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Members:
     """Input Gaussians as contiguous float32 arrays for the kernels, with their footprints and pixels."""
 
@@ -82,7 +82,7 @@ def _make_members(g: Gaussians, footprints: np.ndarray, pixels: Pixels) -> Membe
     return Members(**columns, footprints=footprints, pixels=pixels.homes, fronts=pixels.fronts)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Moments:
     """Pooled moments of g groups, float64 except for float32 ``sh``; see :class:`FeatureGaussians`."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from gsmerge.alignment.resection import (
     start_pose,
 )
 from gsmerge.alignment.score import Correspondences, is_as_near, pixel_limit
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import make_pinhole
 from gsmerge.io.photo_files import Size
 from gsmerge.kernels.elementary import log
@@ -47,7 +46,7 @@ class Calibration:
     worst_px: float  # largest median distance of a view, pixels
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Model:
     """Cameras of v views with a number of free intrinsics, and their residuals."""
 

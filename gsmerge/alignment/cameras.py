@@ -8,7 +8,7 @@ wrong is decided later, from the photos (``gsmerge/facts/move_poses.py``).
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ import numpy as np
 from gsmerge.alignment.frames import solve_pose
 from gsmerge.alignment.score import Correspondences, check_pairs, is_as_near, photo_colors, pixel_errors, pixel_limit
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths, is_inside, project_points, robust_weights
 from gsmerge.io.cameras.camera_file import (
     CONVENTIONS,
@@ -39,7 +38,7 @@ CLEAR = 0.96  # the given poses are better if they reduce the disagreement betwe
 _LINE_ROUNDS = 4  # of reweighted least squares
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Poses:
     """Poses in one convention: ``viewmats [c,4,4]`` float64, world to camera."""
 

@@ -8,12 +8,11 @@ nearest centre is then at most r pixels away with a probability of 1 - (1 - pi r
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.alignment.score import SHUFFLED_MARGIN
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import median
 from gsmerge.kernels.elementary import power
 from gsmerge.kernels.reproject import follow_pixels, nearest_centres

@@ -8,7 +8,7 @@ shows the lines before and after them in their pixels, also the incomplete ones,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from gsmerge.alignment.centres import follow_rows
 from gsmerge.alignment.layouts import Layout, dropped_layout, subsample
 from gsmerge.alignment.resection import projective_camera
 from gsmerge.alignment.score import find_correspondences, is_as_near
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.matrices import matmul
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line
@@ -77,7 +76,7 @@ def _find_lengths(points: np.ndarray) -> list[int]:
     return [int(length) for length in highest if peaks[length] >= _MIN_SHARE * len(starts)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _View:
     """Consecutive rows of one view, with their pixels; the origin of the pixels is arbitrary."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
 
@@ -23,7 +23,6 @@ from gsmerge.alignment.layouts import exact_layouts, subsample, view_orders
 from gsmerge.alignment.row_grid import find_layouts
 from gsmerge.alignment.score import Correspondences, find_correspondences, is_clearly_nearer, pixel_limit
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import is_inside, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
 from gsmerge.io.formats.read import GaussianFile
@@ -52,7 +51,7 @@ _ENTRIES = (((0, 0), (1, 1)), ((0, 0),), ((1, 1),), ((0, 2),), ((1, 2),))
 _CHANGES = [np.array([[float((i, j) in entries) for j in range(3)] for i in range(3)]) for entries in _ENTRIES]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Pictures:
     """Small photos that are compared with the Gaussians."""
 

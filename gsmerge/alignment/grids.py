@@ -6,7 +6,7 @@ Files give some sizes, and the rows themselves show others.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -15,7 +15,6 @@ import numpy as np
 from gsmerge.alignment.cameras import Poses, describe_other_convention
 from gsmerge.alignment.layouts import ESTIMATED, TRIMS, da3_box
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import PATCH, CameraFile, Convention, sizes_of, to_cameras
 from gsmerge.io.cameras.table import FFGS
@@ -33,7 +32,7 @@ _NEAR_SIZE = 0.05  # largest difference between assumed camera sizes and photo s
 _MAX_ENLARGED = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grid:
     """The cameras and the photo transform for one size of the pixel grid."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from gsmerge.alignment.score import (
     score_shuffled,
 )
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 
 # Least colour error of the next candidate and of shuffled pixels, divided by the colour error of the best candidate
 COLOR_MARGIN = 1.5

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.io.image_names import natural_key
 
 MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
@@ -23,7 +22,7 @@ _MAX_STEP = 10  # pixels from one to the next that was kept or dropped
 DEPTH_SHARE = 0.9  # share of each view's pixels that Depth Anything 3 exports, the nearest ones
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layout:
     """The pixel of each row, part by part; a part is one view, or one layer of a view."""
 

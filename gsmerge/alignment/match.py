@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import chain, compress
 
@@ -34,7 +34,6 @@ from gsmerge.alignment.score import (
     score_layout,
 )
 from gsmerge.arrays import distinct
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, camera_centres
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
@@ -50,7 +49,7 @@ _PROJECTED_GAUSSIANS = 200  # Gaussians of a view that the projective camera is 
 GridLayout = tuple[Grid, Layout]  # a layout of the rows, and the grid of its size
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RowSource:
     """The Gaussians, the cameras and the photos of a scene, and hints about the rows; see :func:`align`."""
 

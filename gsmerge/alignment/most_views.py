@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from gsmerge.alignment.judge import Candidate, Recovery, judge
 from gsmerge.alignment.layouts import dropped_layout, plain_layout
 from gsmerge.alignment.match import RowSource
 from gsmerge.alignment.score import pixel_errors, pixel_limit, sample_layout, score_layout
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY
 from gsmerge.runtime.record import list_some
 
@@ -44,7 +43,7 @@ def describe_misfits(source: RowSource, grid: Grid) -> tuple[str, ...]:
     return () if fits is None else _describe(grid, fits, is_left_out=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Fits:
     """Median distances, pixels, of each view's rows from their pixels, and the camera of each view."""
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -48,7 +48,6 @@ from gsmerge.alignment.match import GridLayout, RowSource, match_views, other_gr
 from gsmerge.alignment.most_views import align_most_views, describe_misfits
 from gsmerge.alignment.score import AS_NEAR_PX, SHUFFLED_MARGIN, score_layout
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
@@ -62,7 +61,7 @@ _MANY_PIXELS = 4  # pixels per row above which the grid is probably smaller than
 _MOVED_GAUSSIANS = 2000  # Gaussians of a view that its moved pose is solved from
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AlignmentResult:
     """Result of :func:`align`: the pixel of every row, or for rows without pixels the cameras that see them."""
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.alignment.layouts import Layout, plain_layout, spread_step, subsample
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import Similarity, lower_median, median, sh0_to_rgb
 from gsmerge.kernels import reproject
 from gsmerge.runtime.memory import free_pages, gather
@@ -29,7 +28,7 @@ MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some of them a little beyond
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Correspondences:
     """t Gaussians, each with the view and the pixel to which it is assumed to belong."""
 
@@ -57,7 +56,7 @@ def pixel_errors(pairs: Correspondences, cameras: Cameras) -> np.ndarray:
     return errors
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AlignmentInput:
     """Input of the search for pixels: rows, cameras, photos and hints."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from gsmerge.alignment.frames import exporter_frames
 from gsmerge.alignment.grids import Grid, PlacedGrid, with_poses
 from gsmerge.alignment.score import MARGIN, RANDOM_SHARE, SAME_COLORS, AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import Convention
 from gsmerge.kernels.elementary import exp

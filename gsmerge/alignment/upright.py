@@ -11,7 +11,7 @@ and all other matches are wrong.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from gsmerge.alignment.frames import UPRIGHT, ray_directions, solve_frame
 from gsmerge.alignment.layouts import TRIMS, trim_box
 from gsmerge.alignment.score import AlignmentInput, Correspondences, base_colors, pixel_errors, pixel_limit
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import Similarity
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.kernels.matrices import matmul

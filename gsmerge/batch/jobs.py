@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from string import Formatter
 from typing import Any, Protocol
@@ -13,7 +13,6 @@ from typing import Any, Protocol
 from gsmerge.batch.find import find_named_scenes, main_file, scene_plys
 from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.io import OUTPUT_FORMATS
 from gsmerge.io.formats.table import estimate_counts
 from gsmerge.io.formats.write import level_output

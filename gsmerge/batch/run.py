@@ -11,6 +11,7 @@ import os
 import warnings
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from heapq import nlargest
 from itertools import accumulate
@@ -20,7 +21,6 @@ from typing import Any
 from gsmerge.batch.jobs import BatchOptions, Job
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, check_folder, record
 from gsmerge.errors import SceneError, UsageError, error_line
-from gsmerge.frozen import dataclass
 from gsmerge.io.atomic import remove_stale
 from gsmerge.io.jsonl import append_line
 from gsmerge.io.locks import lock_file

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.cli.parameters import Args, usage_errors
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 
 if TYPE_CHECKING:

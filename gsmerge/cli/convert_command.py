@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs, files_beside, output_file
 from gsmerge.errors import UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import CleanOptions

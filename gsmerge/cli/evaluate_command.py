@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,6 @@ from gsmerge.cli.before_after import BeforeAfter, lpips_networks, read_before_af
 from gsmerge.cli.console import print_document, say_notes, stage_progress, terminal_columns
 from gsmerge.cli.paths import check_folder, check_outputs, check_replaced, input_files, write_texts
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.setting import Settings, setting
 

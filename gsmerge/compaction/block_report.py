@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from gsmerge.compaction.block_start import BlockStart
 from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles, compared_psnr
 from gsmerge.compaction.scores import PartScores
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS
-from gsmerge.frozen import dataclass
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record

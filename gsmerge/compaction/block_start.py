@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from gsmerge.compaction.partition import Block, Covisibility, owning_views
 from gsmerge.compaction.scores import InputScores, score_input
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.frame import Frame
-from gsmerge.frozen import dataclass
 from gsmerge.pipeline import decode_views
 from gsmerge.plan import Plan
 from gsmerge.runtime.memory import free_pages, make_array

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING
@@ -31,7 +31,6 @@ from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
-from gsmerge.frozen import dataclass
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan, choose_for_scene, note_engine, note_surplus
 from gsmerge.runtime.record import (

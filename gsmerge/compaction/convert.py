@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.frame import scene_frame
-from gsmerge.frozen import dataclass
 from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.read import holds_images

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +15,6 @@ import numpy as np
 from gsmerge.compaction.left_out import LEAST_SEEN, LeftOut
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.elementary import log, power
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -17,7 +17,6 @@ from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import DoubtWarning, SceneError, UsageError
 from gsmerge.facts.compare_photos import STRAY_PHOTOS
-from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
 from gsmerge.io.formats.columns import UNUSED, list_names

@@ -8,10 +8,10 @@ before a run, :mod:`gsmerge.runtime.estimate`, has costs in seconds, which are m
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from gsmerge.budget import LEVEL_FACTOR
 from gsmerge.facts.prepare import Prepared
-from gsmerge.frozen import dataclass
 from gsmerge.plan import Plan
 from gsmerge.runtime.record import expect_parts
 from gsmerge.runtime.time_left import Part

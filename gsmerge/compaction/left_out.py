@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ from gsmerge.compaction.make_plan import make_plan
 from gsmerge.facts.prepare import Prepared, Reference
 from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.facts.views import pick_views, subset
-from gsmerge.frozen import dataclass
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos

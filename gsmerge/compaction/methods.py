@@ -6,13 +6,12 @@ A package adds a method by an entry point of the group ``gsmerge.methods`` that 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare, prepare_alone
 from gsmerge.fit import Fitted
-from gsmerge.frozen import dataclass
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, stands_alone
 from gsmerge.runtime.plugins import METHODS, load_plugin

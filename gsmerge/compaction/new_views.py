@@ -8,7 +8,7 @@ photos that were left out, over the pixels that the rows cover.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from gsmerge.compaction.forecast import AFTER, BEFORE, fit_cost
 from gsmerge.compaction.left_out import LEAST_SEEN, LEAST_VIEWS, can_leave_out, choose_views, leave_out, mean_seen
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import subset
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_distances
 from gsmerge.io.formats.arrays import ExpectedScores
 from gsmerge.kernels.elementary import power

@@ -8,11 +8,10 @@ as that lowers the weights between blocks.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_centres, project
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.reproject import see_points

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from gsmerge.compaction.new_views import NewViews
-from gsmerge.frozen import dataclass
 from gsmerge.raster.metrics import psnr_words
 from gsmerge.report import document_head, file_sha256, html_table, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share

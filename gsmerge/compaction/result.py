@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,6 @@ from gsmerge.compaction.scores import PartScores, measure_parts, score_input
 from gsmerge.compaction.search import SearchFacts
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
-from gsmerge.frozen import dataclass
 from gsmerge.plan import Plan
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_distance, describe_loss

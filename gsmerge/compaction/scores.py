@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.compaction.report import Covered, PhotoFiles
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import scored_views
-from gsmerge.frozen import dataclass
 from gsmerge.io.formats.rounding import as_written
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE, PhotoScore, scene_photos, score_photos

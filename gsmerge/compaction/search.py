@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, TypeVar
 
 from gsmerge.budget import LEVEL_FACTOR
@@ -24,7 +24,6 @@ from gsmerge.compaction.left_out import LEAST_VIEWS, LeftOut, can_leave_out, cho
 from gsmerge.compaction.scores import covers_all, may_leave_gaps, measure_input, measure_renders
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import PHOTOS, RENDERS
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.pipeline import Build
 from gsmerge.plan import FIDELITY_LOSS, Plan

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -24,7 +24,6 @@ import numpy as np
 from gsmerge.evidence.offsets import NEAR_PIXELS, SIDE, TOLERANCE, PhotoOffsets, find_offsets
 from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import median
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.runtime.threads import parallel_map

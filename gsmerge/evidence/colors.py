@@ -10,13 +10,13 @@ mean colour, because wrong depth displaces few Gaussians across a block.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from gsmerge.evidence.pictures import Pairs
 from gsmerge.evidence.scores import stands_out
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.runtime.threads import parallel_map
 

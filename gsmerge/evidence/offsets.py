@@ -7,13 +7,13 @@ places. Parts of the view's own photo have no offset. Parts of a neighbour's pho
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import MARGIN, NORMAL, find_contrast, fisher_z
-from gsmerge.frozen import dataclass
 from gsmerge.raster.photos import shrink_pictures
 
 SIDE = 256  # pixels of the longer side of both pictures

@@ -7,12 +7,11 @@ weight. Photos are averaged with the same weights, so pixels without Gaussians c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.frame import Frame, canonicalise
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import LEAST_OPACITY, blank_photos, photo_errors, photos_of, pixel_weights, shrink_pictures

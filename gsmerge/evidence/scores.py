@@ -8,12 +8,12 @@ so the median absolute deviation of all z is the noise of wrong pairs.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from gsmerge.evidence.pictures import ViewPictures, fit_size
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import median
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul

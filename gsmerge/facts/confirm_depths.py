@@ -9,12 +9,11 @@ as beyond a crop.
 from __future__ import annotations
 
 import math
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from gsmerge.frame import scene_depth
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths, nearest_views, project
 from gsmerge.kernels.elementary import log
 from gsmerge.runtime.threads import parallel_map

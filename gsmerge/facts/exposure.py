@@ -15,12 +15,11 @@ same gain. In both cases the mean would be farther from new photos, by 1.5 dB in
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.facts.photo_change import CLIPPED, PhotoChange, change_large
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_distances, correlation, median, medians, order_others, rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels.compare_views import find_surfaces
 from gsmerge.kernels.elementary import exp, log
@@ -55,7 +54,7 @@ NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
 NEAREST, FARTHER = 6, 2  # a view is compared with the nearest views, and with further views at equal steps of rank
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Pair:
     """Ratios of the colours of one view's pixels in another."""
 
@@ -144,7 +143,7 @@ def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
     return float(np.sqrt((away * away).mean()) / max(random, 1e-9))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Pixels:
     """Position of every pixel's Gaussian, and the pixels that count."""
 

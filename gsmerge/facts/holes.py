@@ -9,14 +9,13 @@ the nearest other views agree best.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import fill_gaps
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import lies_inside, nearest_views, rgb_to_sh0
 from gsmerge.kernels.compare_views import add_differences
 from gsmerge.kernels.matrices import invert, matmul

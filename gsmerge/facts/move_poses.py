@@ -10,10 +10,10 @@ bit for bit, after one step at the smallest size.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths, median, motion_matrices, motion_vectors, move_views, without_common_motion
 from gsmerge.kernels.compare_views import COLUMNS, compare_views
 from gsmerge.kernels.matrices import invert, matmul, solve

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from gsmerge.evidence.colors import map_tones
-from gsmerge.frozen import dataclass
 from gsmerge.types import LargePhotos
 
 CLIPPED = 0.985  # a pixel may be clipped from this level on

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -28,7 +28,6 @@ from gsmerge.facts.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add
 from gsmerge.facts.scene_size import SceneSize, measure_size, unlike_captures
 from gsmerge.facts.views import distinct_views, subset, take_rows
 from gsmerge.frame import Frame, canonicalise, sample_rows
-from gsmerge.frozen import dataclass
 from gsmerge.raster.images import seen_weights
 from gsmerge.runtime.record import choose, note, record_part, stage
 from gsmerge.settings.stages import Look, PrepareOptions
@@ -37,7 +36,7 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 FLAT = 2 / 255  # a picture shows one flat colour if the range of its values is smaller
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reference:
     """Pictures of a canonical scene that a result is fitted to and scored on."""
 

@@ -9,13 +9,13 @@ colour nor a solid drawing do not count.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TypeVar
 
 import cv2
 import numpy as np
 
 from gsmerge.facts.views import camera_kinds, subset
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths, sh0_to_rgb
 from gsmerge.kernels.pictures import blur
 from gsmerge.raster import make_splats, tile_view

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
 
 from gsmerge.facts.views import camera_kinds
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import median, quantiles, vector_lengths
 from gsmerge.types import Gaussians, Scene
 

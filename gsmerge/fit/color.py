@@ -7,13 +7,12 @@ conjugate-gradient steps are enough.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.fit.photo_sizes import exposure_gains, holdout_psnr, training_weights
 from gsmerge.fit.report import FitReport, FitResult
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
 from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import Photos

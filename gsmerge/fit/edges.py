@@ -6,11 +6,11 @@ Gaussians across the edges of all views look like a soft rim and clouds around t
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from gsmerge.fit.fit_state import FitState
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_centres
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.edges import cut_at_edges

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from gsmerge.arrays import ArrayFields
 from gsmerge.fit.outside import Outside
-from gsmerge.frozen import dataclass
 from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
 
@@ -17,8 +17,8 @@ TIME_SPENT = "time budget spent"  # why a fit ended
 HAZE = 0.05  # far fog above which a result gets a note, because it is plain to see in a viewer
 
 
-@dataclass(frozen=True)
-class FitReport:
+@dataclass(frozen=True, eq=False, repr=False)
+class FitReport(ArrayFields):
     """Facts about a fit and its scores."""
 
     method: str  # `"none"`, `"color"` or `"full"`: the fit from which the result comes

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io import file_notes
 from gsmerge.io.archives import damaged_member
 from gsmerge.io.bounds import check_file

@@ -19,13 +19,12 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import groupby, takewhile
 from pathlib import Path, PurePath
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.types import StrPath
 
 # Errors of the disk while a file is written; other OSErrors are errors of the caller

@@ -13,12 +13,12 @@ import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io.first_bytes import check_first_bytes
 from gsmerge.types import StrPath
 

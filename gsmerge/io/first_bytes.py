@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 
 _PACKED_SCENES = (".spz", ".splat", ".sog", ".ksplat", ".npz", ".glb", ".gsm")
 _PHOTOS = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff")

@@ -7,7 +7,7 @@ import struct
 import warnings
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,7 +17,6 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
 from gsmerge.io.first_bytes import refuse_picture
 from gsmerge.io.image_names import ImageSource, match_images
@@ -67,7 +66,7 @@ Size = tuple[int, int]  # width, height, pixels
 _AT_ONCE = 128 << 20  # bytes of decoded photos in memory; if there are more, photos are decoded at each use
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PhotoReader:
     """c photos of one size ``(width, height)``, which are decoded at each use and not stored in memory."""
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import (
     camera_centres,
     lower_median,

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from threading import Thread
@@ -18,7 +19,6 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_output
 from gsmerge.io.image_names import CLIP_ENDS
 from gsmerge.kernels.elementary import sin

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +14,6 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import NO_VIEWS, add_views
 from gsmerge.facts.support import count_views_in_world, tint
 from gsmerge.facts.views import pick_views, subset
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs

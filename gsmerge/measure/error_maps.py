@@ -8,14 +8,13 @@ the render. Where no other photo shows the surface, only the view's own photo su
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frame import scene_frame
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.pictures import blur
 from gsmerge.kernels.reproject import add_photo_errors
 from gsmerge.measure.preview import Picture, contact_sheet, to_picture

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.arguments import check_arguments
-from gsmerge.arrays import as_pictures
+from gsmerge.arrays import ArrayFields, as_pictures
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import scored_pictures
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.facts.views import pick_views
 from gsmerge.frame import scene_frame
-from gsmerge.frozen import dataclass
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
 from gsmerge.measure.visibility import context_points, visible_pixels
@@ -116,8 +115,8 @@ class ResultScores:
         return [score for score in self.scores if score.split == split]
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Evaluation(ArrayFields):
     """Scores of several results on the same views.
 
     Args:

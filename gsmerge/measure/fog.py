@@ -9,14 +9,13 @@ needs no photos, only the input and the cameras of its views; docs/guide/evaluat
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from gsmerge.facts.views import pick_views
 from gsmerge.fit.report import HAZE
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths, middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.raster import Splats, make_splats, render, tile_view

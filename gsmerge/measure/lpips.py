@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import pickle
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +20,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from gsmerge.arrays import Array
 from gsmerge.errors import GsmergeError, SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.networks.layers import PLAIN, dense, pack
 from gsmerge.raster.metrics import image_pair, pixel_mask
 from gsmerge.runtime.threads import parallel_map
@@ -68,7 +68,7 @@ _ARCHITECTURES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layer:
     """One convolution of an LPIPS network.
 

@@ -7,13 +7,12 @@ methods of :class:`NetworkContext` by the same formulas on tensors, so that grad
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from gsmerge.arrays import Array, as_array, concat_columns, concat_rows, like
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
 from gsmerge.networks.corrector import Corrector

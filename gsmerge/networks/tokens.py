@@ -8,12 +8,11 @@ depth, focal length, resolution or the scale of the world.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.arrays import Array, as_array
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.networks.tokens import describe_groups, describe_parts, place_frames
 from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats
 from gsmerge.networks.options import GROUP, MEMBER, PART

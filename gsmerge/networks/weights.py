@@ -8,14 +8,13 @@ threads.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
 from gsmerge.arrays import Array
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.networks.layers import GELU, PLAIN, TANH, attend, dense, normalise, pack, padded, scratch_size
 from gsmerge.networks.options import NetworkOptions
 

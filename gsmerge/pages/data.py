@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -11,7 +11,6 @@ import numpy as np
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.views import even_views
 from gsmerge.frame import Frame, scene_frame
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import middle_depth
 from gsmerge.io.encode_pictures import encode_indexed, encode_picture
 from gsmerge.io.photo_files import photo_array

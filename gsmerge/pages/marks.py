@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import numpy as np
 
 from gsmerge.facts.support import TINTS, count_views
-from gsmerge.frozen import dataclass
 from gsmerge.io.encode_pictures import encode_indexed
 from gsmerge.raster import Splats, TiledView, tile_view
 from gsmerge.raster.composite import blend

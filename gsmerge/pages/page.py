@@ -10,6 +10,7 @@ import json
 import re
 import secrets
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache, partial
 from itertools import chain, zip_longest
 from pathlib import Path
@@ -18,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.frozen import dataclass
 from gsmerge.pages.data import PageView, ViewData
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.types import Cameras

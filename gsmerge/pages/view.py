@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import webbrowser
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from tempfile import mkdtemp
@@ -14,7 +14,6 @@ from typing import Any
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
-from gsmerge.frozen import dataclass
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import file_bytes

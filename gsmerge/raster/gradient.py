@@ -5,12 +5,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import sh
 from gsmerge.kernels.raster.blend import blend_backward, gather_slots

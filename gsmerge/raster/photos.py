@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import composite
@@ -42,7 +41,7 @@ class RenderScore(NamedTuple):
     covered: np.ndarray  # [h,w] bool, the scored pixels that are covered
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PhotoScore:
     """Mean score of renders against photos; see :class:`RenderScore`."""
 
@@ -72,7 +71,7 @@ class Sample:
 WHOLE_PHOTO = Sample()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Photos:
     """V photos of one size, with their cameras and pixel weights."""
 

@@ -6,12 +6,12 @@ pixel, a product takes a small share of the time of blending along the tile list
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.raster import list_weights as kernels
 from gsmerge.raster import TiledView
 

@@ -8,12 +8,12 @@ instead.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
 from gsmerge.io.cameras.read import read_cameras

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -20,7 +20,6 @@ from gsmerge.compaction.compact import compact
 from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.facts.views import even_views, subset, take_rows
 from gsmerge.frame import Frame, scene_frame
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import move_views
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.runtime.record import Progress

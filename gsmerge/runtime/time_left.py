@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import field
-
-from gsmerge.frozen import dataclass
+from dataclasses import dataclass, field
 
 STAGES = (
     "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",

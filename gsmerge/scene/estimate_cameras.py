@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -19,7 +19,6 @@ from gsmerge.errors import SceneError
 from gsmerge.evidence.offsets import correlate_parts
 from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import stands_out
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import list_images

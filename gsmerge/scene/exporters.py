@@ -7,12 +7,11 @@ To add a model, add a :class:`Model` to the exporter whose columns, order and en
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from gsmerge.alignment import ESTIMATED, MAY_BE_UNALIGNED, Layout
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.table import FFGS
 from gsmerge.settings.reading import SCENE_ARGUMENTS, QuatChoice, ReadHints

@@ -8,12 +8,11 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.foreign import check_program, find_unread
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras, holds_images, read_cameras, read_sharp_camera

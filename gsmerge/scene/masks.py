@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,6 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.evidence.offsets import SIDE
-from gsmerge.frozen import dataclass
 from gsmerge.io.image_names import match_masks
 from gsmerge.io.photo_files import Size, decode_alpha, decode_levels, decode_small, image_size, same_shape
 from gsmerge.kernels.pictures import turn_picture

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.npz_files import array_names, missing_of_depths
 from gsmerge.io.first_bytes import FOREIGN

@@ -10,7 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import compress
 from pathlib import Path, PurePath
@@ -26,7 +26,6 @@ from gsmerge.evidence.pictures import ViewPictures, show_views
 from gsmerge.evidence.rays import find_on_rays
 from gsmerge.evidence.scores import stands_out
 from gsmerge.frame import canonicalise
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import read_cameras

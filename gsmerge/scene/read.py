@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,6 @@ from gsmerge.alignment import (
 )
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
@@ -73,7 +72,7 @@ from gsmerge.types import NO_CAMERAS, Cameras, LargePhotos, Scene, StrPath
 from gsmerge.words import count_words
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SceneViews:
     """All c views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures."""
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import CameraFile, drop_repeats, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.read import read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
@@ -111,7 +110,7 @@ def find_larger_and_masks(
     return large, *read_masks(files, camera_file.names, photos, stored, cut, cameras)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Window:
     """The window of a photo's file that a view shows."""
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from gsmerge.frozen import dataclass
 from gsmerge.runtime import MOST_THREADS
 from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.settings.budget import BudgetOptions

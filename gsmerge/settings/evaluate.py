@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from gsmerge.frozen import dataclass
+from dataclasses import dataclass
+
 from gsmerge.runtime import MOST_THREADS
 from gsmerge.settings.setting import Settings, setting
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from gsmerge.frozen import dataclass
 from gsmerge.settings.compact import CompactOptions, changed_settings
 from gsmerge.settings.setting import Settings, setting
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
-from gsmerge.frozen import dataclass
 from gsmerge.settings.setting import Settings, setting
 
 AXES = ("x", "-x", "y", "-y", "z", "-z")

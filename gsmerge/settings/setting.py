@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import Field, field, fields, is_dataclass, replace
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from inspect import cleandoc
 from math import inf
@@ -16,8 +16,6 @@ from numbers import Integral, Real
 from operator import ge, gt, le, lt
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
-
-from gsmerge.frozen import dataclass
 
 T = TypeVar("T")
 SAME = "as it is"  # marks that a run on a piece of a scene takes the value of the whole scene

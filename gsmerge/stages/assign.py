@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from threading import Lock
 
 import numpy as np
 
 from gsmerge.errors import UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import morton_codes
 from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.pooling import Members, pool_members, scene_members
@@ -52,7 +51,7 @@ def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
     return decode(features, members, DecodeOptions(min_opacity=0.0))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Owners:
     """The superpixel to which each of n Gaussians contributes most."""
 

@@ -8,7 +8,7 @@ depths that no view contradicts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,7 +17,6 @@ from gsmerge.facts.holes import SIZE, make_gaussians
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.facts.row_colors import fill_gaps
 from gsmerge.fit.outside import Outside
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import is_inside, project
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from gsmerge.arrays import Array, as_tensor, to_float32
-from gsmerge.frozen import dataclass
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.pooling import Members
 from gsmerge.runtime.record import stage

@@ -8,10 +8,11 @@ lowers the distortion about equally.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from gsmerge.budget import CountLimits
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths
 from gsmerge.kernels.elementary import log, log10
 from gsmerge.kernels.superpixels.merge_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums

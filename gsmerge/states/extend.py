@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from gsmerge.errors import SceneError
 from gsmerge.facts.confirm_depths import CERTAIN, ENOUGH
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_centres, camera_distances
 from gsmerge.io.photo_files import photo_array
 from gsmerge.raster.photos import shrink_pictures

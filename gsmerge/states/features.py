@@ -6,7 +6,7 @@ any K of Gaussians per group. For a single batch the result has the same bytes a
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import cast
 
@@ -17,7 +17,6 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.facts.views import concat_cameras, in_float64, resize_cameras
 from gsmerge.frame import Frame
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.gaussians.cluster import connected_components
 from gsmerge.networks.apply import NetworkContext, decode_gaussians
 from gsmerge.networks.checkpoint import Checkpoint

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsmerge.frame import Frame
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import MAX_NUMBER, check_camera, check_size
 from gsmerge.io.formats.gsm import (
     FEATURES,

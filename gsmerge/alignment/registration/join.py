@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ import numpy as np
 
 from gsmerge.alignment.registration.register import register
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import Similarity, rotmat_to_quat
 from gsmerge.kernels.elementary import arccos
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Pixels, Scene

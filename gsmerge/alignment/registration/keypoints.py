@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import camera_depths, lower_median
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.raster.photos import row_pictures

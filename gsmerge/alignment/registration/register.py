@@ -9,14 +9,13 @@ photos. Single depths may be wrong, so a point may move along its ray within the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from gsmerge.alignment.registration.keypoints import End, KeypointMatches, Photo, find_keypoints, match_photos
 from gsmerge.alignment.registration.similarities import compose, fit_similarities, invert_similarity, round_similarity
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import IDENTITY, Damping, Similarity, camera_depths, descend, lower_median, motion_matrices
 from gsmerge.kernels.elementary import exp, log, log1p
 from gsmerge.kernels.matrices import matmul, solve, transform

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -12,7 +12,6 @@ import numpy as np
 
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import Similarity, pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.io.photo_files import PhotoArrays, PhotoReader, PhotoTransform, Size, change_photos, photo_size, same_shape
@@ -69,7 +68,7 @@ def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients:
     return Lens(name, model, tuple(coefficients)) if model == "fisheye" or any(coefficients) else None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CameraFile:
     """The c cameras of a file, in its order."""
 

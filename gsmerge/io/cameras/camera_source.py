@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +14,6 @@ import numpy as np
 from plyfile import PlyData
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import Convention, StoredView
 from gsmerge.io.formats.ply import open_ply

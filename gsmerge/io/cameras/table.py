@@ -6,11 +6,10 @@ If files of a format have a key for each value, a :class:`ViewLayout` reads them
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile, Convention, make_camera_file
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.embedded import SHARP, read_sharp

@@ -6,13 +6,12 @@ The rows of ``table.py`` hold such declarations, and ``read_views.py`` reads fil
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import motion_matrices
 from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, convert, to_array, to_number
@@ -86,7 +85,7 @@ def rotation_of_vector(numbers: np.ndarray) -> np.ndarray:
     return motion_matrices(motion)[0, :3, :3]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RotationAndShift:
     """A pose ``[3,4]`` under two keys: its rotation, and its last column.
 

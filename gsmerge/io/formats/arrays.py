@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from gsmerge.arrays import Array, as_array
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import (
     apply_harmonics_rotation,
     harmonics_rotation,
@@ -136,7 +135,7 @@ def are_logarithms(scales: np.ndarray) -> bool:
     return bool(np.count_nonzero(scales < 0) > MAX_STRAY * scales.size)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Columns:
     """Columns of n Gaussians as files store them.
 
@@ -230,7 +229,7 @@ def _to_table(columns: Columns) -> np.ndarray:
     return np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StoredRows:
     """Gaussians as a file stores them; after ``adapt``, ``rows`` have at least the PLY columns ``REQUIRED``."""
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io.formats import arrays
 
 UNUSED = "not used: "  # start of the note

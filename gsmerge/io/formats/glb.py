@@ -13,14 +13,13 @@ import json
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import quat_to_rotmat, rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats import spz
@@ -173,7 +172,7 @@ class _ForeignError(ValueError):
     """Content that the reader does not support; the message continues "expected a .glb of Gaussians, found"."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Values:
     """Stored values ``[n,width]`` of an accessor; an index with a slice returns its rows as float64."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from safetensors.numpy import save
 
 from gsmerge.arrays import as_array
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_pixels, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import StoredView
@@ -42,7 +41,7 @@ NUM_HIGHER = (0, 3, 8, 15, 24)  # harmonics above degree 0
 _LEAST_SCALE = 1e-30  # scale that replaces 0, so that its logarithm is finite
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GsmFile:
     """Content of a ``.gsm``: a header whose entries have the right types, and arrays that match their checksums."""
 

@@ -10,7 +10,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import partial
 from io import BufferedReader, BytesIO, FileIO, TextIOWrapper
 from itertools import islice
@@ -22,7 +22,6 @@ import numpy as np
 from plyfile import PlyData, PlyElementParseError, PlyListProperty, PlyParseError
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import ReadBudget, check_file, read_budget
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.columns import check_columns

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
@@ -64,7 +63,7 @@ class FileInfo:
     adapted: tuple[str, ...] = ()  # how the content was adapted, one sentence each without a full stop
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GaussianFile:
     """The n Gaussians of a file, row by row, as float32; means are float64 if the file stores them as float64.
 

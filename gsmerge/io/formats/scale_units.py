@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import median, quantiles
 from gsmerge.io.formats import arrays
 from gsmerge.kernels.elementary import log

@@ -16,6 +16,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,6 @@ import numpy as np
 
 from gsmerge.arrays import to_float32
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.io.archives import new_member, open_archive, read_member
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, read_budget, read_errors, read_text
 from gsmerge.io.formats import arrays

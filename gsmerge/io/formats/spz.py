@@ -17,7 +17,7 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +26,6 @@ import numpy as np
 
 from gsmerge.arrays import to_float32
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays

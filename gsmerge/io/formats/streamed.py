@@ -13,7 +13,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,7 +22,6 @@ import numpy as np
 
 from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog

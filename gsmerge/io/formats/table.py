@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +12,6 @@ import numpy as np
 
 from gsmerge.arrays import to_float32
 from gsmerge.errors import UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import FLAT_COMMENT, MIP_COMMENT, StoredRows
@@ -31,7 +31,7 @@ WRITE_APART = _lazy("write.write_apart")
 NamedPhotos = Sequence[tuple[str, Path | None]]  # names in a model's folder of photos, with their files if known
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Contents:
     """The content of an output; a format leaves out parts that it cannot store."""
 
@@ -51,7 +51,7 @@ class Contents:
 WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Format:
     """A format of files of Gaussians: its ending, and how to read and write it.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_output
 from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results
 from gsmerge.research.charts.measure_run import INPUT

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +13,6 @@ from typing import Any, Literal
 from gsmerge.batch.find import find_scenes, main_file, scene_plys
 from gsmerge.batch.jobs import Job
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.read import find_cameras
 from gsmerge.io.cameras.table import is_colmap
 from gsmerge.io.formats.table import estimate_counts

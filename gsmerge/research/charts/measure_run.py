@@ -8,7 +8,7 @@ import platform
 import sys
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -24,7 +24,6 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.left_out import LEAST_VIEWS
 from gsmerge.compaction.left_out import choose_views as leave_out_views
 from gsmerge.facts.views import even_views, midpoint_views, pick_views, subset
-from gsmerge.frozen import dataclass
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate, near_plane

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,6 @@ from gsmerge.cli.before_after import lpips_networks
 from gsmerge.cli.console import print_document, say_notes
 from gsmerge.cli.paths import write_texts
 from gsmerge.errors import UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS
 from gsmerge.settings.setting import Settings, flat_settings, setting

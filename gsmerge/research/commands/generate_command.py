@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from functools import partial
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, stage_progress
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.frozen import dataclass
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.words import count_words

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,6 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import held_out_views, require_views
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.errors import TargetError
-from gsmerge.frozen import dataclass
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import Settings, setting
 

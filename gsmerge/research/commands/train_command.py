@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
-from gsmerge.frozen import dataclass
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.setting import Settings, change_settings, flat_settings, setting
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, make_dataclass
+from dataclasses import dataclass, fields, make_dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import cv2
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.pictures import blur, convolve
 from gsmerge.kernels.raster.sh import view_colors
@@ -106,7 +105,7 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
     return Noise(**drawn, sh_degree=degree)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrueView:
     """A rendered view with exact depth and normals, and the pose that a network would estimate."""
 

@@ -7,13 +7,13 @@ curve with an exposure turns the light into a photo.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
 from gsmerge.kernels.elementary import arctan2, cos, power, sin
 from gsmerge.kernels.matrices import matmul
@@ -38,7 +38,7 @@ MIN_COSINE = 0.1  # least cosine of a surface's tilt in the size of a sample, wh
 Float: TypeAlias = NDArray[Any]  # float32
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Light:
     """The lights of a scene."""
 
@@ -49,7 +49,7 @@ class Light:
     softness: float  # half width of the light, radians
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stage:
     """Shapes, textures and light of a scene; y points down, and the cameras look along +z."""
 
@@ -74,7 +74,7 @@ class Pinhole:
         return np.array([[self.focal, 0, self.width / 2], [0, self.focal, self.height / 2], [0, 0, 1.0]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Hits:
     """First hits of a view's rays, h x w samples."""
 
@@ -84,7 +84,7 @@ class Hits:
     normals: Float  # [h,w,3] world, towards the camera
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LitStage:
     """A stage with shadow maps, ready to be rendered."""
 

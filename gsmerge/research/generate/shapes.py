@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.frozen import dataclass
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
@@ -32,7 +31,7 @@ class Material:
     shift: Pair = (0.0, 0.0)  # offset into the texture, repeats
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shape:
     """One shape; see :mod:`gsmerge.kernels.cast` for the kinds."""
 
@@ -133,7 +132,7 @@ def place(
     ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ShapeArrays:
     """Arrays of m shapes, as the kernel takes them."""
 

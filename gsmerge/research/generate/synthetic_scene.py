@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.kernels.elementary import cos, exp, sin
 from gsmerge.kernels.matrices import matmul
@@ -123,7 +122,7 @@ class SyntheticScene:
     noise: Noise
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Shoot:
     """A lit room with a path of cameras, and the settings of its photos and of the simulated network."""
 

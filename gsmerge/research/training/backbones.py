@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from threading import Lock
 from typing import TypeVar
 
@@ -12,7 +12,6 @@ import torch
 
 from gsmerge.arrays import to_float32
 from gsmerge.compaction.tensors import make_gaussians, make_scene
-from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import select_views
 from gsmerge.measure.sizes import shrink_views
 from gsmerge.research.captures import Capture

@@ -7,7 +7,7 @@ choice of views is fixed, or drawn again for every window (:func:`select_views`)
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.frozen import dataclass
 from gsmerge.geometry import lower_median
 from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.raster.photos import Photos, blank_photos, scene_pictures

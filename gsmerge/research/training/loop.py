@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ from torch.nn import Parameter
 
 from gsmerge.errors import SceneError
 from gsmerge.facts.views import even_views
-from gsmerge.frozen import dataclass
 from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.preview import save_picture, to_picture
 from gsmerge.networks.checkpoint import save_checkpoint

@@ -8,7 +8,7 @@ order of axes, views, and the agreement of a group with other views.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gsmerge.arrays import Array, as_array, as_tensor
-from gsmerge.frozen import dataclass
 from gsmerge.networks.apply import NetworkContext, prepare_children, run_heads
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
 from gsmerge.networks.cross_view_stats import NUM_STATS

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from gsmerge.facts.views import concat_cameras, even_views, resize_cameras, subset
 from gsmerge.frame import canonicalise
-from gsmerge.frozen import dataclass
 from gsmerge.measure.sizes import resize_photo
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.pooling import Members, scene_members

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from gsmerge.frozen import dataclass
 from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks.options import SLOTS, NetworkOptions
 from gsmerge.research.training.loss_ssim import LOSS_WINDOW
