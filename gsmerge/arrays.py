@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,23 @@ if TYPE_CHECKING:
     import torch
 
 Array = NDArray[Any]  # or a torch tensor if a docstring allows one; type checkers do not see that
+
+
+class ArrayFields:
+    """Base of dataclasses of arrays: compares values, where ``==`` of the arrays themselves gives an array."""
+
+    def __eq__(self, other: object) -> bool:
+        if other.__class__ is not self.__class__:
+            return NotImplemented
+        names = [field.name for field in fields(self) if field.compare]  # type: ignore[arg-type]
+        return all(is_equal(getattr(self, name), getattr(other, name)) for name in names)
+
+    def __hash__(self) -> int:
+        return hash(repr(self))  # equal values have equal shapes
+
+    def __repr__(self) -> str:
+        names = [field.name for field in fields(self) if field.repr]  # type: ignore[arg-type]
+        return f"{type(self).__name__}({', '.join(f'{name}={shorten(getattr(self, name))}' for name in names)})"
 
 
 def check_shape(name: str, array: Array, shape: tuple[int | str, ...]) -> int:
@@ -101,3 +119,18 @@ def concat_rows(parts: Sequence[Array], axis: int = 0) -> Any:
 def concat_columns(parts: Sequence[Array]) -> Array:
     """Concatenate the columns of arrays or tensors."""
     return concat_rows(parts, 1)
+
+
+def is_equal(one: Any, other: Any) -> bool:
+    """Return whether two values are equal; arrays or tensors are if their shapes and numbers are, NaN equals NaN."""
+    if one is other:
+        return True
+    if getattr(one, "ndim", 0) or getattr(other, "ndim", 0):
+        alike = [(getattr(each, "shape", None), getattr(each, "device", None)) for each in (one, other)]
+        return alike[0] == alike[1] and bool(((one == other) | ((one != one) & (other != other))).all())
+    return bool(one == other)
+
+
+def shorten(value: Any) -> str:
+    """Describe a value; of an array or tensor only the shape."""
+    return f"{type(value).__name__}{list(value.shape)}" if getattr(value, "ndim", 0) else repr(value)

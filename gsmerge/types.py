@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import numpy as np
 
 from gsmerge.arguments import check_fields
-from gsmerge.arrays import Array, as_array, as_index, as_pictures, as_tensor, check_shape, concat_rows
+from gsmerge.arrays import Array, ArrayFields, as_array, as_index, as_pictures, as_tensor, check_shape, concat_rows
 
 if TYPE_CHECKING:
     import torch
@@ -31,8 +31,8 @@ StrPath = str | os.PathLike[str]
 SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0: rgb = 0.5 + SH_C0 * sh0
 
 
-@dataclass(frozen=True)
-class Gaussians:
+@dataclass(frozen=True, eq=False, repr=False)
+class Gaussians(ArrayFields):
     """n Gaussians in the world frame.
 
     Args:
@@ -122,8 +122,8 @@ def own_gaussians(value: HasGaussians | Gaussians) -> Gaussians:
     return value if isinstance(value, Gaussians) else value.gaussians
 
 
-@dataclass(frozen=True)
-class Cameras:
+@dataclass(frozen=True, eq=False, repr=False)
+class Cameras(ArrayFields):
     """c pinhole cameras of one image size.
 
     Args:
@@ -184,8 +184,8 @@ class Cameras:
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
-@dataclass(frozen=True)
-class LargePhotos:
+@dataclass(frozen=True, eq=False, repr=False)
+class LargePhotos(ArrayFields):
     """Photos larger than the scene's views, read one at a time; they have the poses of the scene's cameras."""
 
     Ks: np.ndarray  # [v,3,3] intrinsics at the size of the photos
@@ -200,8 +200,8 @@ class LargePhotos:
         return replace(self, Ks=self.Ks[list(views)], ids=tuple(self.ids[view] for view in views))
 
 
-@dataclass(frozen=True)
-class Views:
+@dataclass(frozen=True, eq=False, repr=False)
+class Views(ArrayFields):
     """Cameras with their photos.
 
     Args:
@@ -241,8 +241,8 @@ PROTECTED = np.float32(4)  # importance of a pixel that is white in a picture of
 PER_PIXEL = ("images", "masks", "importance")  # arrays of a scene with a value for each pixel of its views
 
 
-@dataclass(frozen=True)
-class Pixels:
+@dataclass(frozen=True, eq=False, repr=False)
+class Pixels(ArrayFields):
     """The pixel that each Gaussian belongs to, and the Gaussian that each pixel shows.
 
     Pixels are numbered over all views, ``(v·H + y)·W + x``.
@@ -299,8 +299,8 @@ class Pixels:
         return rows, Pixels(np.concatenate(homes), np.array(fronts, np.int32).reshape(shape), own=self.own)
 
 
-@dataclass(frozen=True)
-class Region:
+@dataclass(frozen=True, eq=False, repr=False)
+class Region(ArrayFields):
     """A box, which may be rotated, or a sphere; both are convex, so the mean of points inside is inside."""
 
     middle: np.ndarray  # [3]
@@ -321,8 +321,8 @@ def _check_count(what: str, values: Sequence[Any], count: int) -> None:
         raise ValueError(f"expected {count} {what}, got {len(values)}")
 
 
-@dataclass(frozen=True)
-class Scene:
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene(ArrayFields):
     """Gaussians, and the views from which they were made or that see them.
 
     The Gaussians are the rows of a file that are finite and not empty. If reading finds the pixel of each row, the
@@ -470,7 +470,7 @@ def fill_pixels(scene: SceneT, added: Gaussians, places: np.ndarray) -> SceneT:
     return replace(scene, gaussians=Gaussians.concat([scene.gaussians, added]), pixels=pixels, filled=filled)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class PicturedScene(Scene):
     """A scene with a picture of every view: its photo, or a replacement.
 
@@ -492,7 +492,7 @@ class PicturedScene(Scene):
         return Scene(**{field.name: getattr(self, field.name) for field in fields(Scene)} | {"images": None})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Groups:
     """Superpixels of every view: a label for each pixel, and the number of superpixels of each view."""
 
@@ -506,7 +506,7 @@ class Groups:
         return sum(self.counts)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Segmentation:
     """Superpixels of a scene and the number of Gaussians to make of them."""
 
@@ -515,7 +515,7 @@ class Segmentation:
     exact: bool  # True if exactly this number was requested
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Matches:
     """Clusters of Feature Gaussians that show the same surface."""
 
@@ -523,7 +523,7 @@ class Matches:
     count: int  # Number of clusters
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FeatureGaussians:
     """g Gaussians that each represent a group of members, with facts about the group for later stages.
 

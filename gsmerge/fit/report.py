@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.arrays import ArrayFields
 from gsmerge.fit.outside import Outside
 from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
@@ -15,8 +16,8 @@ SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, in units of one 
 HAZE = 0.05  # far fog above which a result gets a note, because it is plain to see in a viewer
 
 
-@dataclass(frozen=True, eq=False)
-class FitReport:
+@dataclass(frozen=True, eq=False, repr=False)
+class FitReport(ArrayFields):
     """Facts about a fit and its scores."""
 
     method: str  # `"none"` or `"full"`: the fit from which the result comes

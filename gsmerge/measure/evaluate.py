@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.arguments import check_arguments
-from gsmerge.arrays import as_pictures
+from gsmerge.arrays import ArrayFields, as_pictures
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import scored_pictures
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
@@ -104,8 +104,8 @@ class ResultScores:
         return [score for score in self.scores if score.split == split]
 
 
-@dataclass(frozen=True, eq=False)
-class Evaluation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Evaluation(ArrayFields):
     """Scores of several results on the same views.
 
     Args:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gsmerge.arrays import Array as AnyArray
-from gsmerge.arrays import as_array
+from gsmerge.arrays import ArrayFields, as_array
 from gsmerge.kernels.raster import blend as kernels
 from gsmerge.kernels.raster import sh
 from gsmerge.raster.tiled_view import Array, Splats, TiledView, make_splats, pieces, tile_ranges
@@ -128,8 +128,8 @@ def list_contributions(tiled: TiledView) -> Array:
     return totals.T
 
 
-@dataclass(frozen=True, eq=False)
-class Rendering:
+@dataclass(frozen=True, eq=False, repr=False)
+class Rendering(ArrayFields):
     """Rendered images of c views.
 
     Args:
