@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 
 import gsmerge
-from gsmerge.geometry import quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
+from gsmerge.geometry.transforms import quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
 from gsmerge.measure.lpips import INSTALL, lpips, lpips_available
 from gsmerge.raster.metrics import psnr, ssim
 from gsmerge.types import Cameras, Gaussians

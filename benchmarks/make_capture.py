@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from captures import frame_of
 
-from gsmerge.geometry import project_points
+from gsmerge.geometry.transforms import project_points
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.read import find_cameras, read_cameras
 from gsmerge.io.image_names import natural_key

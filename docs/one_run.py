@@ -26,7 +26,7 @@ import numpy as np
 from skimage.segmentation import find_boundaries
 
 import gsmerge
-from gsmerge.geometry import IDENTITY, covariances, project
+from gsmerge.geometry.transforms import IDENTITY, covariances, project
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
 DOCS = Path(__file__).parent
@@ -234,7 +234,7 @@ def align_section(run: Run) -> str:
     return "\n\n".join([
         "## 1. align: which row is which pixel",
         text(
-            "[`alignment/rows_first.py`](../../gsmerge/alignment/rows_first.py) gets the rows, the cameras and the",
+            "[`cameras/rows_first.py`](../../gsmerge/cameras/rows_first.py) gets the rows, the cameras and the",
             "photos, and returns the pixel of every row.",
         ),
         "\n".join([

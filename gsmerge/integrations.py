@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.arrays import Array, as_array, like
 from gsmerge.errors import SceneError
-from gsmerge.geometry import rotmat_to_quat
+from gsmerge.geometry.transforms import rotmat_to_quat
 from gsmerge.kernels.matrices import eigh, invert
+from gsmerge.values.arrays import Array, as_array, like
 
 _OTHER_SIZE = 0.1  # intrinsics are of another image size if all principal points differ by more than this share
 _BYTES = 255.0  # largest value of an 8-bit image

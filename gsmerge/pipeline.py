@@ -9,11 +9,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import Fitted, fit_scene
+from gsmerge.geometry.pooling import Members
 from gsmerge.networks.corrector import Corrector
+from gsmerge.photos.row_colors import RENDERS
 from gsmerge.plan import Plan
-from gsmerge.pooling import Members
 from gsmerge.runtime.record import choose
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged, keep_all

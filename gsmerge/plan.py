@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmerge.budget import CountLimits, FileSize, count_limits, exact_count, file_size, has_few_rows, max_allowed
 from gsmerge.errors import UsageError
 from gsmerge.facts.confirm_depths import FEWEST, Agreement
+from gsmerge.facts.counts import CountLimits, FileSize, count_limits, exact_count, file_size, has_few_rows, max_allowed
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.row_colors import RENDERS
 from gsmerge.facts.scene_size import SceneSize
-from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
+from gsmerge.photos.row_colors import RENDERS
+from gsmerge.photos.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.runtime.record import note
 from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.compact import OURS, CompactOptions
@@ -279,7 +279,7 @@ def choose_for_scene(
 ) -> SceneChoices:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
-    ``num_input``, ``num_reserved``: see :func:`gsmerge.budget.count_limits`. ``keeps``: the result of
+    ``num_input``, ``num_reserved``: see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: the result of
     :func:`keeps_fidelity` for the options as they were given; None: for these options.
     """
     keeps = keeps_fidelity(scene, options) if keeps is None else keeps

@@ -19,8 +19,17 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
-from gsmerge.arguments import check_fields
-from gsmerge.arrays import Array, ArrayFields, as_array, as_index, as_pictures, as_tensor, check_shape, concat_rows
+from gsmerge.values.arguments import check_fields
+from gsmerge.values.arrays import (
+    Array,
+    ArrayFields,
+    as_array,
+    as_index,
+    as_pictures,
+    as_tensor,
+    check_shape,
+    concat_rows,
+)
 
 if TYPE_CHECKING:
     import torch

@@ -15,9 +15,9 @@ from gsmerge.io.bounds import read_budget, read_lines
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import natural_order
-from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
-from gsmerge.scene.no_gaussians import find_remedy
-from gsmerge.words import count_words
+from gsmerge.io.no_gaussians import find_remedy
+from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
+from gsmerge.values.words import count_words
 
 NamedScene = tuple[Path, Path | None]  # a scene, and the folder that the user named; None if that was the scene itself
 MAX_FOLDERS = 100_000  # folders without a scene after the last scene; a link into a system's folders leads to more

@@ -24,12 +24,12 @@ from gsmerge.errors import SceneError, error_line
 from gsmerge.io.atomic import atomic_output, remove_stale
 from gsmerge.io.jsonl import append_line
 from gsmerge.io.locks import lock_file
-from gsmerge.report import file_sha256, finite
+from gsmerge.measure.documents import file_sha256, finite
 from gsmerge.runtime.memory import free_memory
 from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.threads import available_threads
 from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, LostProcess, RayPool, WorkerPool
-from gsmerge.words import count_words
+from gsmerge.values.words import count_words
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory, for all scenes that run at the same time by default
 

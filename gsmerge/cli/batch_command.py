@@ -15,7 +15,7 @@ from gsmerge.cli.console import RunEnd, print_document, say, separate_stdout, te
 from gsmerge.errors import BatchError, TargetError, UsageError
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import Engine
-from gsmerge.words import count_words
+from gsmerge.values.words import count_words
 
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
@@ -214,7 +214,7 @@ class Totals:
         """Format the end of a run: a table, ``columns`` wide, of the results, notes, failures, and a line of totals."""
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.io.image_names import natural_key
-        from gsmerge.report import text_table
+        from gsmerge.measure.documents import text_table
         from gsmerge.runtime.memory import human_share
 
         rows = [HEADER, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
@@ -250,7 +250,7 @@ def _list_reasons(reasons: Sequence[tuple[str, str]]) -> list[str]:
 
 def _describe_lack(report: Mapping[str, Any]) -> str:
     """Describe what is missing for a scene that no photo shows, and what its numbers are measured on."""
-    from gsmerge.facts.row_colors import ROW_COLORS
+    from gsmerge.photos.row_colors import ROW_COLORS
 
     if not report["input"]["num_views"]:
         return "no cameras found beside it or in the named folder; name them with --cameras, and photos with --images"
@@ -278,7 +278,7 @@ def print_plan(
 ) -> None:
     """Print which jobs a run would do; ``unit`` is the word for them."""
     from gsmerge.batch.run import choose_concurrency, pending_jobs
-    from gsmerge.report import document_head
+    from gsmerge.measure.documents import document_head
 
     out, pending = args.output, pending_jobs(jobs, args.output, options)
     concurrency = choose_concurrency(jobs, options)

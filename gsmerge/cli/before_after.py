@@ -14,7 +14,7 @@ from gsmerge.settings.evaluate import NETS, EvaluateOptions
 
 if TYPE_CHECKING:
     from gsmerge.io import GaussianFile
-    from gsmerge.scene.files import SceneFiles
+    from gsmerge.io.scene_files import SceneFiles
     from gsmerge.scene.read import Loaded
     from gsmerge.types import Cameras, Gaussians, Scene, Views
 
@@ -51,7 +51,7 @@ class BeforeAfter:
     @property
     def title(self) -> str:
         """Name of the scene."""
-        from gsmerge.scene.files import scene_title
+        from gsmerge.io.scene_files import scene_title
 
         return scene_title(self.load.files.ply)
 
@@ -65,8 +65,8 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     """Read the scenes BEFORE (``files``) and AFTER, and the views of ``--targets``; place views if there are none."""
     from gsmerge.facts.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.io import read_gaussians
+    from gsmerge.io.scene_files import result_cameras
     from gsmerge.runtime.record import record_run
-    from gsmerge.scene.files import result_cameras
 
     if files.cameras is None and "cameras" not in files.named:  # a result may have cameras that its scene lacks
         files = replace(files, cameras=next(filter(None, map(result_cameras, args.after)), None))
@@ -92,10 +92,10 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     """Read the cameras that ``compact`` wrote into or beside results, if the fit has moved them; add notes."""
     import numpy as np
 
-    from gsmerge.frame import scene_depth
+    from gsmerge.geometry.frame import scene_depth
     from gsmerge.io.cameras.camera_file import describe_moves, list_moves
     from gsmerge.io.cameras.read import read_cameras
-    from gsmerge.scene.files import result_cameras
+    from gsmerge.io.scene_files import result_cameras
 
     cameras: dict[str, Cameras] = {}
     notes, start = list[str](), scene.cameras.viewmats
@@ -128,7 +128,7 @@ def held_out_views(
     load: Loaded, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[Scene, Views | None, tuple[str, ...]]:
     """Choose the context views by ``--views``, and the held-out views; return scene, held-out views and notes."""
-    from gsmerge.facts.views import even_views, midpoint_views, subset
+    from gsmerge.photos.views import even_views, midpoint_views, subset
     from gsmerge.scene.held_out import read_held_out
 
     if target_images is not None and targets is None:

@@ -28,8 +28,8 @@ from gsmerge.settings.reading import NONE
 from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
+    from gsmerge.io.scene_files import SceneFiles
     from gsmerge.scene.exporters import ReadHints
-    from gsmerge.scene.files import SceneFiles
     from gsmerge.scene.read import Loaded
 
 STREAMED_LEVELS = 3  # of a lod-meta.json; the coarsest level, a sixteenth, loads at once

@@ -82,7 +82,7 @@ def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
         stream.print({kind: one_line(message)})
     if quiet or stream is not None:
         return
-    from gsmerge.report import wrap_line
+    from gsmerge.measure.documents import wrap_line
 
     text = one_line(PREFIXES[kind] + message)
     with suppress(OSError):
@@ -104,7 +104,7 @@ def print_document(
     document: Mapping[str, Any], lines: Sequence[str] | str, *, as_json: bool, quiet: bool = False, wrap: bool = True
 ) -> None:
     """Print a result on stdout as JSON or, unless ``quiet``, as lines; ``wrap``: break long lines in a terminal."""
-    from gsmerge.report import to_json, wrap_line
+    from gsmerge.measure.documents import to_json, wrap_line
 
     if as_json:
         sys.stdout.write(to_json(document))

@@ -108,8 +108,8 @@ def _write(
     outputs: Sequence[Path], document: Mapping[str, Any], pair: BeforeAfter, evaluation: Evaluation, stills: Stills
 ) -> None:
     """Write the reports, each in the format of its ending."""
+    from gsmerge.measure.documents import to_json
     from gsmerge.measure.scores import evaluation_csv
-    from gsmerge.report import to_json
 
     writers = {".json": to_json, ".csv": evaluation_csv}
     texts: dict[Path, str | bytes] = {}

@@ -35,7 +35,7 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
     from gsmerge.inspection.inspect import inspect as inspect_scene
     from gsmerge.inspection.inspect import inspection_lines
     from gsmerge.io.formats.table import INDEX
-    from gsmerge.report import document_head
+    from gsmerge.measure.documents import document_head
     from gsmerge.runtime.record import record_run
 
     hints = args.hints()
@@ -54,7 +54,7 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
 def _check_files(args: opt.Args) -> None:
     """Print a line for each file; SceneError if ``compact`` refuses one."""
     from gsmerge.inspection.file_checks import FileCheck, check_content
-    from gsmerge.report import document_head
+    from gsmerge.measure.documents import document_head
 
     checks, hints = list[FileCheck](), args.hints()
     with stage_progress(quiet=args.silent) as progress:

@@ -35,7 +35,7 @@ from gsmerge.settings.setting import Setting, change_settings, flat_settings, jo
 from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
-    from gsmerge.scene.files import SceneFiles
+    from gsmerge.io.scene_files import SceneFiles
     from gsmerge.scene.read import Loaded
 
 INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
@@ -126,7 +126,7 @@ class Args(SimpleNamespace):
 
         Cameras and photos that the user named are used; otherwise cameras and photos beside each scene.
         """
-        from gsmerge.scene.files import find_scene_files
+        from gsmerge.io.scene_files import find_scene_files
 
         named = {"cameras": self.cameras, **{name: vars(self).get(name) for name in ("images", "masks", "protect")}}
         files, *more_files = (find_scene_files(path, **named) for path in (scene, *more))

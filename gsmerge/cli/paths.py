@@ -12,7 +12,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.settings.setting import Settings, setting
 
 if TYPE_CHECKING:
-    from gsmerge.scene.files import SceneFiles
+    from gsmerge.io.scene_files import SceneFiles
 
 
 # Reports that gsmerge writes (pages, JSON, CSV, Markdown) have one of these texts in their first MARKED_BYTES

@@ -66,7 +66,7 @@ def render(args: opt.Args) -> None:
     kind = _choose_kind(args)
     from gsmerge.measure import drawings
     from gsmerge.measure.camera_path import parse_path
-    from gsmerge.report import document_head
+    from gsmerge.measure.documents import document_head
 
     files = args.files(args.scenes[0])
     framing = drawings.frame_files(files, args.cameras, args.images)

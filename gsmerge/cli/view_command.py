@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 )  # fmt: skip
 def view(args: opt.Args) -> None:
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D and scores in one file."""
+    from gsmerge.measure.documents import document_head
     from gsmerge.pages.data import collect
     from gsmerge.pages.page import headline, speed, speed_words, view_page
     from gsmerge.pages.view import check_page_name, file_gains
-    from gsmerge.report import document_head
 
     args.after = args.after or []
     if args.protect is not None and not args.sizes and "loaded" not in vars(args):

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmerge.compaction.block_start import BlockStart
 from gsmerge.compaction.report import CompactReport
-from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS
+from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record

@@ -10,7 +10,7 @@ from gsmerge.compaction.make_plan import make_plan
 from gsmerge.compaction.partition import Block, Covisibility, owning_views
 from gsmerge.compaction.scores import measure_input
 from gsmerge.facts.prepare import Prepared, prepare
-from gsmerge.frame import Frame
+from gsmerge.geometry.frame import Frame
 from gsmerge.pipeline import decode_views
 from gsmerge.plan import Plan
 from gsmerge.runtime.memory import free_pages, make_array

@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from gsmerge.budget import file_size
 from gsmerge.compaction.block_report import join_reports
 from gsmerge.compaction.block_start import BlockStart, start_block
 from gsmerge.compaction.costs import RunCosts
@@ -25,9 +24,10 @@ from gsmerge.compaction.partition import (
 from gsmerge.compaction.result import CompactResult
 from gsmerge.compaction.scores import measure_result
 from gsmerge.compaction.seams import fit_seams
-from gsmerge.facts.views import subset
+from gsmerge.facts.counts import file_size
 from gsmerge.fit import fit_scene, peak_weights
-from gsmerge.frame import Frame, scene_frame
+from gsmerge.geometry.frame import Frame, scene_frame
+from gsmerge.photos.views import subset
 from gsmerge.plan import WHOLE_GAUSSIANS, SceneChoices
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.memory import free_pages, memory_bytes

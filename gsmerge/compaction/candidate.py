@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 from gsmerge.compaction.scores import covers_all, measure_renders, measure_result
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import Fitted
-from gsmerge.frame import scene_depth
+from gsmerge.geometry.frame import scene_depth
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
+from gsmerge.photos.row_colors import RENDERS
 from gsmerge.plan import Plan
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
 from gsmerge.types import Cameras, Gaussians

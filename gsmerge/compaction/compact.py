@@ -15,7 +15,6 @@ from weakref import ReferenceType, ref
 
 import numpy as np
 
-from gsmerge.arguments import check_arguments
 from gsmerge.compaction.candidate import Candidate, score
 from gsmerge.compaction.costs import RunCosts, expected_parts, mean_inside
 from gsmerge.compaction.file_size import Rebuild, meet_bytes
@@ -28,9 +27,9 @@ from gsmerge.compaction.search import CountSearch, add_target, build_left_out, l
 from gsmerge.errors import DoubtWarning
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.row_colors import RENDERS
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
+from gsmerge.photos.row_colors import RENDERS
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan, choose_for_scene, note_surplus
 from gsmerge.runtime.record import (
@@ -50,6 +49,7 @@ from gsmerge.scene.input import as_scene
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians, Scene, StrPath
+from gsmerge.values.arguments import check_arguments
 
 SURPLUS = 1.05  # The requested count has to remain after clean-up, so this many times more are built
 

@@ -14,7 +14,7 @@ from gsmerge.compaction.outputs import add_views, name_photos
 from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import place_viewpoints
-from gsmerge.frame import scene_frame
+from gsmerge.geometry.frame import scene_frame
 from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
@@ -25,11 +25,11 @@ from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents, Format, NamedPhotos
 from gsmerge.io.formats.write import output_notes
 from gsmerge.io.photo_files import read_images
-from gsmerge.report import document_head
+from gsmerge.io.scene_files import find_scene_files, named_path, result_cameras, scene_title
+from gsmerge.measure.documents import document_head
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, OpacityChoice, ScaleChoice
 from gsmerge.settings.stages import CleanOptions

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.budget import LEVEL_FACTOR, CountLimits
 from gsmerge.compaction.curve import DROP_SHARES, DROP_STEPS, KNEE_SHARES, KNEE_STEPS, curve_counts
+from gsmerge.facts.counts import LEVEL_FACTOR, CountLimits
 from gsmerge.measure.coverage import shares_inside
 from gsmerge.runtime.record import Part
 from gsmerge.settings.compact import OURS

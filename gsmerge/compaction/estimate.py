@@ -15,18 +15,18 @@ from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import views_notes, without_repeats
 from gsmerge.facts.scene_size import measure_size
-from gsmerge.frame import canonicalise
+from gsmerge.geometry.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
+from gsmerge.measure.documents import document_head
 from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, choose_for_scene, resolve_budget, stands_alone
-from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
 from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import available_threads
 from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
-from gsmerge.words import count_words
+from gsmerge.values.words import count_words
 
 
 def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:

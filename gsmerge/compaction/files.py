@@ -14,7 +14,6 @@ from gsmerge.compaction.outputs import add_views, name_photos
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import DoubtWarning, SceneError, UsageError
-from gsmerge.facts.compare_photos import STRAY_PHOTOS
 from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
 from gsmerge.io.formats.columns import UNUSED, list_names
@@ -22,15 +21,16 @@ from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents, find_format
 from gsmerge.io.formats.write import output_notes
+from gsmerge.io.scene_files import SceneFiles, result_cameras, scene_title
+from gsmerge.photos.compare import STRAY_PHOTOS
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress, list_some
 from gsmerge.scene.exporters import NO_HINTS, ReadHints
-from gsmerge.scene.files import SceneFiles, result_cameras, scene_title
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene
-from gsmerge.words import count_words
+from gsmerge.values.words import count_words
 
 
 @dataclass(frozen=True)

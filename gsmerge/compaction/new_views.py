@@ -14,10 +14,10 @@ import numpy as np
 
 from gsmerge.compaction.left_out import LEAST_SEEN, can_leave_out, choose_views, leave_out, mean_seen
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.views import subset
-from gsmerge.geometry import camera_distances
+from gsmerge.geometry.transforms import camera_distances
 from gsmerge.io.formats.arrays import ExpectedScores
 from gsmerge.kernels.elementary import power
+from gsmerge.photos.views import subset
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import shrink_pictures

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmerge.geometry import camera_centres, project
+from gsmerge.geometry.transforms import camera_centres, project
 from gsmerge.kernels.reproject import see_points
 from gsmerge.runtime.memory import free_pages
 from gsmerge.runtime.threads import parallel_map

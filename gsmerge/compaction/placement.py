@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.geometry import IDENTITY, Similarity, euler_to_rotmat, normalize
+from gsmerge.geometry.transforms import IDENTITY, Similarity, euler_to_rotmat, normalize
 from gsmerge.kernels.matrices import matmul
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.types import Cameras, Gaussians

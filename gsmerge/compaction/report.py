@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.compaction.new_views import NewViews
+from gsmerge.measure.documents import document_head, file_sha256, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.raster.metrics import psnr_words
-from gsmerge.report import document_head, file_sha256, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share
-from gsmerge.words import count_words
+from gsmerge.values.words import count_words
 
 
 @dataclass(frozen=True)

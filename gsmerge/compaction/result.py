@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from weakref import ReferenceType
 
-from gsmerge.arguments import check_arguments
-from gsmerge.arrays import to_float32
 from gsmerge.compaction.candidate import Candidate, with_moved_views
 from gsmerge.compaction.new_views import SIDE, NewViews, Trial
 from gsmerge.compaction.outputs import write_result
@@ -18,13 +16,15 @@ from gsmerge.compaction.report import CompactReport, compared_psnr
 from gsmerge.compaction.scores import PartScores, measure_parts, score_input
 from gsmerge.compaction.search import SearchFacts
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
+from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.plan import Plan
 from gsmerge.raster.metrics import describe_distance, describe_loss
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene, number_views
-from gsmerge.words import count_words
+from gsmerge.values.arguments import check_arguments
+from gsmerge.values.arrays import to_float32
+from gsmerge.values.words import count_words
 
 if TYPE_CHECKING:
     import torch

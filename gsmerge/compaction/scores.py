@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.compaction.report import Covered, PhotoFiles
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.views import scored_views
+from gsmerge.photos.views import scored_views
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE, PhotoScore, scene_photos, score_photos
 from gsmerge.runtime.record import stage

@@ -7,10 +7,10 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from gsmerge.alignment.registration.join import concat_scenes
+from gsmerge.cameras.registration.join import concat_scenes
 from gsmerge.compaction.block_start import BlockStart
-from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
+from gsmerge.photos.views import in_float64, subset
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.composite import list_contributions
 from gsmerge.raster.photos import Photos, blank_photos

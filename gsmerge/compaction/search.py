@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, TypeVar
 
-from gsmerge.budget import LEVEL_FACTOR
 from gsmerge.compaction.candidate import Candidate
 from gsmerge.compaction.curve import (
     DROP_SHARES,
@@ -21,9 +20,10 @@ from gsmerge.compaction.curve import (
 )
 from gsmerge.compaction.left_out import LEAST_VIEWS, LeftOut, can_leave_out, choose_views, leave_out, mean_seen
 from gsmerge.compaction.scores import covers_all, may_leave_gaps, measure_input, measure_renders
+from gsmerge.facts.counts import LEVEL_FACTOR
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.row_colors import PHOTOS, RENDERS
 from gsmerge.kernels.elementary import exp, log, power
+from gsmerge.photos.row_colors import PHOTOS, RENDERS
 from gsmerge.pipeline import Build
 from gsmerge.plan import FIDELITY_LOSS, Plan
 from gsmerge.runtime.record import begin_part, choose, current_record, note, record_part, stage

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment import (
+from gsmerge.cameras import (
     check_pairs,
     choose_poses,
     explain_misalignment,
@@ -17,11 +17,10 @@ from gsmerge.alignment import (
     other_conventions,
     sample_pixels,
 )
-from gsmerge.arrays import Array, as_array, to_float32
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError
-from gsmerge.geometry import normalize, rgb_to_sh0
+from gsmerge.geometry.transforms import normalize, rgb_to_sh0
 from gsmerge.io.bounds import check_pixels
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENCV,
@@ -37,7 +36,8 @@ from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.input import TOLERANCE, check_cameras, check_numbers, check_values
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
-from gsmerge.words import count_words
+from gsmerge.values.arrays import Array, as_array, to_float32
+from gsmerge.values.words import count_words
 
 ORDERS = ("view-major", "none")
 _NOT_UNIT, _FEW = 0.01, 0.01  # difference of a quaternion's length from 1; share of rows that may exceed it

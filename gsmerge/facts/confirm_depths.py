@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmerge.frame import scene_depth
-from gsmerge.geometry import camera_depths, nearest_views, project
+from gsmerge.geometry.frame import scene_depth
+from gsmerge.geometry.transforms import camera_depths, nearest_views, project
 from gsmerge.kernels.elementary import log
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.budget import parse_share

@@ -14,7 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.geometry import camera_depths, median, motion_matrices, motion_vectors, move_views, without_common_motion
+from gsmerge.geometry.transforms import (
+    camera_depths,
+    median,
+    motion_matrices,
+    motion_vectors,
+    move_views,
+    without_common_motion,
+)
 from gsmerge.kernels.compare_views import COLUMNS, compare_views
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.facts.views import concat_cameras, take_rows
 from gsmerge.fit.outside import outside_cameras
-from gsmerge.geometry import motion_matrices, motion_vectors, nearest_views, normalize
+from gsmerge.geometry.transforms import motion_matrices, motion_vectors, nearest_views, normalize
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
+from gsmerge.photos.views import concat_cameras, take_rows
 from gsmerge.raster import contributions, make_splats, render, tile_view
 from gsmerge.raster.images import thin_out
 from gsmerge.runtime.record import note

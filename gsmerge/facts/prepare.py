@@ -8,9 +8,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.exposure import equalise_exposure
 from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.move_poses import move_poses
 from gsmerge.facts.pixels import with_pixels
@@ -24,10 +22,12 @@ from gsmerge.facts.place_cameras import (
     draw_placed,
     keep_finite,
 )
-from gsmerge.facts.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
 from gsmerge.facts.scene_size import SceneSize, measure_size, unlike_captures
-from gsmerge.facts.views import distinct_views, subset, take_rows
-from gsmerge.frame import Frame, canonicalise, sample_rows
+from gsmerge.geometry.frame import Frame, canonicalise, sample_rows
+from gsmerge.photos.compare import compare_photos
+from gsmerge.photos.exposure import equalise_exposure
+from gsmerge.photos.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
+from gsmerge.photos.views import distinct_views, subset, take_rows
 from gsmerge.raster.images import seen_weights
 from gsmerge.runtime.record import choose, note, record_part, stage
 from gsmerge.settings.stages import Look, PrepareOptions

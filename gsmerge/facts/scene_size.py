@@ -7,8 +7,8 @@ from functools import reduce
 
 import numpy as np
 
-from gsmerge.facts.views import camera_kinds
-from gsmerge.geometry import median, quantiles, vector_lengths
+from gsmerge.geometry.transforms import median, quantiles, vector_lengths
+from gsmerge.photos.views import camera_kinds
 from gsmerge.types import Gaussians, Scene
 
 # Bounds for the Gaussians of captures. The median largest scale is at least TINY times the extent, which is twice the

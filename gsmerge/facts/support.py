@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.frame import scene_frame
+from gsmerge.geometry.frame import scene_frame
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.composite import list_contributions
 from gsmerge.raster.photos import blank_photos

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmerge.fit.fit_state import FitState
-from gsmerge.geometry import camera_centres
+from gsmerge.geometry.pooling import principal_axes
+from gsmerge.geometry.transforms import camera_centres
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.edges import cut_at_edges
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
 from gsmerge.kernels.matrices import matmul
-from gsmerge.pooling import principal_axes
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 

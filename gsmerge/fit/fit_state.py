@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.geometry import clamp_inside, lies_inside
+from gsmerge.geometry.transforms import clamp_inside, lies_inside
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.raster import Splats

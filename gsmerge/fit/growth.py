@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.fit.fit_state import CARRIED, FitState, state_of
-from gsmerge.geometry import lower_median, quat_to_rotmat
+from gsmerge.geometry.transforms import lower_median, quat_to_rotmat
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
 from gsmerge.raster import composite, splat_adjoint, tile_view

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.geometry import depths_inside, is_inside, middle_depth, project, quantiles, step_outside
+from gsmerge.geometry.transforms import depths_inside, is_inside, middle_depth, project, quantiles, step_outside
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster import Splats, make_splats, tile_view
 from gsmerge.raster.composite import blend, blend_depths, depth_colors

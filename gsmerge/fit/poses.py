@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.fit.schedule import first_decay
-from gsmerge.geometry import motion_matrices
+from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.kernels.elementary import power
 from gsmerge.kernels.matrices import matmul
 from gsmerge.raster.photos import Photos
@@ -22,7 +22,7 @@ class PoseState:
 
     start: np.ndarray  # [v,4,4] viewmats before the fit
     viewmats: np.ndarray  # [v,4,4] float64; steps update it in place, and all sizes of the photos share it
-    # [v,6] motion of each camera, see gsmerge.geometry.motion_vectors. The centre of its rotation is the middle of the
+    # [v,6] motion of each camera, see transforms.motion_vectors. The centre of its rotation is the middle of the
     # scene, where rotations and shifts of a camera look different
     x: np.ndarray
     m: np.ndarray  # First moment

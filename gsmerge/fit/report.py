@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.arrays import ArrayFields
 from gsmerge.fit.outside import Outside
 from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
+from gsmerge.values.arrays import ArrayFields
 
 SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, in units of one on all: .3 to .6 on two captures
 HAZE = 0.05  # far fog above which a result gets a note, because it is plain to see in a viewer

@@ -15,7 +15,7 @@ from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob, prepare_fit
 from gsmerge.fit.survey import photo_error, survey_photos
-from gsmerge.geometry import clamp_inside
+from gsmerge.geometry.transforms import clamp_inside
 from gsmerge.raster import make_splats
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.record import choose, stage

@@ -13,7 +13,7 @@ from gsmerge.fit.outside import veil_gradients
 from gsmerge.fit.poses import PoseState, start_poses
 from gsmerge.fit.schedule import GROWTH, FitRun, Step, first_decay, loss_weights, step_sizes
 from gsmerge.fit.step_buffers import StepBuffers
-from gsmerge.geometry import camera_centres
+from gsmerge.geometry.transforms import camera_centres
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.raster.blend import MAX_ALPHA

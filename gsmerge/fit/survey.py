@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.fit.fit_state import FitState, start_state
 from gsmerge.fit.photo_sizes import holdout_psnr
 from gsmerge.fit.schedule import FitRun
-from gsmerge.geometry import project
+from gsmerge.geometry.transforms import project
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.composite import list_contributions, survey
 from gsmerge.raster.photos import NEAR_PLANE, Photos, photo_errors, render_photos

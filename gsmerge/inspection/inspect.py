@@ -9,37 +9,37 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment import check_cameras
-from gsmerge.arguments import check_arguments
+from gsmerge.cameras import check_cameras
 from gsmerge.compaction.estimate import estimate, estimate_lines
 from gsmerge.errors import SceneError
-from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.prepare import views_notes, without_repeats
 from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.facts.support import count_views_in_world
-from gsmerge.frame import canonicalise
+from gsmerge.geometry.frame import canonicalise
 from gsmerge.io import GaussianFile, file_notes, kept_comments
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.gsm import list_batches
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
 from gsmerge.io.photo_files import photo_array
+from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.measure.coverage import coverage, extents
+from gsmerge.measure.documents import finite
+from gsmerge.photos.compare import compare_photos
 from gsmerge.plan import describe_share
 from gsmerge.raster.photos import LEAST_OPACITY
-from gsmerge.report import finite
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_part, report_progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints
-from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.read import Loaded, align_scene, read_gaussian_file
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import PicturedScene, Scene, StrPath
+from gsmerge.values.arguments import check_arguments
 
 _OPAQUE = 0.995  # the optical depth is capped from this opacity on
 _SATURATED = 1e-6  # float32 changes the logit of an opacity that is nearer to 0 or 1 than this

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.geometry import (
+from gsmerge.geometry.transforms import (
     camera_centres,
     lower_median,
     middle_depth,

@@ -10,16 +10,14 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.arguments import check_arguments
-from gsmerge.arrays import ArrayFields, as_pictures
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import scored_pictures
-from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
-from gsmerge.facts.views import pick_views
-from gsmerge.frame import scene_frame
+from gsmerge.geometry.frame import scene_frame
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
 from gsmerge.measure.visibility import context_points, visible_pixels
+from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
+from gsmerge.photos.views import pick_views
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
 from gsmerge.raster.photos import COVERED, NEAR_PLANE, WHOLE
@@ -28,6 +26,8 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.input import check_scene
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, own_gaussians
+from gsmerge.values.arguments import check_arguments
+from gsmerge.values.arrays import ArrayFields, as_pictures
 
 MENDED = (
     "the photos of the input views differ from their Gaussians, or from each other, in tone, exposure or by objects"

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.facts.views import pick_views
 from gsmerge.fit.report import HAZE
-from gsmerge.geometry import camera_depths, middle_depth, step_outside
+from gsmerge.geometry.transforms import camera_depths, middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
+from gsmerge.photos.views import pick_views
 from gsmerge.raster import Splats, make_splats, render, tile_view
 from gsmerge.raster.composite import blend_depths
 from gsmerge.runtime.record import Progress

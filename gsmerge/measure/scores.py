@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
+from gsmerge.measure.documents import csv_text, document_head, text_table, wrap_line
 from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.raster.photos import WHOLE
-from gsmerge.report import csv_text, document_head, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share
 
 Row = Sequence[str]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.geometry import is_inside, median, project
+from gsmerge.geometry.transforms import is_inside, median, project
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.reproject import mark_pixels
 from gsmerge.raster import render

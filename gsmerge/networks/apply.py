@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.arrays import Array, as_array, concat_columns, concat_rows, like
-from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
+from gsmerge.geometry.pooling import Members, feature_to_gaussians
+from gsmerge.geometry.transforms import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
 from gsmerge.networks.corrector import Corrector
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
@@ -29,10 +29,10 @@ from gsmerge.networks.tokens import (
     split_tables,
 )
 from gsmerge.networks.weights import RunnableNetworks
-from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
+from gsmerge.values.arrays import Array, as_array, concat_columns, concat_rows, like
 
 # Columns of a Feature Gaussian itself; members, their weights and the view belong to its cluster
 OWN_COLUMNS = (*CORRECTED, "gains", "shN", "footprints")

@@ -12,12 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.arrays import Array, like
 from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.networks.tokens import correct_features, correct_gaussians
 from gsmerge.networks.options import RESIDUAL, Bounds
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians
+from gsmerge.values.arrays import Array, like
 
 MEAN, SIZE, ROTATION, LOGIT, COLOR, MASS = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13), 13
 HALF = 0.5  # share of the bounds that each stage before the decoder may use

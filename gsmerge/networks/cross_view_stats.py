@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from gsmerge.geometry import camera_distances, order_others
+from gsmerge.geometry.pooling import Members
+from gsmerge.geometry.transforms import camera_distances, order_others
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, make_tree, nearest_of_others, sum_cross_view
-from gsmerge.pooling import Members
 from gsmerge.raster.tiled_view import pieces
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsmerge.geometry import rotation_entries
+from gsmerge.geometry.transforms import rotation_entries
 from gsmerge.networks.corrections import COLOR, LOGIT, MEAN, ROTATION, SIZE
 from gsmerge.types import SH_C0, Gaussians
 

@@ -14,9 +14,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gsmerge.arrays import Array
 from gsmerge.kernels.networks.layers import GELU, PLAIN, TANH, attend, dense, normalise, pack, padded, scratch_size
 from gsmerge.networks.options import NetworkOptions
+from gsmerge.values.arrays import Array
 
 Layer = tuple[np.ndarray, np.ndarray, int]  # packed weights, packed bias, outputs
 

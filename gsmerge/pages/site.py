@@ -7,8 +7,7 @@ from importlib import resources
 from pathlib import Path
 
 from gsmerge.facts.place_cameras import place_viewpoints
-from gsmerge.facts.views import even_views
-from gsmerge.geometry import middle_depth
+from gsmerge.geometry.transforms import middle_depth
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.sog import sog_bytes
@@ -17,6 +16,7 @@ from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
 from gsmerge.pages.page import VIEWER, base64_text, camera_numbers, data_uri, describe_gain, render_template
+from gsmerge.photos.views import even_views
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 

@@ -11,20 +11,20 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
-from gsmerge.arguments import check_arguments
 from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.read import GaussianFile, read_gaussians
+from gsmerge.io.scene_files import find_scene_files, scene_title
 from gsmerge.pages.data import collect
 from gsmerge.pages.page import headline, view_page
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
-from gsmerge.scene.files import find_scene_files, scene_title
 from gsmerge.scene.input import as_scene
 from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
+from gsmerge.values.arguments import check_arguments
 
 MAX_SOLID = 600_000  # Gaussians, 8 MB of a notebook; a larger scene is shown in stills only
 HEIGHT = 820  # height of a page in a notebook, pixels

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.arguments import check_arguments
-from gsmerge.arrays import Array, like
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import (
     Rendering,
@@ -26,6 +24,8 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.tiled_view import FAR_PLANE, TiledView, make_splats, tile_view
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.values.arguments import check_arguments
+from gsmerge.values.arrays import Array, like
 
 ONE_AT_A_TIME = 4_000_000  # Gaussians; larger scenes tile one view at a time, since a tiled view takes as much memory
 BAND_PIXELS = 1 << 22  # largest number of pixels drawn at once; larger images are drawn in bands to save memory

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import cv2
 import numpy as np
 
-from gsmerge.geometry import sh0_to_rgb
+from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import composite
 from gsmerge.raster.metrics import MAX_PSNR, psnr_within

@@ -18,10 +18,10 @@ import numpy as np
 
 from gsmerge.compaction.compact import compact
 from gsmerge.errors import GsmergeError, UsageError
-from gsmerge.facts.views import even_views, subset, take_rows
-from gsmerge.frame import Frame, scene_frame
-from gsmerge.geometry import move_views
+from gsmerge.geometry.frame import Frame, scene_frame
+from gsmerge.geometry.transforms import move_views
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
+from gsmerge.photos.views import even_views, subset, take_rows
 from gsmerge.runtime.record import Progress
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions

@@ -14,8 +14,8 @@ from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.dataparser import DATAPARSER
 from gsmerge.io.cameras.foreign import INTRINSICS
 from gsmerge.io.cameras.long_lrm import FRAMES_FILE, POSE_FILE, SCALE_FILE
-from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
-from gsmerge.scene.photos import images_beside
+from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
+from gsmerge.photos.scene_photos import images_beside
 
 EXTRA_FILES = (DATAPARSER, INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files
 

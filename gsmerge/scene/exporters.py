@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from gsmerge.alignment import ESTIMATED
+from gsmerge.cameras import ESTIMATED
 from gsmerge.io.cameras.table import FFGS
 from gsmerge.settings.reading import SCENE_ARGUMENTS, Order, ReadHints
 from gsmerge.settings.setting import join_words, suggest_name

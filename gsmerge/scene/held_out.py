@@ -8,15 +8,15 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import IDENTITY, Similarity, camera_centres, fit_similarity
+from gsmerge.geometry.transforms import IDENTITY, Similarity, camera_centres, fit_similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.image_names import find_image
 from gsmerge.io.photo_files import as_floats, photo_size
+from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
 from gsmerge.kernels.elementary import arccos
+from gsmerge.photos.scene_photos import stored_photos
 from gsmerge.scene.exporters import NO_HINTS
-from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
-from gsmerge.scene.photos import stored_photos
 from gsmerge.scene.read import Loaded
 from gsmerge.scene.views import limit_photo_size
 from gsmerge.types import Scene, StrPath, Views

@@ -10,31 +10,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsmerge.alignment import ESTIMATED, Alignment, AlignmentResult, Recovery, align, check_pixels
-from gsmerge.arguments import check_arguments
+from gsmerge.cameras import ESTIMATED, Alignment, AlignmentResult, Recovery, align, check_pixels
 from gsmerge.errors import SceneError
-from gsmerge.evidence.assign import Assignment
-from gsmerge.geometry import move_views
+from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.formats.arrays import FLAT_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
-from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.exporters import (
-    NO_HINTS,
-    Exporter,
-    ReadHints,
-    choose_exporters,
-    find_cameras_of_model,
-    find_exporter,
-    make_hints,
-)
-from gsmerge.scene.files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
-from gsmerge.scene.grid_fit import GridFit
-from gsmerge.scene.masks import NO_MASKS, Masks, check_masks
-from gsmerge.scene.photos import (
+from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
+from gsmerge.photos.assign import Assignment
+from gsmerge.photos.grid_fit import GridFit
+from gsmerge.photos.masks import NO_MASKS, Masks, check_masks
+from gsmerge.photos.scene_photos import (
     SEEN_PLACE,
     UNNAMED,
     Proposal,
@@ -54,11 +43,22 @@ from gsmerge.scene.photos import (
     stored_photos,
     without_photo,
 )
+from gsmerge.runtime.threads import use_threads
+from gsmerge.scene.exporters import (
+    NO_HINTS,
+    Exporter,
+    ReadHints,
+    choose_exporters,
+    find_cameras_of_model,
+    find_exporter,
+    make_hints,
+)
 from gsmerge.scene.rows import read_rotations, take_gaussians
 from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, LargePhotos, Scene, StrPath
-from gsmerge.words import count_words
+from gsmerge.values.arguments import check_arguments
+from gsmerge.values.words import count_words
 
 T = TypeVar("T")
 
@@ -198,7 +198,7 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
 def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
     """Join several scenes of the same place to one, with the notes of all."""
-    from gsmerge.alignment.registration.join import join_scenes
+    from gsmerge.cameras.registration.join import join_scenes
 
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
     scene, used = joined.scene, [loads[i] for i in joined.used]
@@ -573,7 +573,7 @@ def _keep_stored_cameras(
 
     None for cameras that were not named and do not see the Gaussians.
     """
-    from gsmerge.alignment import check_cameras  # few scenes need it
+    from gsmerge.cameras import check_cameras  # few scenes need it
 
     pictures = stored_photos(files, camera_file) if photos else ()
     cameras = to_cameras(camera_file, photo_size(pictures))

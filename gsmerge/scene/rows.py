@@ -7,8 +7,8 @@ from math import prod
 
 import numpy as np
 
-from gsmerge.alignment import AlignmentResult
-from gsmerge.geometry import camera_depths
+from gsmerge.cameras import AlignmentResult
+from gsmerge.geometry.transforms import camera_depths
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.settings.reading import QuatChoice

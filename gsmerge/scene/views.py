@@ -28,11 +28,11 @@ from gsmerge.io.photo_files import (
     resize_to,
     same_shape,
 )
+from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import count_bars
-from gsmerge.scene.files import SceneFiles
-from gsmerge.scene.masks import NO_MASKS, Masks, read_masks
-from gsmerge.scene.photos import ScenePhotos
+from gsmerge.photos.masks import NO_MASKS, Masks, read_masks
+from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.types import Cameras, LargePhotos
 
 _MAX_BYTES = 2 << 30  # size of all photos as floats, up to which photos are not resized unless rows have no pixels
@@ -58,7 +58,7 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
     sharp = None if "cameras" in files.named else read_sharp_camera(files.ply)
     if sharp is not None:
         return sharp
-    from gsmerge.alignment import estimate_cameras  # few files need it
+    from gsmerge.cameras import estimate_cameras  # few files need it
 
     return estimate_cameras(files.ply, ply.gaussians.means, ply.valid)
 

@@ -8,9 +8,9 @@ from threading import Lock
 import numpy as np
 
 from gsmerge.errors import UsageError
-from gsmerge.geometry import morton_codes
+from gsmerge.geometry.pooling import Members, pool_members, scene_members
+from gsmerge.geometry.transforms import morton_codes
 from gsmerge.kernels.raster.contribution import dominant_labels
-from gsmerge.pooling import Members, pool_members, scene_members
 from gsmerge.raster import TiledView
 from gsmerge.raster.images import tile_views
 from gsmerge.runtime.record import stage

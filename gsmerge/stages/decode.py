@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.arrays import as_array
+from gsmerge.geometry.pooling import Members, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.networks.corrector import ANALYTIC, Corrector
-from gsmerge.pooling import Members, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import MIXED, MIXED_COUNTS, DecodeOptions
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.types import Decoded, FeatureGaussians, Gaussians, PicturedScene, Scene
+from gsmerge.values.arrays import as_array
 
 GROUPS_PER_TASK = 8192
 REFILLS = 3  # rounds that replace Gaussians too faint to be seen; a few of the new Gaussians are faint again

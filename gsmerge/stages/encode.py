@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsmerge.arrays import to_float32
+from gsmerge.geometry.pooling import ROWS, Members, Moments, Rule, pool_members
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.networks.cross_view_stats import cross_view_stats
-from gsmerge.pooling import ROWS, Members, Moments, Rule, pool_members
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene
+from gsmerge.values.arrays import to_float32
 
 if TYPE_CHECKING:
     from gsmerge.networks.weights import RunnableNetworks
@@ -41,7 +41,7 @@ def make_corrector(networks: RunnableNetworks | None, members: Members, cameras:
 def encode(scene: Scene, members: Members, groups: Groups, rule: Rule = "depth") -> FeatureGaussians:
     """Pool every superpixel into one Feature Gaussian, in order of view and label.
 
-    Superpixels without a valid member are omitted. ``rule``: see :func:`gsmerge.pooling.pool_members`.
+    Superpixels without a valid member are omitted. ``rule``: see :func:`gsmerge.geometry.pooling.pool_members`.
     """
     starts, ids, views = member_rows(scene, members, groups)
     return from_moments(pool_members(members, starts, ids, rule), starts, ids, views)

@@ -15,11 +15,11 @@ import numpy as np
 
 from gsmerge.facts.holes import SIZE, make_gaussians
 from gsmerge.facts.place_cameras import between_cameras
-from gsmerge.facts.row_colors import fill_gaps
 from gsmerge.fit.outside import Outside
-from gsmerge.geometry import is_inside, project
+from gsmerge.geometry.transforms import is_inside, project
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
+from gsmerge.photos.row_colors import fill_gaps
 from gsmerge.raster import Splats, TiledView, make_splats, tile_view
 from gsmerge.raster.composite import blend, blend_depths, view_colors
 from gsmerge.raster.photos import NEAR_PLANE

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.arrays import to_float32
+from gsmerge.geometry.pooling import FULL_MATRIX, MAX_OPACITY, principal_axes
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.elementary import power as power_of
 from gsmerge.kernels.gaussians.cross_view import make_tree
 from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments, merge_pairs
-from gsmerge.pooling import FULL_MATRIX, MAX_OPACITY, principal_axes
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians
+from gsmerge.values.arrays import to_float32
 
 ROUND_SHARE = 0.25  # least share of the Gaussians that remains after a round
 CELL_SHARE = 0.2  # least share of a cell's Gaussians that remains after a round; longer chains of merges make haze

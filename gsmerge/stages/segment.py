@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.budget import CountLimits
-from gsmerge.geometry import camera_depths
+from gsmerge.facts.counts import CountLimits
+from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels.elementary import log, log10
 from gsmerge.kernels.superpixels.merge_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
 from gsmerge.kernels.superpixels.regions import pad_labels

@@ -13,7 +13,7 @@ from functools import reduce
 import cv2
 import numpy as np
 
-from gsmerge.geometry import correlation, is_inside, project
+from gsmerge.geometry.transforms import correlation, is_inside, project
 from gsmerge.kernels.pictures import blur, sobel
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.photos import NEAR_PLANE

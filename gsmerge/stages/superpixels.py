@@ -15,8 +15,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from gsmerge.arrays import Array, as_array, like
-from gsmerge.budget import count_for
+from gsmerge.facts.counts import count_for
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels, refine
 from gsmerge.kernels.superpixels.seeds import (
@@ -30,6 +29,7 @@ from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.types import Groups
+from gsmerge.values.arrays import Array, as_array, like
 
 RECTANGLES, EARLY_SWEEPS = 2.0, 0  # rectangles per superpixel that rdseg merges, and sweeps before the merges
 NUM_SWEEPS = 2

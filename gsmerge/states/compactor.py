@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsmerge.arguments import check_arguments
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import UsageError
@@ -19,6 +18,7 @@ from gsmerge.states.extend import BatchReport, extend
 from gsmerge.states.features import decode_features, extend_features
 from gsmerge.states.state_file import State, load_state, save_state
 from gsmerge.types import Gaussians, Scene, StrPath
+from gsmerge.values.arguments import check_arguments
 
 
 def extend_state(

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment import check_cameras
+from gsmerge.cameras import check_cameras
 from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
 from gsmerge.errors import SceneError
 from gsmerge.facts.confirm_depths import CERTAIN, ENOUGH
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
-from gsmerge.geometry import camera_centres, camera_distances
+from gsmerge.geometry.transforms import camera_centres, camera_distances
 from gsmerge.io.photo_files import photo_array
+from gsmerge.photos.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads

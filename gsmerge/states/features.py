@@ -15,16 +15,16 @@ import numpy as np
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
-from gsmerge.facts.views import concat_cameras, resize_cameras
-from gsmerge.frame import Frame
+from gsmerge.geometry.frame import Frame
+from gsmerge.geometry.pooling import Members, feature_to_gaussians, gaussian_members
 from gsmerge.kernels.gaussians.cluster import connected_components
 from gsmerge.networks.apply import NetworkContext, decode_gaussians
 from gsmerge.networks.checkpoint import Checkpoint
 from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group_features
 from gsmerge.networks.weights import NetworkWeights
+from gsmerge.photos.views import concat_cameras, resize_cameras
 from gsmerge.pipeline import encode_views
-from gsmerge.pooling import Members, feature_to_gaussians, gaussian_members
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import PIECE, CompactOptions

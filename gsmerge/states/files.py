@@ -20,12 +20,12 @@ from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.write import output_notes
 from gsmerge.io.locks import lock_file
-from gsmerge.report import document_head, seconds_document, seconds_line
+from gsmerge.io.scene_files import SceneFiles, scene_title
+from gsmerge.measure.documents import document_head, seconds_document, seconds_line
 from gsmerge.runtime.memory import human_bytes, human_share, peak_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.content_hash import content_hash, digest, list_files
 from gsmerge.scene.exporters import NO_HINTS, ReadHints
-from gsmerge.scene.files import SceneFiles, scene_title
 from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import DecodeOptions
@@ -33,7 +33,7 @@ from gsmerge.states.compactor import extend_state
 from gsmerge.states.extend import BATCH
 from gsmerge.states.features import decode_features
 from gsmerge.states.state_file import State, load_state, save_state
-from gsmerge.words import count_words
+from gsmerge.values.words import count_words
 
 
 def extend_file(

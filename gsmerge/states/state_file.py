@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.frame import Frame
+from gsmerge.geometry.frame import Frame
 from gsmerge.io.cameras.camera_file import MAX_NUMBER, check_camera, check_size
 from gsmerge.io.formats.gsm import (
     FEATURES,
@@ -29,7 +29,7 @@ from gsmerge.networks.weights import NetworkWeights
 from gsmerge.scene.read import load_scene
 from gsmerge.states.features import FeatureState, ViewSamples
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, StrPath
-from gsmerge.words import count_words
+from gsmerge.values.words import count_words
 
 COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
 LARGEST = 1e37  # absolute value of any number; float32 ends at 3e38

@@ -16,12 +16,11 @@ from scripts import load_script
 
 import gsmerge
 from gsmerge import plan, types
-from gsmerge.alignment import cameras as cameras_off
-from gsmerge.alignment import rows_first, score
-from gsmerge.alignment.registration import register
+from gsmerge.cameras import cameras as cameras_off
+from gsmerge.cameras import rows_first, score
+from gsmerge.cameras.registration import register
 from gsmerge.compaction import blocks, curve, left_out, new_views, partition, seams, search
-from gsmerge.evidence import colors
-from gsmerge.facts import compare_photos, confirm_depths, exposure, holes, move_poses, scene_size, views
+from gsmerge.facts import confirm_depths, holes, move_poses, scene_size
 from gsmerge.fit import outside, photo_sizes, schedule, stage
 from gsmerge.fit import report as fit_report
 from gsmerge.io import bounds, photo_files
@@ -31,6 +30,7 @@ from gsmerge.measure import drawings, error_maps, fog
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
 from gsmerge.pages import data, splats
+from gsmerge.photos import colors, compare, exposure, views
 from gsmerge.raster import metrics, photos, tiled_view
 from gsmerge.runtime import memory, work
 from gsmerge.scene.held_out import read_held_out
@@ -168,8 +168,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"With {word(left_out.LEAST_VIEWS)} views or more, both leave out some views",
     ),
     PHOTOS: (
-        f"differs by {colors.STEP:g} of the range, averaged over {len(compare_photos.WINDOW)} x"
-        f" {len(compare_photos.WINDOW)} pixels",
+        f"differs by {colors.STEP:g} of the range, averaged over {len(compare.WINDOW)} x {len(compare.WINDOW)} pixels",
         f"at least {photo_sizes.MIN_AUTO_SCALE:g} times as many pixels a side",
         f"wider than a {part(holes.LARGE)} of the picture",
         f"cover at least {percent(holes.PART)} of it",

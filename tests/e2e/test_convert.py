@@ -19,7 +19,7 @@ import gsmerge
 from gsmerge.compaction.convert import ConvertOptions, convert_files, join_gaussians
 from gsmerge.compaction.placement import find_placement, rotation_between
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.geometry import covariances
+from gsmerge.geometry.transforms import covariances
 from gsmerge.io import CameraFile
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.colmap_model import model_files

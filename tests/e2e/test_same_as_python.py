@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import gsmerge
-from gsmerge.facts.views import subset
+from gsmerge.photos.views import subset
 
 from .conftest import Run
 

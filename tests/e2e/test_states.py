@@ -20,7 +20,7 @@ from damage.tensors import negate
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.scene.files import find_scene_files
+from gsmerge.io.scene_files import find_scene_files
 from gsmerge.scene.read import load_scene
 from gsmerge.states.extend import NOT_COMPARED
 from gsmerge.states.state_file import load_state, save_state

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from messages import ERROR
 
-from gsmerge.report import wrap_line
+from gsmerge.measure.documents import wrap_line
 
 from .conftest import Run
 

@@ -14,7 +14,7 @@ from shared import make_once
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.geometry import middle_depth, rotmat_to_quat
+from gsmerge.geometry.transforms import middle_depth, rotmat_to_quat
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import near_plane
 from gsmerge.raster.metrics import psnr

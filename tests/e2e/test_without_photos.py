@@ -14,7 +14,7 @@ from messages import noted
 from sweeps import sweep
 
 import gsmerge
-from gsmerge.facts.row_colors import NO_PHOTOS, ROW_COLORS
+from gsmerge.photos.row_colors import NO_PHOTOS, ROW_COLORS
 
 from .conftest import Run
 

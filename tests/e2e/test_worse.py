@@ -15,7 +15,7 @@ from sweeps import sweep
 
 import gsmerge
 from gsmerge import Scene
-from gsmerge.facts.views import subset
+from gsmerge.photos.views import subset
 from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run

@@ -16,7 +16,7 @@ from saved_cameras import write_transforms
 from tiny_scene import edited_json
 
 from gsmerge import to_cameras
-from gsmerge.geometry import pose_changes
+from gsmerge.geometry.transforms import pose_changes
 from gsmerge.io import write_gaussians
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene

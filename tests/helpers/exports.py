@@ -10,7 +10,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, make_tiny, rotation, write_images, write_transforms
 
-from gsmerge.geometry import quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry.transforms import quat_to_rotmat, rotmat_to_quat
 from gsmerge.kernels import elementary
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge import Scene
-from gsmerge.geometry import motion_matrices, move_views
+from gsmerge.geometry.transforms import motion_matrices, move_views
 from gsmerge.kernels.matrices import matmul
 
 

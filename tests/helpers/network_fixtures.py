@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from scenes import arc, make_scene, room
 
+from gsmerge.geometry.pooling import Members, scene_members
 from gsmerge.networks.apply import NetworkContext
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.pooling import Members, scene_members
 from gsmerge.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups, Scene
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.kernels.pictures import blur
+from gsmerge.photos.pictures import ViewPictures
 from gsmerge.raster.photos import shrink_pictures
 
 WIDTH, HEIGHT, STEP = 256, 192, 48  # pixels of a view, and between two

@@ -11,7 +11,7 @@ import numpy as np
 import scenes
 from tiny_scene import FLIP
 
-from gsmerge.geometry import motion_vectors
+from gsmerge.geometry.transforms import motion_vectors
 from gsmerge.kernels.matrices import invert, matmul
 
 VIEWS, WIDTH, HEIGHT = 3, 24, 16

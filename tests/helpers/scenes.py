@@ -18,12 +18,12 @@ from floors import nudged
 from gsmerge import Cameras, Gaussians, Scene, compact, render
 from gsmerge.compaction.report import CompactReport
 from gsmerge.compaction.result import CompactResult
-from gsmerge.facts.views import subset, take_rows
 from gsmerge.fit import FitJob, FitOptions
 from gsmerge.fit.schedule import FitRun, prepare_fit
-from gsmerge.geometry import covariances, normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry.transforms import covariances, normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.kernels import elementary
 from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.photos.views import subset, take_rows
 from gsmerge.raster.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
 from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians

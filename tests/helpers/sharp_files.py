@@ -11,7 +11,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from gsmerge import Scene
-from gsmerge.geometry import multiply_quats, rotmat_to_quat
+from gsmerge.geometry.transforms import multiply_quats, rotmat_to_quat
 from gsmerge.kernels import elementary
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians

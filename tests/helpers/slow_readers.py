@@ -11,7 +11,7 @@ import numpy as np
 import scenes
 
 from gsmerge import Gaussians, Scene
-from gsmerge.geometry import normalize
+from gsmerge.geometry.transforms import normalize
 from gsmerge.io import read_gaussians
 from gsmerge.kernels import elementary
 from gsmerge.types import SH_C0

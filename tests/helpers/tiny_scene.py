@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gsmerge.geometry import normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry.transforms import normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io import CameraFile, write_ply
 from gsmerge.kernels import elementary
 from gsmerge.kernels.matrices import invert, matmul

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge import Cameras, Gaussians, Scene
-from gsmerge.geometry import normalize
+from gsmerge.geometry.transforms import normalize
 
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.geometry import camera_depths, motion_matrices, project_points
+from gsmerge.geometry.transforms import camera_depths, motion_matrices, project_points
 from gsmerge.kernels.compare_views import COLUMNS, add_differences, compare_views, find_surfaces
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.kernels.matrices import matmul

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.geometry import motion_matrices, project_points
+from gsmerge.geometry.transforms import motion_matrices, project_points
 from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.pictures import sample_bilinear
 from gsmerge.kernels.reproject import add_photo_errors, follow_pixels, linearise, mark_pixels, pixel_errors, see_points

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scenes import make_features
 from skimage.measure import label as connected_parts
 
-from gsmerge.pooling import Members, gaussian_members
+from gsmerge.geometry.pooling import Members, gaussian_members
 from gsmerge.stages.decode import split_counts
 from gsmerge.stages.segment import RegionTree, SegmentOptions, cut_tree, region_tree, segment
 from gsmerge.types import FeatureGaussians, Gaussians, Groups

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import assert_same_set, make_features
 
+from gsmerge.geometry.pooling import Members, gaussian_members
 from gsmerge.kernels.elementary import exp
-from gsmerge.pooling import Members, gaussian_members
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import decode
 from gsmerge.types import FeatureGaussians, Gaussians

@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.geometry import normalize
+from gsmerge.geometry.transforms import normalize
 from gsmerge.kernels import elementary
 from gsmerge.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
 from gsmerge.raster.metrics import psnr

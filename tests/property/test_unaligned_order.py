@@ -15,7 +15,7 @@ from sweeps import sweep
 
 from gsmerge import Scene, compact
 from gsmerge.facts.pixels import with_pixels
-from gsmerge.pooling import scene_members
+from gsmerge.geometry.pooling import scene_members
 from gsmerge.stages.assign import Owners, find_owners, owner_pixels
 from gsmerge.stages.encode import member_rows
 from gsmerge.stages.segment import SegmentOptions, segment

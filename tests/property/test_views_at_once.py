@@ -10,7 +10,7 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Scene, compact
-from gsmerge.pooling import scene_members
+from gsmerge.geometry.pooling import scene_members
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
-from gsmerge.geometry import covariances, project, quat_to_rotmat
+from gsmerge.geometry.pooling import feature_to_gaussians, scene_members
+from gsmerge.geometry.transforms import covariances, project, quat_to_rotmat
 from gsmerge.kernels import elementary
-from gsmerge.pooling import feature_to_gaussians, scene_members
 from gsmerge.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups
 

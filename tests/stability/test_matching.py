@@ -8,7 +8,7 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Cameras
-from gsmerge.pooling import feature_to_gaussians
+from gsmerge.geometry.pooling import feature_to_gaussians
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge

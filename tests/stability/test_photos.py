@@ -14,7 +14,7 @@ from sweeps import sweep
 
 from gsmerge import Compactor, CompactResult, Gaussians, Scene, compact, render
 from gsmerge.facts.prepare import PrepareOptions, prepare
-from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
+from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels import elementary
 
 Photos = np.ndarray

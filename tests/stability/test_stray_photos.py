@@ -13,10 +13,10 @@ from messages import noted, says
 from sweeps import sweep
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
-from gsmerge.evidence.pictures import show_views
-from gsmerge.facts.compare_photos import compare_photos, find_matching_views
-from gsmerge.facts.row_colors import ROW_COLORS
-from gsmerge.frame import canonicalise
+from gsmerge.geometry.frame import canonicalise
+from gsmerge.photos.compare import compare_photos, find_matching_views
+from gsmerge.photos.pictures import show_views
+from gsmerge.photos.row_colors import ROW_COLORS
 from gsmerge.types import PicturedScene
 
 Photos = np.ndarray

@@ -10,9 +10,9 @@ import unaligned_scenes
 from messages import refuses
 
 from gsmerge import CompactOptions, Scene, compact
-from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.facts.views import pick_views
 from gsmerge.kernels import elementary
+from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.photos.views import pick_views
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS

@@ -23,7 +23,7 @@ from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.fit import Fitted
-from gsmerge.frame import canonicalise
+from gsmerge.geometry.frame import canonicalise
 from gsmerge.networks.checkpoint import IN_PACKAGE
 from gsmerge.plan import (
     EFFORTS,

@@ -19,7 +19,7 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.fit.outside import HIGH, LOW, outside_cameras
 from gsmerge.fit.report import FitReport
-from gsmerge.geometry import camera_centres
+from gsmerge.geometry.transforms import camera_centres
 from gsmerge.pipeline import build
 from gsmerge.plan import choose_for_scene
 from gsmerge.raster.metrics import psnr

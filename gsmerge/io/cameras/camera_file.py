@@ -10,14 +10,14 @@ from typing import Any, Literal, NamedTuple, get_args
 import cv2
 import numpy as np
 
-from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity, pose_changes
+from gsmerge.geometry.transforms import Similarity, pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.io.photo_files import PhotoArrays, PhotoReader, PhotoTransform, Size, change_photos, photo_size, same_shape
 from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath
+from gsmerge.values.arguments import check_arguments
 
 # Limits of numbers in poses and intrinsics, sides and focal lengths. No camera exceeds them, and larger numbers would
 # overflow in later steps

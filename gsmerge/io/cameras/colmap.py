@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import rotation_entries
+from gsmerge.geometry.transforms import rotation_entries
 from gsmerge.io.bounds import MAX_MODEL_BYTES, read_lines
 from gsmerge.io.cameras.camera_file import StoredView, check_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras

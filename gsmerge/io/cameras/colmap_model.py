@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import project, rotmat_to_quat, sh0_to_rgb
+from gsmerge.geometry.transforms import project, rotmat_to_quat, sh0_to_rgb
 from gsmerge.io.formats.table import CAMERAS, IMAGES, POINTS
 from gsmerge.types import Cameras, Gaussians
 

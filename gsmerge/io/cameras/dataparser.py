@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.geometry import Similarity
+from gsmerge.geometry.transforms import Similarity
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import MAX_NUMBER, make_similarity
 from gsmerge.io.cameras.camera_source import number_errors, to_array, to_number

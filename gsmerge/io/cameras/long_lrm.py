@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import mean_pose_frame
+from gsmerge.geometry.transforms import mean_pose_frame
 from gsmerge.io.bounds import MAX_VIEWS, read_text
 from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, number_errors

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import CameraFile
@@ -16,6 +15,7 @@ from gsmerge.io.cameras.viewer_cameras import ENDING
 from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.types import StrPath
+from gsmerge.values.arguments import check_arguments
 
 _lazy = lazy_functions(__package__)
 holds_images = _lazy("npz_files.holds_images")

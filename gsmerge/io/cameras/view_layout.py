@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from gsmerge.geometry import motion_matrices
+from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, convert, to_array
 
@@ -73,7 +73,7 @@ class RotationAndShift:
         rotation: Key of the rotation.
         shift: Key of the last column, which is the camera's centre if poses are camera-to-world.
         to_matrix: Makes the rotation ``[3,3]`` from the numbers under its key: :func:`rotation_of_matrix`,
-            :func:`rotation_of_vector`, or :func:`gsmerge.geometry.quat_to_rotmat` for quaternions wxyz.
+            :func:`rotation_of_vector`, or :func:`gsmerge.geometry.transforms.quat_to_rotmat` for quaternions wxyz.
     """
 
     rotation: str

@@ -8,8 +8,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from gsmerge.arrays import Array, as_array
-from gsmerge.geometry import (
+from gsmerge.geometry.transforms import (
     apply_harmonics_rotation,
     harmonics_rotation,
     morton_codes,
@@ -21,6 +20,7 @@ from gsmerge.io.bounds import ReadBudget
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
+from gsmerge.values.arrays import Array, as_array
 
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
 LOGIT_COMMENT = "opacity: logit"  # states the encoding in files of gsmerge, so that no reader guesses it

@@ -15,7 +15,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import rgb_to_sh0
+from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.arrays import PACKED
 from gsmerge.kernels.elementary import log, log1p

@@ -19,7 +19,7 @@ from typing import IO, Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import quat_to_rotmat
+from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats.arrays import (
     Columns,

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError
-from gsmerge.geometry import lower_median, rgb_to_sh0
+from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.scale_units import LINEAR_NOTE, ScaleJudgement, judge_scales, log_of_scales
@@ -22,7 +21,8 @@ from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.reading import OpacityChoice, ScaleChoice
 from gsmerge.types import Gaussians, StrPath
-from gsmerge.words import count_words
+from gsmerge.values.arguments import check_arguments
+from gsmerge.values.words import count_words
 
 MIN_PADDING = 16  # number of equal rows at the origin that are padding; fewer may be Gaussians
 MIN_FINITE = 0.002  # least share of finite rows; a file with fewer is refused

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.arrays import distinct
-from gsmerge.geometry import medians
+from gsmerge.geometry.transforms import medians
 from gsmerge.io.formats.table import PLY, output_format
 from gsmerge.types import Gaussians, StrPath
+from gsmerge.values.arrays import distinct
 
 # Renders change above this mean square of the moves of Gaussians: by .05 dB of 27. A move is in units of the Gaussian's
 # size and at most 1. Scenes around their origin have at most a tenth of this.

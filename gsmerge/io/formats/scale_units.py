@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.geometry import median, quantiles
+from gsmerge.geometry.transforms import median, quantiles
 from gsmerge.io.formats import arrays
 from gsmerge.kernels.elementary import log
 from gsmerge.runtime.memory import gather

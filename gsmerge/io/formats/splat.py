@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import rgb_to_sh0
+from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import check_file, read_errors
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored
 from gsmerge.kernels.elementary import exp, log

@@ -23,12 +23,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmerge.arrays import to_float32
 from gsmerge.errors import SceneError
-from gsmerge.geometry import rgb_to_sh0
+from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
 from gsmerge.types import SH_C0, Gaussians, StrPath
+from gsmerge.values.arrays import to_float32
 
 VERSION, MAX_DEGREE = 3, 3  # of written files; Spark 2.2 does not read version 4
 MAGIC = 0x5053474E

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.arguments import check_arguments
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
@@ -30,7 +29,8 @@ from gsmerge.io.formats.splat_transform import name_file, run_program
 from gsmerge.io.formats.table import INDEX, Contents
 from gsmerge.io.formats.write import write_ply
 from gsmerge.types import Gaussians, StrPath
-from gsmerge.words import count_words
+from gsmerge.values.arguments import check_arguments
+from gsmerge.values.words import count_words
 
 VERSION = 1
 MAX_DEGREE = sog.MAX_DEGREE

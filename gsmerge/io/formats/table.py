@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 
-from gsmerge.arrays import to_float32
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats import ply
@@ -19,6 +18,7 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.settings.setting import join_words
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath
+from gsmerge.values.arrays import to_float32
 
 STATE_ENDING = ".gsm"  # of states, as gsmerge extend writes them
 INDEX = "lod-meta.json"  # name of a Streamed SOG, by which viewers recognise it

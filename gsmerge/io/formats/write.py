@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmerge.arguments import check_arguments
 from gsmerge.io.atomic import AddOutput, atomic_output
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.table import OUTPUT_FORMATS, PLY, Contents, NamedPhotos, find_format, output_format
 from gsmerge.types import Gaussians, StrPath
+from gsmerge.values.arguments import check_arguments
 
 
 def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.facts.prepare import Prepared
+from gsmerge.geometry.pooling import MAX_OPACITY
 from gsmerge.kernels.elementary import log, power
 from gsmerge.plan import Plan
-from gsmerge.pooling import MAX_OPACITY
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.stages.pair_merge import FLATNESS, MIN_OPACITY, Cloud, cloud_of, gaussians_of, merge_rows

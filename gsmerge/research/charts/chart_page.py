@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
+from gsmerge.measure.documents import csv_text
 from gsmerge.pages.page import PICTURES, data_uri, render_template
-from gsmerge.report import csv_text
 from gsmerge.research.charts.figures import Figure
 from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Results, size_label
 from gsmerge.research.charts.measure_run import HELD_OUT, RunRecord

@@ -11,11 +11,11 @@ from typing import Any
 
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.left_out import LEAST_VIEWS, choose_views
-from gsmerge.facts.views import subset
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
+from gsmerge.io.scene_files import find_scene_files
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate
-from gsmerge.scene.files import find_scene_files
+from gsmerge.photos.views import subset
 from gsmerge.scene.held_out import HeldOutViews, read_held_out
 from gsmerge.scene.read import load_files
 from gsmerge.settings.compact import CompactOptions

@@ -114,7 +114,7 @@ def _run_all(args: opt.Args, runs: Sequence[Run], measured: EvaluateOptions) -> 
 
 def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     """Draw charts, page and table of all runs in the folder, and print a summary; ``notes`` were printed before."""
-    from gsmerge.report import document_head
+    from gsmerge.measure.documents import document_head
     from gsmerge.research.charts.chart_page import list_held_out_notes, make_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures
     from gsmerge.research.charts.lines import Results

@@ -11,7 +11,7 @@ from gsmerge.cli.console import print_document, stage_progress
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.setting import Settings, setting
-from gsmerge.words import count_words
+from gsmerge.values.words import count_words
 
 OPTIONS = LazyFunction("gsmerge.research.generate", "GenerateOptions")
 
@@ -35,7 +35,7 @@ class SeriesOptions(Settings):
 )  # fmt: skip
 def generate(args: opt.Args) -> None:
     """Make synthetic scenes to train and test with, as a feed-forward network would export them."""
-    from gsmerge.report import document_head
+    from gsmerge.measure.documents import document_head
     from gsmerge.research.generate import GenerateOptions
     from gsmerge.research.generate import generate as generate_scenes
 

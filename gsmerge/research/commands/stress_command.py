@@ -35,7 +35,7 @@ class StressFiles(Settings):
 )
 def stress(args: opt.Args) -> None:
     """Compact a scene under bad conditions, and report for each if the required property holds."""
-    from gsmerge.report import document_head
+    from gsmerge.measure.documents import document_head
     from gsmerge.research.stress import stress as stress_scene
 
     settings, places = args.make(CompactOptions, StressFiles)

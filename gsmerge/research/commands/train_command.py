@@ -44,7 +44,7 @@ class RunOptions(Settings):
 )  # fmt: skip
 def train(args: opt.Args) -> None:
     """Train networks on scenes and their photos; after an interruption the same call resumes the run."""
-    from gsmerge.report import document_head
+    from gsmerge.measure.documents import document_head
     from gsmerge.research.training import TrainOptions, choose_device, prepare_shards, preset_options
     from gsmerge.research.training import train as train_networks
     from gsmerge.runtime.threads import use_threads

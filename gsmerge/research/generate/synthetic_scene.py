@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gsmerge.geometry import quat_to_rotmat
+from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.kernels.elementary import cos, exp, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import blur

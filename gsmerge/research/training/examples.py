@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import lower_median
-from gsmerge.pooling import Members, feature_to_gaussians
+from gsmerge.geometry.pooling import Members, feature_to_gaussians
+from gsmerge.geometry.transforms import lower_median
 from gsmerge.raster.photos import Photos, blank_photos, scene_pictures
 from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, make_training_scene, view_subsets
 from gsmerge.research.training.train_options import TrainOptions

@@ -24,11 +24,11 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gsmerge.errors import SceneError
-from gsmerge.facts.views import even_views
 from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.preview import save_picture, to_picture
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.corrections import LOGIT
+from gsmerge.photos.views import even_views
 from gsmerge.research.training.examples import Example, draw_views, recolor
 from gsmerge.research.training.losses import render_window, window_loss, window_psnr
 from gsmerge.research.training.modules import Head, Networks

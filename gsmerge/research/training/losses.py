@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsmerge.geometry.pooling import Members, pool_members, to_gaussians
 from gsmerge.measure.lpips import EPSILON, SCALE, SHIFT, Layer, min_size, read_layers
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
-from gsmerge.pooling import Members, pool_members, to_gaussians
 from gsmerge.raster.autograd import render_tensors
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.research.training.loss_ssim import loss_ssim

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from gsmerge.arrays import Array, as_array, as_tensor
 from gsmerge.networks.options import FEATURE, GROUP, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
 from gsmerge.networks.weights import NetworkWeights
+from gsmerge.values.arrays import Array, as_array, as_tensor
 
 
 def mlp(*widths: int) -> nn.Sequential:

@@ -2,7 +2,8 @@
 
 The geometry of the stages is computed on tensors here, so that gradients pass from the results of a stage to the
 results of earlier stages. The formulas are those of the kernels that the stages use (:mod:`gsmerge.networks.tokens`,
-:mod:`gsmerge.pooling`, :mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours, clusters,
+:mod:`gsmerge.geometry.pooling`, :mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours,
+clusters,
 order of axes, views, and the agreement of a group with other views.
 """
 
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsmerge.arrays import Array, as_array, as_tensor
+from gsmerge.geometry.pooling import MAX_OPACITY, Members, principal_axes
 from gsmerge.networks.apply import NetworkContext, prepare_children, run_heads
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
 from gsmerge.networks.cross_view_stats import NUM_STATS
@@ -29,7 +30,6 @@ from gsmerge.networks.tensors import (
     skew_vectors,
 )
 from gsmerge.networks.tokens import GroupFeatures
-from gsmerge.pooling import MAX_OPACITY, Members, principal_axes
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop
@@ -37,6 +37,7 @@ from gsmerge.stages.decode import divide
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
+from gsmerge.values.arrays import Array, as_array, as_tensor
 
 TINY = 1e-12  # world units
 CONSTANT = slice(6, 8)  # columns of a group without a gradient: log of the number of members, and their mean weight
@@ -63,7 +64,8 @@ def groups_to_arrays(groups: GroupFeatures) -> GroupFeatures:
 def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     """Compute scales ``[g,3]``, ascending, and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
 
-    Values are those of :func:`gsmerge.pooling.principal_axes`; gradients follow from first-order perturbation theory.
+    Values are those of :func:`gsmerge.geometry.pooling.principal_axes`; gradients follow from first-order perturbation
+    theory.
     Axes of nearly equal scales have no clear direction, so the gradient of their rotation is damped.
     """
     scales, quats = (torch.from_numpy(axes).float() for axes in principal_axes(as_array(covars)))
@@ -80,7 +82,7 @@ def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def differentiate_base(features: FeatureGaussians) -> Gaussians:
-    """Decode Feature Gaussians like :func:`gsmerge.pooling.feature_to_gaussians`, differentiable."""
+    """Decode Feature Gaussians like :func:`gsmerge.geometry.pooling.feature_to_gaussians`, differentiable."""
     scales, quats = differentiate_axes(features.covars)
     depths = features.extinctions * as_tensor(features.gains) / (scales[:, 1] * scales[:, 2])
     opacities = (1 - torch.exp(-depths)).clamp(0, MAX_OPACITY)

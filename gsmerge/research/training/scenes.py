@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.facts.views import concat_cameras, even_views, resize_cameras, subset
-from gsmerge.frame import canonicalise
+from gsmerge.geometry.frame import canonicalise
+from gsmerge.geometry.pooling import Members, scene_members
 from gsmerge.measure.sizes import resize_photo
 from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.pooling import Members, scene_members
+from gsmerge.photos.views import concat_cameras, even_views, resize_cameras, subset
 from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import NEAR_PLANE, Photos, photos_of
 from gsmerge.runtime.threads import parallel_map

@@ -19,13 +19,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry.pooling import Members
 from gsmerge.io.atomic import atomic_output
-from gsmerge.pooling import Members
+from gsmerge.io.scene_files import find_scene_files
 from gsmerge.raster.photos import Photos
 from gsmerge.research.training.examples import Example, make_examples, scene_name
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.scene.content_hash import content_hash, digest, list_files
-from gsmerge.scene.files import find_scene_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.version import __version__
 

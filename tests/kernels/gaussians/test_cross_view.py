@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scenes import arc, make_scene, room
 
-from gsmerge.geometry import camera_distances, project
+from gsmerge.geometry.pooling import Members, scene_members
+from gsmerge.geometry.transforms import camera_distances, project
 from gsmerge.kernels import elementary
 from gsmerge.kernels.gaussians.cross_view import sum_cross_view
 from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR_LOG, cross_view_stats
-from gsmerge.pooling import Members, scene_members
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import SH_C0, Cameras, Scene
 

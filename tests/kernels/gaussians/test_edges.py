@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_gaussians import random_gaussians
 
-from gsmerge.geometry import covariances
+from gsmerge.geometry.transforms import covariances
 from gsmerge.kernels.gaussians.edges import NUM_EDGES, cut_at_edges
 from gsmerge.types import Gaussians
 

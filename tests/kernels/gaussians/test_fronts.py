@@ -10,7 +10,7 @@ from made_gaussians import random_gaussians
 
 from gsmerge.facts import pixels as pixels_module
 from gsmerge.facts.pixels import find_pixels
-from gsmerge.geometry import project
+from gsmerge.geometry.transforms import project
 from gsmerge.kernels import elementary
 from gsmerge.kernels.gaussians.fronts import order_by_depth, project_centres, weigh_centres
 from gsmerge.types import Cameras, Gaussians, Scene

@@ -8,7 +8,7 @@ import numpy as np
 from made_gaussians import random_gaussians
 from messages import refuses
 
-from gsmerge.geometry import covariances
+from gsmerge.geometry.transforms import covariances
 from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments, merge_pairs
 
 UPPER = np.triu_indices(3)

@@ -10,12 +10,12 @@ import pytest
 from messages import refuses
 from network_fixtures import Made, made
 
-from gsmerge.geometry import quat_to_rotmat
+from gsmerge.geometry.pooling import feature_to_gaussians
+from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.kernels.elementary import log
 from gsmerge.networks.corrections import move_features, move_gaussians
 from gsmerge.networks.options import FEATURE, MEMBER, PART, RESIDUAL
 from gsmerge.networks.tokens import GroupFeatures, compute_group_features, contiguous, part_tokens
-from gsmerge.pooling import feature_to_gaussians
 from gsmerge.stages.merge import take
 from gsmerge.types import SH_C0, Gaussians
 

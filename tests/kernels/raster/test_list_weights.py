@@ -10,7 +10,7 @@ from made_gaussians import random_gaussians
 from numpy.testing import assert_allclose
 from slow_renderer import render_arrays
 
-from gsmerge.geometry import quat_to_rotmat
+from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.kernels.raster.list_weights import collect
 from gsmerge.raster import TiledView, composite, make_splats, splat_adjoint, tile_view
 from gsmerge.raster.weights import ViewWeights, apply_transposed, view_weights

@@ -14,7 +14,7 @@ from messages import refuses
 
 from gsmerge.batch.find import find_scenes, main_file, scene_plys
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.scene.files import find_scene_files
+from gsmerge.io.scene_files import find_scene_files
 
 OUT = Path("out")
 pytestmark = pytest.mark.usefixtures("inside")

@@ -14,12 +14,12 @@ from sweeps import sweep
 from gsmerge import CompactOptions, compact
 from gsmerge.compaction.seams import join_views
 from gsmerge.errors import UsageError
-from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.facts.scene_size import measure_size
-from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions, fit
 from gsmerge.fit.photo_sizes import fit_photos
-from gsmerge.frame import canonicalise
+from gsmerge.geometry.frame import canonicalise
+from gsmerge.photos.row_colors import ROW_COLORS
+from gsmerge.photos.views import subset
 from gsmerge.plan import choose_for_scene
 from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES

@@ -10,7 +10,7 @@ import pytest
 from gsmerge.compaction import report
 from gsmerge.compaction.new_views import NewViews
 from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
-from gsmerge.report import to_json
+from gsmerge.measure.documents import to_json
 from gsmerge.settings.compact import CompactOptions
 
 

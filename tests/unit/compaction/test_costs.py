@@ -8,9 +8,9 @@ import numpy as np
 from made_gaussians import random_gaussians
 
 from gsmerge import CompactOptions
-from gsmerge.budget import count_limits
 from gsmerge.compaction.costs import IMPORT_SECONDS, RunCosts, expected_parts
 from gsmerge.compaction.estimate import estimate
+from gsmerge.facts.counts import count_limits
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.types import Cameras, Scene
 

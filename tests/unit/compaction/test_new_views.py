@@ -12,9 +12,9 @@ from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.compaction.left_out import LEAST_VIEWS, choose_views, cover, leave_out, mean_seen
 from gsmerge.compaction.new_views import OWN, SPREAD, NewViews, Trial, shrink_scene
 from gsmerge.facts.prepare import prepare
-from gsmerge.facts.views import subset
 from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, new_views_comment, read_new_views
 from gsmerge.pages.page import describe_gain
+from gsmerge.photos.views import subset
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import PicturedScene
 

@@ -11,14 +11,14 @@ from typing import Any, cast
 import pytest
 from messages import noted, refuses
 
-from gsmerge.budget import exact_count, max_allowed
 from gsmerge.compaction.curve import CurvePoint, count_within, curve_counts, curve_knee
 from gsmerge.compaction.left_out import LeftOut
 from gsmerge.compaction.search import CLOSE, MAX_RUNS, MAX_TRIED, CountSearch, level_counts, search_count
+from gsmerge.facts.counts import exact_count, max_allowed
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.fit import FitOptions
 from gsmerge.kernels import elementary
+from gsmerge.photos.row_colors import PHOTOS
 from gsmerge.pipeline import Build
 from gsmerge.plan import FIDELITY_LOSS, Plan
 from gsmerge.settings.budget import DEVICES, BudgetOptions, parse_share, share_text

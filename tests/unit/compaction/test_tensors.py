@@ -14,7 +14,7 @@ from messages import noted, refuses
 from scenes import FIELDS, arc, make_scene, move, room
 
 from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate
-from gsmerge.geometry import sh0_to_rgb
+from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels import elementary
 from gsmerge.scene.input import check_scene
 

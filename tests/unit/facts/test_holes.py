@@ -15,7 +15,7 @@ from gsmerge import compact
 from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.prepare import prepare
-from gsmerge.geometry import camera_depths, rgb_to_sh0
+from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0
 from gsmerge.kernels import elementary
 from gsmerge.raster import render
 from gsmerge.runtime.record import record_run

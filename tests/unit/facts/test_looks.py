@@ -12,9 +12,9 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import CompactResult, Scene, compact, render
-from gsmerge.facts.compare_photos import _note_hidden, have_other_tones
-from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
+from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
+from gsmerge.photos.compare import _note_hidden, have_other_tones
+from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.runtime.record import record_run
 from gsmerge.types import PicturedScene
 

@@ -15,8 +15,8 @@ from gsmerge.compaction.make_plan import make_plan
 from gsmerge.facts.move_poses import move_poses
 from gsmerge.facts.prepare import prepare
 from gsmerge.fit import Fitted
-from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
-from gsmerge.geometry import without_common_motion as without_common
+from gsmerge.geometry.transforms import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
+from gsmerge.geometry.transforms import without_common_motion as without_common
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
 from gsmerge.runtime.threads import use_threads

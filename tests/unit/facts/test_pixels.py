@@ -11,8 +11,8 @@ import unaligned_scenes
 
 from gsmerge import Scene
 from gsmerge.facts.pixels import choose_level, find_pixels
-from gsmerge.frame import canonicalise
-from gsmerge.geometry import camera_depths
+from gsmerge.geometry.frame import canonicalise
+from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels import elementary
 
 WIDTH, HEIGHT = 96, 72

@@ -9,9 +9,9 @@ from messages import noted, refuses
 
 from gsmerge import Scene
 from gsmerge.facts.prepare import prepare
-from gsmerge.facts.row_colors import ROW_COLORS
-from gsmerge.frame import canonicalise, scene_frame
-from gsmerge.geometry import project
+from gsmerge.geometry.frame import canonicalise, scene_frame
+from gsmerge.geometry.transforms import project
+from gsmerge.photos.row_colors import ROW_COLORS
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import record_part
 

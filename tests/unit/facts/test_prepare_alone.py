@@ -13,7 +13,7 @@ from messages import noted
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
 from gsmerge.facts.place_cameras import MAX_SCORED, place_viewpoints
 from gsmerge.facts.prepare import Prepared, prepare_alone
-from gsmerge.geometry import project
+from gsmerge.geometry.transforms import project
 from gsmerge.plan import stands_alone
 from gsmerge.runtime.record import record_run
 

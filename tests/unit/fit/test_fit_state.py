@@ -13,7 +13,7 @@ from gsmerge import Gaussians, Scene
 from gsmerge.fit.fit_state import FitState, gaussians_of, start_state
 from gsmerge.fit.growth import FADED, error_masses, grow, grow_to
 from gsmerge.fit.photo_sizes import holdout_psnr, reduced, training_weights
-from gsmerge.geometry import covariances
+from gsmerge.geometry.transforms import covariances
 from gsmerge.kernels import elementary
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.raster.metrics import psnr

@@ -15,7 +15,7 @@ from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.schedule import DROPOUT, FEW_VIEWS, MANY_STEPS, Schedule, prepare_fit
 from gsmerge.fit.steps import make_optimiser, start_poses
-from gsmerge.geometry import motion_matrices, motion_vectors, project_points
+from gsmerge.geometry.transforms import motion_matrices, motion_vectors, project_points
 from gsmerge.raster import tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import gradients_of

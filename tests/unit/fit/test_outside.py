@@ -25,7 +25,7 @@ from gsmerge.fit.outside import (
     veil_gradients,
 )
 from gsmerge.fit.report import HAZE
-from gsmerge.geometry import camera_centres
+from gsmerge.geometry.transforms import camera_centres
 from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import Photos, render_photos
 from gsmerge.runtime.record import record_run

@@ -12,7 +12,7 @@ from gsmerge import Gaussians
 from gsmerge.fit.edges import Edges, cut_state, find_edges
 from gsmerge.fit.fit_state import FitState, start_state
 from gsmerge.fit.full import fit_full
-from gsmerge.geometry import project
+from gsmerge.geometry.transforms import project
 from gsmerge.kernels.gaussians.edges import cut_at_edges
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import use_threads

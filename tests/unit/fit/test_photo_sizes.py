@@ -12,12 +12,12 @@ import scenes
 from messages import refuses
 
 from gsmerge import Gaussians, Scene, compact
-from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions, fit, fit_photos
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale, training_weights
 from gsmerge.fit.schedule import DrawMode, prepare_fit
-from gsmerge.geometry import project
+from gsmerge.geometry.transforms import project
+from gsmerge.photos.views import subset
 from gsmerge.raster.photos import EPS2D, MASKED, scene_photos, score_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import LargePhotos, PicturedScene

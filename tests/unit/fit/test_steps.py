@@ -16,7 +16,7 @@ from gsmerge.fit import FitJob, FitOptions
 from gsmerge.fit.fit_state import FitState, start_state
 from gsmerge.fit.schedule import FitRun, Schedule, Step, prepare_fit
 from gsmerge.fit.steps import Optimiser, make_optimiser
-from gsmerge.geometry import motion_matrices
+from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.raster import tiled_view
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import use_threads

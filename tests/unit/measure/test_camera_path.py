@@ -11,7 +11,7 @@ import pytest
 from messages import refuses
 from sweeps import sweep
 
-from gsmerge.geometry import camera_centres, motion_matrices, project
+from gsmerge.geometry.transforms import camera_centres, motion_matrices, project
 from gsmerge.kernels import elementary
 from gsmerge.measure.camera_path import (
     HORIZONTAL,

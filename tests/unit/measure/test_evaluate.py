@@ -17,12 +17,12 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
 from gsmerge.cli.console import say_notes
-from gsmerge.facts.row_colors import ROW_COLORS
+from gsmerge.measure.documents import to_json
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate, near_plane
 from gsmerge.measure.fog import measure_fog
 from gsmerge.measure.scores import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines
+from gsmerge.photos.row_colors import ROW_COLORS
 from gsmerge.raster.photos import scene_pictures
-from gsmerge.report import to_json
 from gsmerge.types import Gaussians, Scene, Views
 
 PLAIN = EvaluateOptions(lpips=())

@@ -12,7 +12,7 @@ from tiny_scene import rotation
 
 from gsmerge.fit.outside import HIGH, LOW, PLACES
 from gsmerge.fit.outside import outside_cameras as place_views
-from gsmerge.geometry import camera_centres
+from gsmerge.geometry.transforms import camera_centres
 from gsmerge.kernels import elementary
 from gsmerge.measure.fog import (
     ALL,

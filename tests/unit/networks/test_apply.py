@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from network_fixtures import SMALL, Made, made, noisy, untrained
 
-from gsmerge.arrays import as_array
-from gsmerge.geometry import covariances
+from gsmerge.geometry.pooling import feature_to_gaussians
+from gsmerge.geometry.transforms import covariances
 from gsmerge.networks.apply import NetworkContext, decode_gaussians, encode_features, find_neighbors, run_heads
 from gsmerge.networks.corrector import ANALYTIC
 from gsmerge.networks.options import GROUP, PAPER_NUMBERS, NetworkOptions
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.pooling import feature_to_gaussians
 from gsmerge.settings.stages import DecodeOptions, MatchOptions
 from gsmerge.stages.decode import decode, divide
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
+from gsmerge.values.arrays import as_array
 
 PAPER = replace(SMALL, outputs="absolute", merger_start="first", geometry="carried", group_numbers=False)
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scenes import make_features
 
-from gsmerge import geometry
-from gsmerge.geometry import covariances, quat_to_rotmat
+from gsmerge.geometry import transforms
+from gsmerge.geometry.pooling import feature_to_gaussians
+from gsmerge.geometry.transforms import covariances, quat_to_rotmat
 from gsmerge.kernels import elementary
 from gsmerge.networks.corrections import (
     COLOR,
@@ -22,7 +23,6 @@ from gsmerge.networks.corrections import (
     residual_limits,
 )
 from gsmerge.networks.options import FEATURE, RESIDUAL, Bounds
-from gsmerge.pooling import feature_to_gaussians
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
 
 EACH = np.arange(20)  # its own group
@@ -137,9 +137,9 @@ def test_rotations_agree_with_each_other(torch: Any) -> None:
     same = np.tile(np.eye(3, dtype=np.float32), (20, 1, 1))
     round_ones = replace(base, quats=np.tile(np.float32([1, 0, 0, 0]), (20, 1)))
     quats = move(round_ones, quarter, EACH, same).quats
-    np.testing.assert_allclose(geometry.quat_to_rotmat(quats) @ [1.0, 0, 0], [[0.0, 1, 0]] * 20, atol=1e-6)
+    np.testing.assert_allclose(transforms.quat_to_rotmat(quats) @ [1.0, 0, 0], [[0.0, 1, 0]] * 20, atol=1e-6)
     np.testing.assert_allclose(
-        tensors.quat_to_rotmat(torch.from_numpy(quats)), geometry.quat_to_rotmat(quats), atol=1e-6
+        tensors.quat_to_rotmat(torch.from_numpy(quats)), transforms.quat_to_rotmat(quats), atol=1e-6
     )
 
 

@@ -16,8 +16,7 @@ import scenes
 from messages import noted
 
 from gsmerge import Gaussians, Scene, evaluate, render
-from gsmerge.facts.row_colors import ROW_COLORS
-from gsmerge.frame import scene_frame
+from gsmerge.geometry.frame import scene_frame
 from gsmerge.io.formats.spz import UNIX, spz_bytes
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane
@@ -27,6 +26,7 @@ from gsmerge.pages import data, splats
 from gsmerge.pages.data import ViewData, collect, encode_still, short_names
 from gsmerge.pages.page import headline
 from gsmerge.pages.splats import pack_splats
+from gsmerge.photos.row_colors import ROW_COLORS
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Views
 

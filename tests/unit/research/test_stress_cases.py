@@ -13,7 +13,7 @@ from messages import refuses
 from sweeps import sweep
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import project
+from gsmerge.geometry.transforms import project
 from gsmerge.research import stress as module
 from gsmerge.research.stress import CASES, StressScene, stress
 from gsmerge.scene.held_out import read_held_out

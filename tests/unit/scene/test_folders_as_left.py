@@ -19,8 +19,8 @@ from tiny_scene import Tiny, frames_of, save_json, write_images, write_npz, writ
 from gsmerge.batch.find import find_scenes, main_file
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, to_cameras
+from gsmerge.io.scene_files import find_scene_files
 from gsmerge.scene.content_hash import list_files
-from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene
 
 SMOOTH = replace(smooth_scene(48, 36), names=tuple(f"input_{i:06d}.png" for i in (4, 17, 30)))
@@ -116,7 +116,7 @@ def test_several_scenes_further_down_are_named(tmp_path: Path) -> None:
 
 def test_a_folder_of_too_many_files_is_not_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_export(tmp_path / "a", SMOOTH, export_rows(SMOOTH), cameras=False, name="gaussians.ply")
-    monkeypatch.setattr("gsmerge.scene.files._MAX_ENTRIES", 3)
+    monkeypatch.setattr("gsmerge.io.scene_files._MAX_ENTRIES", 3)
     assert find_scene_files(tmp_path).ply == tmp_path / "a/gaussians.ply"
     for i in range(3):
         (tmp_path / f"{i}.txt").touch()

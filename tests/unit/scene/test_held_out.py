@@ -15,7 +15,7 @@ from sweeps import sweep
 from tiny_scene import FLIP, Tiny, edited_json, make_tiny, rotation
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import fit_similarity
+from gsmerge.geometry.transforms import fit_similarity
 from gsmerge.scene import views as scene_views
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene

@@ -19,7 +19,7 @@ from gsmerge.inspection.file_checks import check_content
 from gsmerge.io import read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import file_bytes, header_content
-from gsmerge.scene.files import find_scene_files
+from gsmerge.io.scene_files import find_scene_files
 from gsmerge.settings.compact import CompactOptions
 
 PLAIN = CompactOptions().with_settings({"superpixels": "20%", "fit": "none", "threads": 1, "levels": 2})
@@ -144,6 +144,6 @@ def test_headers_of_many_files_are_read_up_to_a_bound(
 ) -> None:
     save_result(folder / "a.ply", tiny)
     shutil.copy(folder / "a.ply", folder / "z.ply")
-    monkeypatch.setattr("gsmerge.scene.files._MAX_HEADERS", 1)
+    monkeypatch.setattr("gsmerge.io.scene_files._MAX_HEADERS", 1)
     with refuses(SceneError, folder, "2 (room.ply, z.ply)"):
         find_scene_files(folder)

@@ -13,7 +13,7 @@ from messages import noted
 from plyfile import PlyData, PlyElement
 
 from gsmerge import Gaussians, Scene
-from gsmerge.alignment import AlignmentResult
+from gsmerge.cameras import AlignmentResult
 from gsmerge.facts.prepare import prepare
 from gsmerge.io import write_ply
 from gsmerge.io.formats.read import GaussianFile, read_ply

@@ -13,9 +13,9 @@ from tiny_scene import Tiny, edited_json, frames_of, write_colmap_binary, write_
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.scene_files import find_scene_files, scene_title
+from gsmerge.photos.scene_photos import stored_photos
 from gsmerge.scene import rows
-from gsmerge.scene.files import find_scene_files, scene_title
-from gsmerge.scene.photos import stored_photos
 from gsmerge.scene.read import load_scene, read_scene
 
 

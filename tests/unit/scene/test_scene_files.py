@@ -11,7 +11,7 @@ from tiny_scene import Tiny, write_colmap_binary, write_colmap_text, write_image
 
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
-from gsmerge.scene.files import find_scene_files
+from gsmerge.io.scene_files import find_scene_files
 
 
 def make(folder: Path, *names: str) -> Path:

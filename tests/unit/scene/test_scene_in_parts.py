@@ -16,8 +16,8 @@ from gsmerge.cli import main
 from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
+from gsmerge.io.scene_files import find_scene_files
 from gsmerge.scene.content_hash import content_hash, list_files
-from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene, read_scene
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.states.state_file import load_state

@@ -14,7 +14,7 @@ from gsmerge import Scene
 from gsmerge.compaction.make_plan import make_plan
 from gsmerge.facts.confirm_depths import FEWEST, MOST, confirm_depths
 from gsmerge.facts.prepare import prepare
-from gsmerge.pooling import scene_members
+from gsmerge.geometry.pooling import scene_members
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import encode, weaken_contradicted

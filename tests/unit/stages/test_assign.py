@@ -9,14 +9,14 @@ import unaligned_scenes
 from messages import noted, refuses
 
 from gsmerge import Scene, compact
-from gsmerge.budget import FEW_PIXELS, superpixels_per_view
 from gsmerge.errors import UsageError
+from gsmerge.facts.counts import FEW_PIXELS, superpixels_per_view
 from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
-from gsmerge.frame import canonicalise, scene_frame
-from gsmerge.pooling import scene_members
+from gsmerge.geometry.frame import canonicalise, scene_frame
+from gsmerge.geometry.pooling import scene_members
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.assign import assign, find_owners, merge_unseen, middle_pixels, owner_pixels

@@ -8,9 +8,9 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene
-from gsmerge.geometry import covariances
+from gsmerge.geometry.pooling import Members, feature_to_gaussians, scene_members
+from gsmerge.geometry.transforms import covariances
 from gsmerge.kernels import elementary
-from gsmerge.pooling import Members, feature_to_gaussians, scene_members
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import deal_visible, decode, mixed_counts, split_counts
 from gsmerge.stages.encode import encode

@@ -5,8 +5,8 @@ import pytest
 import scenes
 
 from gsmerge import Scene
+from gsmerge.geometry.pooling import scene_members
 from gsmerge.kernels import elementary
-from gsmerge.pooling import scene_members
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.types import FeatureGaussians, Groups
 

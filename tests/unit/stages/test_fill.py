@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsmerge.geometry import is_inside, project, rgb_to_sh0
+from gsmerge.geometry.transforms import is_inside, project, rgb_to_sh0
 from gsmerge.raster import render
 from gsmerge.stages.fill import MOST_VIEWS, fill_between, lies_between
 from gsmerge.types import Cameras, Gaussians

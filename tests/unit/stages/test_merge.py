@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import make_features
 
-from gsmerge.pooling import feature_to_gaussians
+from gsmerge.geometry.pooling import feature_to_gaussians
 from gsmerge.stages.merge import merge, take
 from gsmerge.types import FeatureGaussians, Matches
 

@@ -11,7 +11,7 @@ import unaligned_scenes
 from made_gaussians import random_gaussians
 
 from gsmerge import Gaussians, Scene, render
-from gsmerge.pooling import MAX_OPACITY
+from gsmerge.geometry.pooling import MAX_OPACITY
 from gsmerge.raster.metrics import psnr
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.pair_merge import merge_neighbors

@@ -10,8 +10,8 @@ import scenes
 from messages import refuses
 
 from gsmerge import Scene
-from gsmerge.budget import CountLimits
-from gsmerge.pooling import Members, scene_members
+from gsmerge.facts.counts import CountLimits
+from gsmerge.geometry.pooling import Members, scene_members
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 from gsmerge.stages import segment as module
 from gsmerge.stages.decode import decode, split_counts

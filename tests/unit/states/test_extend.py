@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from gsmerge import Cameras, Compactor, Scene, compact
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.row_colors import PHOTOS, RENDERS, ROW_COLORS
-from gsmerge.geometry import camera_centres
+from gsmerge.geometry.transforms import camera_centres
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read import read_cameras
+from gsmerge.photos.row_colors import PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.scene.read import load_scene
 from gsmerge.states.extend import NOT_COMPARED, choose_far, compare_worlds
 

@@ -13,7 +13,7 @@ from network_fixtures import SMALL, noisy, written
 
 from gsmerge import Compactor, Scene, compact
 from gsmerge.errors import UsageError
-from gsmerge.geometry import camera_centres
+from gsmerge.geometry.transforms import camera_centres
 from gsmerge.states.features import FeatureState
 
 PAPER: dict[str, Any] = {"recipe": "paper", "superpixels": "10%"}

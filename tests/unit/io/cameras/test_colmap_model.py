@@ -11,7 +11,7 @@ from messages import refuses
 from tiny_scene import Tiny, assert_same
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import sh0_to_rgb
+from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.io import read_cameras
 from gsmerge.io.cameras.colmap_model import POINTS, files_beside, model_files
 from gsmerge.types import Cameras

@@ -13,7 +13,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, write_gaussians
 from gsmerge.io.cameras.foreign import PROGRAMS, find_unread
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras
-from gsmerge.scene.files import find_scene_files
+from gsmerge.io.scene_files import find_scene_files
 
 # file, its start, the program, and what is read of it
 FILES = [

@@ -15,7 +15,7 @@ from re10k_chunks import entry, rows_of, save, torch
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras
-from gsmerge.scene.files import find_scene_files
+from gsmerge.io.scene_files import find_scene_files
 from gsmerge.scene.read import load_scene
 
 SMOOTH = smooth_scene(48, 36)

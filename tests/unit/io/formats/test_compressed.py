@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from gsmerge.geometry import quat_to_rotmat
+from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.io import read_ply
 from gsmerge.types import SH_C0
 

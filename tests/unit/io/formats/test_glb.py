@@ -13,7 +13,7 @@ import scenes
 from slow_readers import drawn
 
 from gsmerge import Gaussians, Scene
-from gsmerge.geometry import multiply_quats, quat_to_rotmat
+from gsmerge.geometry.transforms import multiply_quats, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.glb import holds_gaussians
 

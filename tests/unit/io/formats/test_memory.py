@@ -13,7 +13,7 @@ from messages import refuses
 from sweeps import sweep
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import normalize
+from gsmerge.geometry.transforms import normalize
 from gsmerge.io import write_gaussians, write_ply
 from gsmerge.io.bounds import ReadBudget
 from gsmerge.io.formats.arrays import check_count

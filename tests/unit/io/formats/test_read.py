@@ -14,7 +14,7 @@ from plyfile import PlyData, PlyElement
 from slow_readers import drawn, read_splat, read_spz
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import sh0_to_rgb
+from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.read import file_notes, read_parts

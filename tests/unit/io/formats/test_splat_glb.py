@@ -13,7 +13,7 @@ import scenes
 from slow_readers import drawn
 
 from gsmerge import Scene
-from gsmerge.geometry import multiply_quats, sh0_to_rgb
+from gsmerge.geometry.transforms import multiply_quats, sh0_to_rgb
 from gsmerge.io import write_gaussians
 
 

@@ -15,7 +15,7 @@ from former_formats import spz4_bytes
 from slow_readers import corners
 
 from gsmerge import Gaussians
-from gsmerge.geometry import covariances, rotate_harmonics
+from gsmerge.geometry.transforms import covariances, rotate_harmonics
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.read import file_notes
 from gsmerge.io.formats.spz import AXES, gzip_bytes, spz_bytes

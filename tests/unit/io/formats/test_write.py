@@ -19,7 +19,7 @@ from tiny_scene import Tiny
 
 from gsmerge import Scene
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.geometry import normalize
+from gsmerge.geometry.transforms import normalize
 from gsmerge.io import OUTPUT_FORMATS, lost_harmonics, output_format, read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.kernels import elementary

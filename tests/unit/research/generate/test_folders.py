@@ -12,7 +12,7 @@ from messages import refuses
 
 import gsmerge
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.geometry import project
+from gsmerge.geometry.transforms import project
 from gsmerge.raster.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, generate, make_scene
 from gsmerge.scene.held_out import read_held_out

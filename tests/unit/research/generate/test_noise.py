@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.geometry import project, quat_to_rotmat
+from gsmerge.geometry.transforms import project, quat_to_rotmat
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.research.generate import NoiseOptions

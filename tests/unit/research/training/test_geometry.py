@@ -12,13 +12,12 @@ from scenes import arc, make_scene, room
 from sweeps import sweep
 from training_runs import PAPER, TINY, noisy_networks, torch
 
-from gsmerge.arrays import as_array
+from gsmerge.geometry.pooling import feature_to_gaussians
 from gsmerge.networks import apply, tokens
 from gsmerge.networks.apply import NetworkContext, encode_features
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
 from gsmerge.networks.options import FEATURE, NetworkOptions
 from gsmerge.networks.tensors import quat_to_rotmat
-from gsmerge.pooling import feature_to_gaussians
 from gsmerge.research.training import Example, make_example, make_training_scene
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import (
@@ -33,6 +32,7 @@ from gsmerge.research.training.windows import Crop, whole_photo
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, pool_runs
 from gsmerge.types import FeatureGaussians, Matches
+from gsmerge.values.arrays import as_array
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 COLUMNS = {"mean": MEAN, "size": SIZE, "turn": ROTATION, "logit": slice(LOGIT, LOGIT + 1), "color": COLOR}

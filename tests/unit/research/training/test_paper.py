@@ -10,10 +10,10 @@ import pytest
 from scenes import arc, make_scene, room
 from training_runs import PAPER, TINY, noisy_networks, torch
 
-from gsmerge.geometry import rotmat_to_quat
+from gsmerge.geometry.pooling import MAX_OPACITY, pool_members
+from gsmerge.geometry.transforms import rotmat_to_quat
 from gsmerge.kernels import elementary
 from gsmerge.networks.tensors import quat_to_rotmat
-from gsmerge.pooling import MAX_OPACITY, pool_members
 from gsmerge.research.training import Example, make_example, make_training_scene, preset_options
 from gsmerge.research.training.examples import draw_views, select_views
 from gsmerge.research.training.losses import teacher_loss, window_loss

@@ -1,0 +1,154 @@
+"""Calibrate cameras from points and their pixels: poses, and intrinsics for each view or common to all.
+
+Intrinsics are as simple as the points allow: of several models, the one with the smallest Bayesian information
+criterion is chosen (Schwarz 1978).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.cameras.resection import (
+    ALL_INTRINSICS,
+    ONE_FOCAL,
+    TWO_FOCALS,
+    focal_uncertainty,
+    projection_errors,
+    projective_error,
+    refine_poses,
+    start_pose,
+)
+from gsmerge.cameras.score import Correspondences, is_as_near, pixel_limit
+from gsmerge.io.cameras.camera_file import make_pinhole
+from gsmerge.io.photo_files import Size
+from gsmerge.kernels.elementary import log
+from gsmerge.kernels.matrices import matmul
+from gsmerge.types import Cameras
+
+_FOCALS = (1.2, 4.8)  # focal lengths, in longer sides of the picture, at which the search begins
+_FREE_INTRINSICS = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
+_ROUNDS = 2  # of solving; each round leaves out the points that the round before found far from their pixels
+_FAR, _FAR_PX = 3.0, 1.0  # a point is far beyond this multiple of the median distance and this number of pixels
+_SMALLEST_PX = 1e-3  # smaller distances count as this, since means have only 24 bits
+_MAX_UNCERTAINTY = 0.05  # of the focal length, relative; larger where points are nearly a plane in front of the camera
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Cameras of v views, and the distance of the points from their pixels."""
+
+    cameras: Cameras
+    worst_px: float  # largest median distance of a view, pixels
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """Cameras of v views with a number of free intrinsics, and their residuals."""
+
+    Ks: np.ndarray  # [v,3,3]
+    poses: np.ndarray  # [v,4,4] world to camera
+    free: int  # number of free intrinsics, over all views
+    errors: tuple[np.ndarray, ...]  # of each view, distances of its points from their pixels
+
+    @property
+    def worst_px(self) -> float:
+        """Largest median distance of a view, pixels."""
+        worst = max(float(np.median(errors)) for errors in self.errors)
+        return worst if math.isfinite(worst) else math.inf
+
+    def criterion(self, far: float) -> float:
+        """Compute the Bayesian information criterion, with distances clipped at ``far`` pixels."""
+        with np.errstate(invalid="ignore"):
+            errors = np.nan_to_num(np.concatenate(self.errors), nan=far).clip(_SMALLEST_PX, far)
+        count = 2.0 * len(errors)
+        return count * float(log((errors * errors).mean())) + self.free * float(log(count))
+
+
+def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | None:
+    """Calibrate the cameras of views of ``width`` x ``height`` pixels from ``pairs`` of Gaussians and pixels.
+
+    A view without pairs gets the camera of the view before. None if the points do not determine the cameras, or if they
+    lie farther from their pixels than allowed.
+    """
+    if not len(pairs.points):
+        return None
+    view_ids = np.unique(pairs.views)
+    views = [pairs.select(pairs.views == view) for view in view_ids]
+    middle = np.median(pairs.points, 0)
+    unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
+    points, pixels = [(view.points - middle) / unit for view in views], [view.pixels for view in views]
+    limit, bound = pixel_limit(width, height), max(map(projective_error, points, pixels), default=math.inf)
+    model = _choose_model(points, pixels, (width, height), bound) if bound <= limit else None
+    if model is None or model.worst_px > limit:
+        return None
+    if focal_uncertainty(points, pixels, model.Ks, model.poses) > _MAX_UNCERTAINTY:
+        return None
+    viewmats = model.poses.copy()
+    viewmats[:, :3, 3] = unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], middle)
+    all_views = np.arange(int(view_ids[-1]) + 1)
+    solved = np.maximum(np.searchsorted(view_ids, all_views, side="right") - 1, 0)  # index of the solved camera
+    return Calibration(Cameras(viewmats[solved], model.Ks[solved], width, height), model.worst_px)
+
+
+def _choose_model(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float
+) -> _Model | None:
+    """Choose the simplest intrinsics that explain the pixels; ``bound`` is the error of projective cameras, pixels."""
+    models: list[_Model] = []
+    with suppress(np.linalg.LinAlgError):  # raised at the first model that the points do not determine
+        models.extend(_solve_models(points, pixels, size, bound))
+    far = max(_FAR_PX, _FAR * min((model.worst_px for model in models), default=math.inf))
+    return min(models, key=lambda model: model.criterion(far), default=None)
+
+
+def _solve_models(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float
+) -> Iterator[_Model]:
+    """Yield models from simple to complex: with intrinsics common to all views, then with intrinsics for each view.
+
+    Models with intrinsics for each view are left out if common intrinsics are as near to the pixels as projective
+    cameras.
+    """
+    one_focal_models = []
+    for share in _FOCALS:
+        focal = share * max(size)
+        K = make_pinhole(focal, focal, size[0] / 2, size[1] / 2)
+        starts = [start_pose(p, q, K) for p, q in zip(points, pixels, strict=True)]
+        poses = np.stack([pose for pose in starts if pose is not None] or [np.eye(4)])
+        if len(poses) < len(starts):
+            return
+        start = _Model(np.tile(K, (len(starts), 1, 1)), poses, 0, ())
+        for free in _FREE_INTRINSICS:
+            model = _solve(points, pixels, start, free)
+            one_focal_models += [model] if free == ONE_FOCAL else []
+            start = start if free == ONE_FOCAL else model
+            yield model
+        if is_as_near(model.worst_px, bound):  # more intrinsics cannot be nearer
+            return
+    model = min(one_focal_models, key=lambda model: model.worst_px)
+    for free in _FREE_INTRINSICS if len(points) > 1 else ():
+        view_starts = (replace(model, Ks=model.Ks[v : v + 1], poses=model.poses[v : v + 1]) for v in range(len(points)))
+        views = [_solve([p], [q], start, free) for p, q, start in zip(points, pixels, view_starts, strict=True)]
+        Ks, poses = np.concatenate([view.Ks for view in views]), np.concatenate([view.poses for view in views])
+        model = _Model(Ks, poses, free * len(views), tuple(view.errors[0] for view in views))
+        yield model
+
+
+def _solve(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start: _Model, free: int) -> _Model:
+    """Solve for poses and ``free`` common intrinsics.
+
+    Raises numpy.linalg.LinAlgError if the points do not determine them.
+    """
+    K, poses, near_points, near_pixels = start.Ks[0], start.poses, points, pixels
+    for _ in range(_ROUNDS):
+        K, poses = refine_poses(near_points, near_pixels, K, poses, free=free)
+        errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]
+        is_near = [e <= max(_FAR_PX, _FAR * float(np.median(e))) for e in errors]  # one mask for each view
+        near_points = [view_points[mask] for view_points, mask in zip(points, is_near, strict=True)]
+        near_pixels = [view_pixels[mask] for view_pixels, mask in zip(pixels, is_near, strict=True)]
+    return _Model(np.tile(K, (len(poses), 1, 1)), poses, free, tuple(errors))

@@ -1,0 +1,72 @@
+"""Explain in one sentence, with a remedy, why rows are not the pixels of their cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.cameras.resection import projective_error
+from gsmerge.cameras.score import Alignment, AlignmentInput, check_pairs, sample_pixels
+from gsmerge.cameras.unaligned import MAX_FRONT_RATIO, check_cameras
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.formats.read import FileInfo
+from gsmerge.types import Cameras, Gaussians
+
+_SOME_CAMERA = 4.0  # rows nearer than this multiple of the limit are the pixels of some projective camera
+
+
+def count_error(ply: FileInfo, cameras: Cameras) -> SceneError:
+    """Make the SceneError for rows that are not the pixels of the cameras."""
+    views, width, height = len(cameras), cameras.width, cameras.height
+    expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
+    actual = f"{ply.count} in no known order" if ply.count == views * height * width else str(ply.count)
+    problem = f"expected one Gaussian per pixel, {expected}, found {actual}"
+    return SceneError(ply.path, problem, "give the cameras of their views, in the frame of the Gaussians")
+
+
+def check_frame(inputs: AlignmentInput, camera_file: CameraFile) -> None:
+    """Raise SceneError if the rows are in order the pixels of some cameras, but not of most of the file's cameras.
+
+    The views may be in another order if photos show the colours of the rows.
+    """
+    cameras = inputs.cameras
+    if inputs.order == "none" or len(inputs.gaussians) != len(cameras) * cameras.width * cameras.height:
+        return
+    pairs = sample_pixels(inputs.gaussians, cameras, inputs.valid)
+    alignment, first_view = check_pairs(pairs, cameras), pairs.select(pairs.views == 0)
+    if float(np.nanmedian([*alignment.median_px, np.inf])) < alignment.limit_px:
+        return
+    are_pixels = projective_error(first_view.points, first_view.pixels) < _SOME_CAMERA * alignment.limit_px
+    shown = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True)
+    if are_pixels and not shown.color_ratio <= MAX_FRONT_RATIO:
+        raise misalignment_error(camera_file.path, alignment, None)
+
+
+def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
+    """Make the SceneError for rows that are as many as the pixels, but do not lie in them.
+
+    ``reason``: another order that fits, see :func:`explain_misalignment`.
+    """
+    percent = f"{100 * alignment.share_in_front:.0f}"
+    in_front = "" if percent == "100" else f" and only {percent} % in front of their camera"
+    problem = (
+        f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
+        f"found a median of up to {alignment.worst_px:.1f} px{in_front}"
+    )
+    unknown = "no other convention fits either: give the cameras that belong to the Gaussians"
+    return SceneError(path, problem, f"{reason}: convert one to the other" if reason else unknown)
+
+
+def explain_misalignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> str | None:
+    """Describe another order in which the rows are the pixels of the cameras; None if none is."""
+    views, width, height = len(cameras), cameras.width, cameras.height
+    rows = np.arange(len(gaussians))
+    orders = {
+        "row, column, view (view fastest)": rows.reshape(height, width, views).transpose(2, 0, 1),
+        "view, column, row (column-major)": rows.reshape(views, width, height).transpose(0, 2, 1),
+    }
+    for name, grid in orders.items():
+        order = grid.reshape(-1)
+        if check_pairs(sample_pixels(gaussians[order], cameras, valid.reshape(-1)[order]), cameras).ok:
+            return f"the Gaussians fit in the order {name}"
+    return None

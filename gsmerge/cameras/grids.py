@@ -1,0 +1,149 @@
+"""Bring cameras and photos to each size that the grid of the rows may have: that of the photos or of the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gsmerge.cameras.layouts import ESTIMATED
+from gsmerge.cameras.poses import Poses, describe_other_convention
+from gsmerge.errors import SceneError
+from gsmerge.geometry.transforms import IDENTITY, Similarity
+from gsmerge.io.cameras.camera_file import CameraFile, Convention, sizes_of, to_cameras
+from gsmerge.io.cameras.table import FFGS
+from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
+from gsmerge.types import Cameras
+
+_STRETCHES = 0.1  # relative difference of the scales of width and height above which few models resize photos
+_MAX_ENLARGED = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """The cameras and the photo transform for one size of the pixel grid."""
+
+    camera_file: CameraFile  # the cameras as they are read, in one convention of the poses
+    cameras: Cameras  # the same cameras at the size of the grid
+    transform: PhotoTransform | None  # applied to the photos; None: nothing
+    notes: tuple[str, ...]  # notes for the user, one sentence each
+    moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
+    given: np.ndarray | None = None  # ``[c,4,4]`` given poses that the photos confirm; Gaussians move there
+
+    @property
+    def size(self) -> Size:
+        """(width, height) of the grid, pixels."""
+        return self.cameras.width, self.cameras.height
+
+
+@dataclass(frozen=True)
+class PlacedGrid:
+    """Cameras that show Gaussians in place: the cameras of a grid, moved into the frame of the Gaussians."""
+
+    grid: Grid
+    frame: Similarity
+    shown_by: str = ""  # evidence for the frame, in words; empty for a frame that a file gives
+
+    @property
+    def cameras(self) -> Cameras:
+        """The cameras in the frame of the Gaussians."""
+        return self.grid.cameras if self.frame is IDENTITY else self.frame.move(self.grid.cameras)
+
+    def notes(self, usual: Convention) -> list[str]:
+        """List notes on what was adapted; ``usual`` is the convention of the poses' format."""
+        notes, convention = [*self.grid.notes], self.grid.camera_file.convention
+        if convention != usual:
+            notes.append(f"{describe_other_convention(convention, usual)}: read so")
+        if self.frame is not IDENTITY:
+            evidence = f", as the {self.shown_by} show" if self.shown_by else ""
+            notes.append(f"the cameras are {self.frame.description}{evidence}")
+        return notes
+
+
+def with_poses(grid: Grid, poses: Poses) -> Grid:
+    """Return a grid with the poses of its cameras in another convention."""
+    file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
+    return replace(grid, camera_file=file, cameras=replace(grid.cameras, viewmats=poses.viewmats))
+
+
+def with_photo_size(camera_file: CameraFile, size: Size | None) -> CameraFile:
+    """Give cameras the size of the photos if the cameras' own size differs by one pixel.
+
+    The own size may have been computed as twice the principal point. The same cameras are returned otherwise.
+    """
+    stored = sizes_of(camera_file)
+    if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= 1:
+        return camera_file
+    widths, heights = (np.full_like(camera_file.widths, side) for side in size)
+    return replace(camera_file, widths=widths, heights=heights)
+
+
+def photo_grid(camera_file: CameraFile, size: Size | None) -> Grid:
+    """Return the grid of the photos' size, or of the cameras' size without photos.
+
+    Raises SceneError if the shapes of cameras and photos differ.
+    """
+    if size is None:
+        return Grid(camera_file, to_cameras(camera_file), None, ())
+    if camera_file.photo_map is not None:
+        return _mapped_grid(camera_file, size, *camera_file.photo_map)
+    width, height = size
+    for w, h in sizes_of(camera_file):
+        if not same_shape((w, h), size) and not _are_stretched(camera_file, size):
+            if camera_file.source == FFGS:
+                return _mapped_grid(camera_file, size, size, resize_and_crop(size, (w, h)))
+            problem = f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}"
+            swapped = (w, h) == (height, width)
+            remedy = "width and height are swapped" if swapped else "crop cameras and images alike"
+            raise SceneError(camera_file.path, problem, remedy)
+    scaled = [camera_size for camera_size in sizes_of(camera_file) if camera_size != size]
+    notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in scaled)
+    return Grid(camera_file, to_cameras(camera_file, size), None, notes)
+
+
+def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform: PhotoTransform) -> Grid:
+    """Return the grid of photos that a known ``transform`` of ``file_size`` resizes or crops.
+
+    ``size`` is the size of the photos in memory, which may be reduced from ``file_size``.
+    """
+    x, y = (file_side / side for file_side, side in zip(file_size, size, strict=True))
+    transform = replace(transform, scale_x=x * transform.scale_x, scale_y=y * transform.scale_y)
+    note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
+    if camera_file.source == ESTIMATED and abs(transform.scale_x / transform.scale_y - 1) > _STRETCHES:
+        note += "; if the model did not squeeze them, rows were left out of the file: name its cameras with --cameras"
+    is_same = file_size == (transform.width, transform.height)
+    return Grid(camera_file, to_cameras(camera_file), transform, () if is_same else (note,))
+
+
+def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
+    """Return True if the model has stretched the photos, so that oblong pixels become square at the photos' size."""
+    if camera_file.focal is None:
+        return False
+    focals = camera_file.Ks[:, (0, 1), (0, 1)]
+    sides = np.stack([camera_file.widths, camera_file.heights], 1)
+    ratios = np.divide(*(focals * size / np.maximum(sides, 1)).T)
+    return bool((np.abs(ratios - 1) <= ASPECT_TOLERANCE).all())
+
+
+def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
+    """List the grids of photos brought to the size of the cameras, or of cameras cropped to the size of the photos.
+
+    ``size`` is the size of the photos. Empty without photos, and if cameras and photos have the same size.
+    """
+    sizes = sizes_of(camera_file)
+    if size is None or len(sizes) != 1 or sizes[0] == size or camera_file.photo_map is not None:
+        return []
+    (camera_size,), grids = sizes, []
+    cameras = to_cameras(camera_file, camera_size)
+    for transform in (resize_to(size, camera_size), resize_and_crop(size, camera_size)):
+        if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
+            continue  # the photos are previews, and a fit to them would blur the Gaussians
+        note = f"photos of {size[0]} x {size[1]} are {transform.description}, the cameras' and the Gaussian grid's size"
+        grids.append(Grid(camera_file, cameras, transform, (note,)))
+    if not same_shape(camera_size, size):
+        for transform in (resize_to(camera_size, size), resize_and_crop(camera_size, size)):
+            note = f"cameras of {camera_size[0]} x {camera_size[1]} are {transform.description}, the images' size"
+            grids.append(Grid(camera_file, transform.cameras(cameras), None, (note,)))
+    return grids

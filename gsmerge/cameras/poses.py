@@ -1,0 +1,221 @@
+"""Read poses in another convention, and move inexact cameras.
+
+Models that predict poses write Gaussians that lie a little beside the pixels of their cameras. The pixels of a view and
+their Gaussians determine its pose. Here the cameras are moved to these poses; whether the cameras or the Gaussians were
+wrong is decided later, from the photos (``gsmerge/facts/move_poses.py``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gsmerge.cameras.frames import solve_pose
+from gsmerge.cameras.score import Correspondences, check_pairs, is_as_near, photo_colors, pixel_errors, pixel_limit
+from gsmerge.errors import SceneError
+from gsmerge.geometry.transforms import camera_depths, is_inside, project_points, robust_weights
+from gsmerge.io.cameras.camera_file import (
+    CONVENTIONS,
+    Convention,
+    describe_moves,
+    from_viewmats,
+    list_moves,
+    to_viewmats,
+)
+from gsmerge.io.photo_files import NO_IMAGES
+from gsmerge.kernels.matrices import invert, matmul, transform
+from gsmerge.types import Cameras
+
+_SAME = 1e-6  # tolerance for equal poses, relative to the largest number in them
+
+MAX_PX, MAX_SHARE = 12.0, 0.05  # error up to which cameras are moved: pixels, and share of the side of small images
+NEAR_PX = 0.5  # cameras with smaller errors are not moved
+SAME_FOCAL = 0.01  # largest relative difference of focal lengths that count as equal
+CLEAR = 0.96  # the given poses are better if they reduce the disagreement between photos to this share
+_LINE_ROUNDS = 4  # of reweighted least squares
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses in one convention: ``viewmats [c,4,4]`` float64, world to camera."""
+
+    convention: Convention
+    viewmats: np.ndarray
+
+    @property
+    def description(self) -> str:
+        """Description of the convention in words."""
+        return describe_convention(self.convention)
+
+
+def describe_convention(convention: Convention) -> str:
+    """Describe a pose convention in words."""
+    return f"{convention[0]} matrices with {convention[1]} axes"
+
+
+def describe_other_convention(convention: Convention, usual: Convention) -> str:
+    """Describe in words that poses fit in a ``convention`` other than ``usual``, the convention of the format."""
+    words = describe_convention(convention)
+    return f"the poses fit when read as {words}, where this format has {usual[0]} with {usual[1]} axes"
+
+
+def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
+    """List the poses ``viewmats [c,4,4]`` as they are in each other convention, without duplicates."""
+    stored, all_poses = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
+    for other in CONVENTIONS:
+        converted = to_viewmats(stored, other)
+        stacks = [poses.viewmats for poses in all_poses]
+        if not any(np.allclose(converted, stack, atol=_SAME * (1 + np.abs(stack).max())) for stack in stacks):
+            all_poses.append(Poses(other, converted))
+    return all_poses[1:]
+
+
+@dataclass(frozen=True)
+class MovedCameras:
+    """Cameras moved to fit their Gaussians, and how far each was moved."""
+
+    cameras: Cameras
+    worst_px: float  # largest median distance of a view's Gaussians from their pixels, before the move
+    moves: list[dict[str, Any]]  # of every view, see list_moves; empty if only the principal points were wrong
+    confirmed: bool = False  # True if photos confirm the given cameras, so the Gaussians have to be moved instead
+
+    @property
+    def note(self) -> str:
+        """Note about the move, one sentence."""
+        if not self.moves:
+            x, y = (self.cameras.Ks[:, :2, 2] - (self.cameras.width / 2, self.cameras.height / 2)).mean(0)
+            return f"principal points lie ({x:.1f}, {y:.1f}) px from the middle, as the Gaussians' pixels show"
+        text = (
+            f"the cameras are off by a median of up to {self.worst_px:.1f} px: each was moved to where its Gaussians"
+            " lie in their pixels"
+        )
+        if self.confirmed:
+            text = (
+                f"the Gaussians are off their pixels by a median of up to {self.worst_px:.1f} px: the Gaussians of each"
+                " view were moved to its camera, since the photos agree better from there"
+            )
+        return f"{text}, {describe_moves(self.moves)}"
+
+
+def max_pixels(width: int, height: int) -> float:
+    """Return the largest median error, pixels, that moving a camera may correct."""
+    return max(pixel_limit(width, height), min(MAX_PX, MAX_SHARE * math.sqrt(width * height)))
+
+
+def move_cameras(
+    pairs: Correspondences, cameras: Cameras, names: tuple[str, ...], source: str = "Ks", images: np.ndarray = NO_IMAGES
+) -> MovedCameras | None:
+    """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far off.
+
+    ``images [c,h,w,3]`` are photos, which may confirm the given poses.
+
+    If changed intrinsics fit as well as moved poses, only principal points in the middle of the image are moved,
+    because these are probably just assumed. Other changes of intrinsics raise SceneError, which names ``source``.
+    """
+    before = check_pairs(pairs, cameras)
+    if not before.worst_px <= max_pixels(cameras.width, cameras.height):
+        return None
+    viewmats, errors = cameras.viewmats.astype(np.float64), pixel_errors(pairs, cameras)
+    for view in np.unique(pairs.views):
+        if np.median(errors[pairs.views == view]) > NEAR_PX:
+            pose = solve_pose(pairs, int(view), cameras.Ks[view])
+            if pose is None:
+                return None
+            viewmats[view] = pose
+    moved = replace(cameras, viewmats=viewmats)
+    after = check_pairs(pairs, moved)
+    if not after.ok:
+        return None
+    other = _fit_intrinsics(pairs, cameras, after.worst_px)
+    if other is not None:
+        _check_assumed(cameras, other, before.worst_px, source)
+        return MovedCameras(other, before.worst_px, [])
+    depth = float(np.median(camera_depths(pairs.points, viewmats[pairs.views])))
+    confirmed = len(images) > 0 and _photos_confirm(pairs, images, cameras, moved)
+    return MovedCameras(moved, before.worst_px, list_moves(names, cameras.viewmats, viewmats, depth), confirmed)
+
+
+def _photos_confirm(pairs: Correspondences, images: np.ndarray, given: Cameras, moved: Cameras) -> bool:
+    """Return True if photos agree better from the given poses than from the moved poses.
+
+    To compare photos from the given poses, the Gaussians of each view are moved with its camera.
+    """
+    motions = matmul(invert(given.viewmats), moved.viewmats)[pairs.views]
+    points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
+    return _disagreement(points, pairs, images, given) < CLEAR * _disagreement(pairs.points, pairs, images, moved)
+
+
+def _disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:
+    """Measure the median difference in colour between photos of the same points; inf if no point is in two photos."""
+    x, y = pairs.pixels.astype(np.int64).T
+    own, errors = photo_colors(images, pairs.views, y, x), []
+    for view in range(len(cameras)):
+        with np.errstate(all="ignore"):
+            xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
+        inside = (depth > 0) & is_inside(xy, cameras) & (pairs.views != view)
+        column, row = xy[inside].astype(np.int64).T
+        errors.append(np.abs(photo_colors(images, np.full(len(row), view), row, column) - own[inside]).mean(1))
+    values = np.concatenate(errors)
+    return float(np.median(values)) if len(values) else np.inf
+
+
+def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit ``y = slope * x + height`` to each column of points ``[n,d]`` by reweighted least squares.
+
+    Returns slopes ``[d]``, heights ``[d]`` and the distances ``[n]`` of the points from the lines.
+    """
+    x, y = (np.ascontiguousarray(values.T) for values in (x, y))
+    weights = np.ones(x.shape[1])
+    with np.errstate(all="ignore"):
+        for _ in range(_LINE_ROUNDS):
+            mean_x, mean_y = ((weights * values).sum(1, keepdims=True) / weights.sum() for values in (x, y))
+            dx, dy = x - mean_x, y - mean_y
+            slopes = (weights * dx * dy).sum(1, keepdims=True) / (weights * dx**2).sum(1, keepdims=True)
+            heights = mean_y - slopes * mean_x
+            errors = np.sqrt(((y - slopes * x - heights) ** 2).sum(0))
+            weights = robust_weights(errors, 3, 1e-9)
+    return slopes[:, 0], heights[:, 0], errors
+
+
+def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -> Cameras | None:
+    """Scale and shift the intrinsics of all views alike, so that they fit as well as moved poses; None if they cannot.
+
+    ``moved_px`` is the largest median error of the moved poses, pixels.
+    """
+    if len(np.unique(pairs.views)) < 2:  # in a single view a shift of the picture looks like a rotation
+        return None
+    with np.errstate(all="ignore"):
+        xy, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
+    in_front = (depth[:, 0] > 0) & np.isfinite(xy[:, 0]).all(1)
+    projected, pixels = xy[in_front, 0], pairs.pixels[in_front]
+    # x and y are fitted one by one, so that each axis has its own weights
+    lines = [fit_lines(projected[:, [axis]], pixels[:, [axis]])[:2] for axis in range(2)]
+    factors, shifts = np.array(lines)[:, :, 0].T
+    Ks = cameras.Ks * np.array([*factors, 1])[:, None]
+    Ks[:, :2, 2] += shifts
+    other = replace(cameras, Ks=Ks)
+    check = check_pairs(pairs, other)
+    return other if check.ok and is_as_near(check.worst_px, moved_px) else None
+
+
+def _check_assumed(cameras: Cameras, other: Cameras, before_px: float, source: str) -> None:
+    """Raise SceneError if ``other`` cameras differ in more than assumed principal points.
+
+    Principal points count as assumed if all are in the middle of the image. ``before_px`` is the median error of the
+    stored cameras, pixels.
+    """
+    factors = other.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
+    middle = cameras.width / 2, cameras.height / 2
+    if (cameras.Ks[:, :2, 2] == middle).all() and (np.abs(factors - 1) <= SAME_FOCAL).all():
+        return
+    x, y = (other.Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
+    raise SceneError(
+        source,
+        f"expected intrinsics that fit the Gaussians, found ones that put them {before_px:.1f} px off their pixels in"
+        " the same way in every view",
+        f"multiply fx by {factors[0]:.4g} and fy by {factors[1]:.4g}, and add {x:.2f} to cx and {y:.2f} to cy"
+        f" (pixels of {cameras.width} x {cameras.height})",
+    )

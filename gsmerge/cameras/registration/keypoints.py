@@ -1,0 +1,185 @@
+"""Find keypoints in photos and their points in the scene, and match the keypoints of two scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+
+import cv2
+import numpy as np
+
+from gsmerge.geometry.transforms import camera_depths, lower_median
+from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.raster.photos import row_pictures
+from gsmerge.types import Scene
+
+SIDE = 1600  # longest side of a photo in which keypoints are searched, pixels
+MIN_SIDE = 8  # least side of such a photo, pixels
+KEYPOINTS = 4000  # most keypoints of a photo
+CONTRAST = 0.02  # least contrast of a keypoint; OpenCV's default finds too few on plain walls
+GREY = np.array([77, 150, 29], np.int32)  # weights of red, green and blue in a grey value, 256ths
+RATIO = 0.8  # largest distance of the best match, divided by the distance of the second best (Lowe 2004)
+SAME_DEPTH = 0.15  # largest relative difference of depths around a keypoint on one surface
+PIXEL_SPREAD = 0.003  # standard deviation of a keypoint, divided by the diagonal of the picture
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """Keypoints of one photo, and their points in the scene."""
+
+    pixels: np.ndarray  # [n,2] of the scene's grid
+    points: np.ndarray  # [n,3] float64, in the scene's frame
+    descriptors: np.ndarray  # [n,128] float32, whole numbers up to 255
+    viewmat: np.ndarray  # [4,4] float64, of its camera in the scene's frame
+    K: np.ndarray  # [3,3]
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """One scene's half of m keypoint matches: pixels, points and cameras."""
+
+    points: np.ndarray  # [m,3] in the scene's frame
+    pixels: np.ndarray  # [m,2] of the scene's grid
+    viewmats: np.ndarray  # [m,4,4] cameras that see them
+    Ks: np.ndarray  # [m,3,3]
+
+    def select(self, mask: np.ndarray) -> End:
+        """Select matches by a mask."""
+        return End(*(getattr(self, field.name)[mask] for field in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointMatches:
+    """Matches between the keypoints of two scenes, row by row."""
+
+    scenes: tuple[int, int]
+    ends: tuple[End, End]
+    spread: float  # standard deviation of a keypoint, pixels
+
+    def __len__(self) -> int:
+        return len(self.ends[0].points)
+
+    def select(self, mask: np.ndarray) -> KeypointMatches:
+        """Select matches by a mask."""
+        first, second = self.ends
+        return replace(self, ends=(first.select(mask), second.select(mask)))
+
+
+def find_keypoints(scene: Scene) -> list[Photo]:
+    """Find the keypoints in the photo of every view of a scene of pixels; leave out those at edges of surfaces."""
+    cameras, photos = scene.cameras.numpy(), []
+    for view in range(len(scene)):
+        K = cameras.Ks[view].astype(np.float64)
+        viewmat = cameras.viewmats[view].astype(np.float64)
+        picture, shown = _picture(scene, view, K)
+        places, descriptors = _describe(picture, shown[1, 1] / shown[0, 0])
+        zoom = K[0, 0] / shown[0, 0], K[1, 1] / shown[1, 1]
+        pixels = (places - shown[:2, 2]) * zoom + K[:2, 2]
+        z, ok = _depths_at(_surface(scene, view, viewmat), pixels)
+        rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
+        points = matmul(rays[ok] * z[ok, None] - viewmat[:3, 3], viewmat[:3, :3])
+        photos.append(Photo(pixels[ok], points, descriptors[ok], viewmat, K))
+    return photos
+
+
+def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a picture ``[h,w,3]`` uint8 of a view, and its intrinsics.
+
+    The picture is the largest photo, reduced to SIDE pixels. Without photos it has the base colours of the Gaussians.
+    """
+    if scene.large_photos is not None:
+        large = scene.large_photos
+        photo = large.read(large.ids[view])
+        share = min(1.0, SIDE / max(large.width, large.height))
+        size = max(1, round(large.width * share)), max(1, round(large.height * share))
+        scale = np.array([[size[0] / large.width], [size[1] / large.height], [1.0]])
+        small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if share < 1 else photo
+        return small, large.Ks[view].astype(np.float64) * scale
+    colors = row_pictures(scene)[view] if scene.images is None else scene.images[view]
+    return (colors.clip(0, 1) * 255).round().astype(np.uint8), K
+
+
+def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find keypoints of a picture ``[h,w,3]`` uint8; return their places ``[n,2]`` and descriptors ``[n,128]``.
+
+    ``stretch`` is the width of a pixel's footprint over its height. The picture is resized to square pixels.
+    """
+    height, width = picture.shape[:2]
+    wide = max(MIN_SIDE, round(width * max(stretch, 1)))
+    high = max(MIN_SIDE, round(height / min(stretch, 1)))
+    grey = ((picture.astype(np.int32) * GREY).sum(-1) >> 8).astype(np.uint8)
+    finder = cv2.SIFT.create(KEYPOINTS, contrastThreshold=CONTRAST)
+    with _any_processor():
+        square = cv2.resize(grey, (wide, high), interpolation=cv2.INTER_LINEAR)
+        keypoints, descriptors = finder.detectAndCompute(square, None)
+    if descriptors is None:
+        return np.empty((0, 2)), np.empty((0, 128), np.float32)
+    places = np.array([keypoint.pt for keypoint in keypoints], np.float64) + 0.5
+    return places * (width / wide, height / high), descriptors
+
+
+@contextmanager
+def _any_processor() -> Iterator[None]:
+    """Restrict OpenCV in the block to instructions of all processors, so that keypoints are equal on all of them."""
+    before = cv2.useOptimized()
+    cv2.setUseOptimized(False)
+    try:
+        yield
+    finally:
+        cv2.setUseOptimized(before)
+
+
+def _surface(scene: Scene, view: int, viewmat: np.ndarray) -> np.ndarray:
+    """Return the depth ``[h,w]`` of the Gaussian in front of each pixel of a view; infinite without any."""
+    rows = scene.get_pixels().fronts[view]
+    depths = camera_depths(scene.gaussians.means[rows].astype(np.float64), viewmat)
+    return np.asarray(np.where((rows >= 0) & (depths > 0), depths, np.inf))
+
+
+def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the median depth of 3 x 3 pixels around each of ``pixels [n,2]``, and whether these show one surface."""
+    padded = np.pad(depths, 1, mode="edge")
+    height, width = depths.shape
+    x = np.floor(pixels[:, 0]).astype(int).clip(0, width - 1)
+    y = np.floor(pixels[:, 1]).astype(int).clip(0, height - 1)
+    window = np.array([padded[y + down, x + right] for down in range(3) for right in range(3)])
+    is_surface = np.isfinite(window).all(0) & (window.max(0) < window.min(0) * (1 + SAME_DEPTH))
+    return lower_median(window), is_surface
+
+
+def match_photos(
+    scenes: tuple[int, int], photos: Sequence[Photo], other_photos: Sequence[Photo], size: tuple[int, int]
+) -> KeypointMatches:
+    """Match the keypoints of all photos of two scenes; ``size`` is width and height of their grids, pixels."""
+    pairs = [(a, b) for a in photos for b in other_photos]
+    rows = [_match(a.descriptors, b.descriptors) for a, b in pairs]
+    first = _make_end([a for a, _ in pairs], [ids for ids, _ in rows])
+    second = _make_end([b for _, b in pairs], [ids for _, ids in rows])
+    diagonal = float(np.sqrt(size[0] ** 2 + size[1] ** 2))
+    return KeypointMatches(scenes, (first, second), PIXEL_SPREAD * diagonal)
+
+
+def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:
+    """Collect the keypoints at the given rows of each photo."""
+    photo_rows = list(zip(photos, rows, strict=True))
+    counts = [len(ids) for ids in rows]
+    return End(
+        points=np.concatenate([photo.points[ids] for photo, ids in photo_rows]),
+        pixels=np.concatenate([photo.pixels[ids] for photo, ids in photo_rows]),
+        viewmats=np.repeat([photo.viewmat for photo in photos], counts, 0),
+        Ks=np.repeat([photo.K for photo in photos], counts, 0),
+    )
+
+
+def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of rows of ``a`` and ``b`` that are mutual best matches, clearly better than the second best."""
+    if min(len(a), len(b)) < 2:
+        return np.empty(0, int), np.empty(0, int)
+    # all sums are whole numbers below 2^24, so float32 is exact in any order of summation
+    distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
+    best = distances.argmin(1)
+    two_best = np.partition(distances, 1, axis=1)[:, :2].astype(np.float64)
+    is_clear = two_best[:, 0] < RATIO**2 * two_best[:, 1]
+    matched = is_clear & (distances.argmin(0)[best] == np.arange(len(a)))
+    return np.flatnonzero(matched), best[matched]

@@ -1,0 +1,338 @@
+"""Register scenes of one place: find the similarities between their frames from photos and depths.
+
+Matched keypoints of two photos are points of both scenes, at the depths of their Gaussians. Three matches determine a
+similarity (Umeyama 1991). Similarities are fitted to random triples, and the similarity that agrees with most matches
+is chosen. Then all scenes are moved at once by Gauss-Newton steps, until points project to their keypoints in the other
+photos. Single depths may be wrong, so a point may move along its ray within the standard deviation of depths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from gsmerge.cameras.registration.keypoints import End, KeypointMatches, Photo, find_keypoints, match_photos
+from gsmerge.cameras.registration.similarities import compose, fit_similarities, invert_similarity, round_similarity
+from gsmerge.geometry.transforms import (
+    IDENTITY,
+    Damping,
+    Similarity,
+    camera_depths,
+    descend,
+    lower_median,
+    motion_matrices,
+)
+from gsmerge.kernels.elementary import exp, log, log1p
+from gsmerge.kernels.matrices import matmul, solve, transform
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Scene
+
+SAMPLE_TRIPLES = 2000  # random triples of matches
+TRIALS = 60  # best similarities of triples that are tested in the photos
+CLOSE = 0.25  # distance of matched points, divided by their depth, up to which a match supports a triple
+DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
+MIN_DEPTH_SPREAD = 0.01  # least measured standard deviation of the logarithm of a depth
+MIN_PIXELS = 0.2  # least measured standard deviation of a keypoint, pixels
+NORMAL = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
+NORMAL_2D = 1 / 1.1774  # standard deviation of two normal components, divided by the median length of their vector
+AGREE = 9.0  # largest squared residual of a match that agrees; residuals are in standard deviations
+LOOSE = (100.0, 10.0, 2.0, 2.0)  # multiples of AGREE in each round; the first are large because chains of scenes drift
+BEHIND = 1e3  # replaces the logarithm of the depth ratio of points behind the camera
+CAUCHY = 4.0  # squared residual at which the weight of a match halves
+MIN_MATCHES = 16  # agreeing matches of two connected scenes; unrelated photos have up to 5
+MIN_SHARE = 0.15  # least share of agreeing matches
+ROUNDS = 3  # of selecting the agreeing matches of a pair and refining its similarity
+DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
+SIZE = 7  # parameters of a step: rotation, shift, logarithm of the scale
+
+Similarities = Sequence[Similarity | None]
+_Fit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]  # similarities; their cost, its curvature and slope
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Similarities from each scene's frame to the frame of the first scene of the largest connected set."""
+
+    similarities: tuple[Similarity | None, ...]  # of each scene; None if it is not connected
+    matches: tuple[int, ...]  # number of agreeing matches of each scene
+
+
+def register(scenes: Sequence[Scene]) -> Registration:
+    """Find the similarities that map aligned scenes, with grids of one size, into the frame of the first.
+
+    If the scenes form several connected sets, the largest is used.
+    """
+    count, cameras = len(scenes), scenes[0].cameras
+    photos = [find_keypoints(scene) for scene in scenes]
+    size = cameras.width, cameras.height
+    ids = combinations(range(count), 2)
+    pairs = [match_photos((a, b), photos[a], photos[b], size) for a, b in ids]
+    links = [link for link in parallel_map(connect, pairs) if link is not None]
+    similarities = _chain(links, count)
+    connected = [pair for _, pair in links if all(similarities[scene] is not None for scene in pair.scenes)]
+    spread = DEPTH_SPREAD
+    for loose in LOOSE if connected else ():
+        agreeing = [pair.select(_squares(similarities, pair, spread) < loose * AGREE) for pair in connected]
+        similarities = _refine(similarities, agreeing, spread)
+        connected, spread = _measure_spreads(similarities, connected)
+    agreeing = [pair.select(_squares(similarities, pair, spread) < AGREE) for pair in connected]
+    matches = [sum(len(pair) for pair in agreeing if i in pair.scenes) for i in range(count)]
+    unit = _unit(photos, similarities)
+    rounded = tuple(None if similarity is None else round_similarity(similarity, unit) for similarity in similarities)
+    return Registration(rounded, tuple(matches))
+
+
+# Two scenes
+
+
+def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | None:
+    """Find the similarity from the first scene to the second that agrees with the most matches.
+
+    Returns the similarity and the matches that agree; None if they are too few.
+    """
+    if len(matches) < MIN_MATCHES:
+        return None
+    pair = replace(matches, scenes=(0, 1))
+    trials = _sample_similarities(matches)
+    misses = [_squares((trial, IDENTITY), pair, DEPTH_SPREAD) for trial in trials]
+    scores = [(1 - squares / AGREE).clip(0).sum() for squares in misses]
+    similarities: Similarities = (trials[int(np.argmax(scores))], IDENTITY)
+    agree = misses[int(np.argmax(scores))] < AGREE
+    for _ in range(ROUNDS):
+        if agree.sum() < MIN_MATCHES // 2:
+            return None
+        similarities = _refine(similarities, [pair.select(agree)], DEPTH_SPREAD, fixed=1)
+        agree = _squares(similarities, pair, DEPTH_SPREAD) < AGREE
+    similarity = similarities[0]
+    if similarity is None or agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(matches)):
+        return None
+    return similarity, matches.select(agree)
+
+
+def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
+    """Fit similarities to random triples of matches; return those that most matches agree with."""
+    rng = np.random.default_rng(0)
+    p, q = (end.points for end in matches.ends)
+    first_depths, second_depths = (camera_depths(end.points, end.viewmats) for end in matches.ends)
+    rows = rng.integers(0, len(matches), (SAMPLE_TRIPLES, 3))
+    weights = (1 / (first_depths * second_depths))[rows]
+    rotations, scales, shifts = fit_similarities(p[rows], q[rows], weights)
+    moved = scales[:, None, None] * matmul(p, rotations.swapaxes(1, 2)) + shifts[:, None]
+    squares = ((moved - q) ** 2).sum(2) / np.minimum(second_depths, scales[:, None] * first_depths) ** 2
+    closeness = (1 - squares / CLOSE**2).clip(0).sum(1)
+    best = np.argsort(-closeness, kind="stable")[:TRIALS]
+    return [Similarity(rotations[i], float(scales[i]), shifts[i]) for i in best]
+
+
+def _between(similarities: Similarities, scenes: Sequence[int]) -> Similarity:
+    """Return the similarity from the frame of the first of two placed scenes to the frame of the second."""
+    first, second = (similarities[scene] for scene in scenes)
+    assert first is not None
+    assert second is not None
+    return compose(invert_similarity(second), first)
+
+
+# Residuals
+
+
+@dataclass(frozen=True, eq=False)
+class _Residuals:
+    """Errors of points of one scene in the photos of another, in standard deviations."""
+
+    moved: np.ndarray  # [m,3] points in the frame of the other scene
+    values: np.ndarray  # [m,3] two errors of the place in the photo, and one of the depth
+    slopes: np.ndarray  # [m,3,3] derivatives of ``values`` by ``moved``
+
+
+def _residuals(similarity: Similarity, end: End, other: End, pixels: float, spread: float) -> _Residuals:
+    """Compute the errors between projected points of one end and the keypoints of the other, in standard deviations.
+
+    ``similarity`` maps from the frame of ``end`` to the frame of ``other``. ``pixels`` is the standard deviation of a
+    keypoint, and ``spread`` the standard deviation of the logarithm of a depth.
+    """
+    rotmats = other.viewmats[:, :3, :3]
+    moved = similarity.move_points(end.points)
+    camera = transform(rotmats, moved) + other.viewmats[:, :3, 3]
+    z = np.maximum(camera[:, 2], 1e-9 * np.abs(camera).max(1) + 1e-30)
+    projected = transform(other.Ks, camera)[:, :2] / z[:, None]
+    by_camera = np.zeros((len(moved), 3, 3))
+    by_camera[:, :2] = (other.Ks[:, :2] - projected[..., None] * np.eye(3)[2]) / z[:, None, None]
+    # movement of the place in the photo if a depth is wrong by one standard deviation
+    poses = end.viewmats[:, :3, :3]
+    eyes = -transform(poses.swapaxes(1, 2), end.viewmats[:, :3, 3])
+    along = similarity.scale * transform(rotmats, matmul(end.points - eyes, similarity.rotation.T))
+    streaks = spread * transform(by_camera[:, :2], along)
+    lengths = np.maximum((streaks * streaks).sum(1), 1e-30)
+    shrink = (1 - pixels / np.sqrt(pixels**2 + lengths)) / lengths
+    outer = shrink[:, None, None] * streaks[:, :, None] * streaks[:, None]
+    whiten = (np.eye(2) - outer) / pixels
+    by_camera[:, :2] = matmul(whiten, by_camera[:, :2])
+    depth_share = np.sqrt(2) * spread  # both depths have errors
+    by_camera[:, 2, 2] = 1 / (depth_share * z)
+    ratios = log(z / camera_depths(other.points, other.viewmats))
+    values = np.empty((len(moved), 3))
+    values[:, :2] = transform(whiten, projected - other.pixels)
+    values[:, 2] = np.where(camera[:, 2] > 0, ratios, BEHIND) / depth_share
+    return _Residuals(moved, values, matmul(by_camera, rotmats))
+
+
+def _squares(similarities: Similarities, matches: KeypointMatches, spread: float) -> np.ndarray:
+    """Return the squared residual ``[m]`` of each match, in the direction in which it is larger."""
+    both = [(residuals.values**2).sum(1) for residuals in _both_residuals(similarities, matches, spread)]
+    return np.asarray(np.maximum(*both))
+
+
+def _both_residuals(similarities: Similarities, matches: KeypointMatches, spread: float) -> list[_Residuals]:
+    """Compute the residuals of matches in both directions: from the first scene to the second, and back."""
+    first, second = matches.ends
+    forward = _between(similarities, matches.scenes)
+    return [
+        _residuals(forward, first, second, matches.spread, spread),
+        _residuals(invert_similarity(forward), second, first, matches.spread, spread),
+    ]
+
+
+def _measure_spreads(
+    similarities: Similarities, matches: Sequence[KeypointMatches]
+) -> tuple[list[KeypointMatches], float]:
+    """Measure standard deviations robustly.
+
+    Returns the matches with the measured standard deviation of keypoints, and the standard deviation of the logarithms
+    of depths.
+    """
+    values = [_both_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
+    lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]
+    ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
+    spread = NORMAL * float(lower_median(ratios))
+    pixels = max(NORMAL_2D * float(lower_median(np.concatenate(lengths))), MIN_PIXELS)
+    measured = [replace(pair, spread=min(pixels, pair.spread)) for pair in matches]
+    return measured, min(max(spread, MIN_DEPTH_SPREAD), DEPTH_SPREAD)
+
+
+# All scenes
+
+
+def _chain(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
+    """Place the scenes of the largest connected set along their strongest links, in the frame of its first scene."""
+    strength = [0] * count
+    for _, pair in links:
+        for scene in pair.scenes:
+            strength[scene] += len(pair)
+    best: Similarities = []
+    for start in sorted(range(count), key=lambda scene: -strength[scene]):
+        similarities = _chain_from(start, links, count)
+        if _num_connected(similarities) > _num_connected(best):
+            best = similarities
+    first = next(similarity for similarity in best if similarity is not None)
+    to_first = invert_similarity(first)
+
+    def move(similarity: Similarity | None) -> Similarity | None:
+        """Change the frame of a similarity to the frame of the first scene."""
+        if similarity is None:
+            return None
+        return IDENTITY if similarity is first else compose(to_first, similarity)
+
+    return list(map(move, best))
+
+
+def _num_connected(similarities: Similarities) -> int:
+    """Count the scenes that are placed."""
+    return sum(similarity is not None for similarity in similarities)
+
+
+def _chain_from(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
+    """Place scenes in the frame of scene ``start``, each along its strongest link to a scene already placed."""
+    similarities: list[Similarity | None] = [None] * count
+    similarities[start] = IDENTITY
+    while True:
+        half_placed = [link for link in links if sum(similarities[scene] is not None for scene in link[1].scenes) == 1]
+        if not half_placed:
+            return similarities
+        similarity, pair = max(half_placed, key=lambda link: len(link[1]))
+        a, b = pair.scenes
+        first = similarities[a]
+        second = similarities[b]
+        if second is not None:
+            similarities[a] = compose(second, similarity)
+        elif first is not None:
+            similarities[b] = compose(first, invert_similarity(similarity))
+
+
+def _refine(
+    similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, fixed: int | None = None
+) -> Similarities:
+    """Move all placed scenes but ``fixed`` (None: the first) by damped Gauss-Newton steps to minimise the residuals."""
+    placed = [i for i, each in enumerate(similarities) if each is not None]
+    free = [i for i in placed if i != (placed[0] if fixed is None else fixed)]
+
+    def fit(current: Similarities) -> _Fit:
+        return current, _normal_equations(current, matches, spread, free)
+
+    def step(state: _Fit, damping: float) -> _Fit | None:
+        current, (_, curvature, slope) = state
+        scale = damping * np.diag(curvature) + 1e-12 * curvature.trace() + 1e-30
+        steps = -solve(curvature + np.diag(scale), slope).reshape(-1, SIZE)
+        if not np.isfinite(steps).all():
+            return None
+        moved = list(current)
+        for i, vector in zip(free, steps, strict=True):
+            moved[i] = compose(current[i] or IDENTITY, _make_step(vector))
+        return fit(moved)
+
+    return descend(fit(similarities), lambda state: state[1][0], step, DAMPING)[0]
+
+
+def _make_step(step: np.ndarray) -> Similarity:
+    """Make the similarity of a step ``[7]``: rotation vector, shift and logarithm of the scale."""
+    rotation = motion_matrices(np.concatenate([step[:3], np.zeros(3)])[None])[0, :3, :3]
+    scale = float(exp(step[6:].clip(-1, 1))[0])
+    return Similarity(rotation, scale, step[3:6])
+
+
+def _normal_equations(
+    similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, free: Sequence[int]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return Cauchy's cost of the residuals, its curvature and its slope with respect to steps of the free scenes."""
+    size = len(free) * SIZE
+    curvature = np.zeros((size, size))
+    slope = np.zeros(size)
+    cost = 0.0
+    columns = {scene: slice(i * SIZE, (i + 1) * SIZE) for i, scene in enumerate(free)}
+    for pair in matches:
+        forward = _between(similarities, pair.scenes)
+        both = _both_residuals(similarities, pair, spread)
+        for source, similarity, residuals in zip((0, 1), (forward, invert_similarity(forward)), both, strict=True):
+            squares = (residuals.values**2).sum(1)
+            weights = 1 / (1 + squares / CAUCHY)
+            cost += CAUCHY * float(log1p(squares / CAUCHY).sum())
+            source_jacobian = _by_step(residuals.slopes, pair.ends[source].points, similarity)
+            target_jacobian = -_by_step(residuals.slopes, residuals.moved, IDENTITY)
+            jacobians = {pair.scenes[source]: source_jacobian, pair.scenes[1 - source]: target_jacobian}
+            jacobians = {scene: jacobian for scene, jacobian in jacobians.items() if scene in columns}
+            for scene, jacobian in jacobians.items():
+                weighted = (weights[:, None, None] * jacobian).reshape(-1, SIZE).T
+                slope[columns[scene]] += matmul(weighted, residuals.values.reshape(-1))
+                for second, second_jacobian in jacobians.items():
+                    block = matmul(weighted, second_jacobian.reshape(-1, SIZE))
+                    curvature[columns[scene], columns[second]] += block
+    return cost, curvature, slope
+
+
+def _by_step(slopes: np.ndarray, points: np.ndarray, similarity: Similarity) -> np.ndarray:
+    """Differentiate residuals by a step of their points before ``similarity`` is applied: ``[m,3,7]``."""
+    by_point = similarity.scale * matmul(slopes, similarity.rotation)
+    x, y, z = points.T
+    zero = np.zeros_like(x)
+    by_rotation = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
+    by_scale = matmul(by_point, points[..., None])
+    return np.concatenate([matmul(by_point, by_rotation), by_point, by_scale], 2)
+
+
+def _unit(photos: Sequence[Sequence[Photo]], similarities: Similarities) -> float:
+    """Return the power of two nearest to the median depth of the points of the first placed scene."""
+    first = next(scene_photos for scene_photos, each in zip(photos, similarities, strict=True) if each is not None)
+    depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
+    return float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0

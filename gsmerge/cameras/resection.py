@@ -1,0 +1,180 @@
+"""Solve for the poses and intrinsics of cameras from points and their pixels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from gsmerge.geometry.transforms import Damping, descend, median, medians, motion_matrices, robust_weights
+from gsmerge.kernels import reproject
+from gsmerge.kernels.matrices import eigh, matmul, solve
+
+DAMPING = Damping(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
+MAX_STRETCH = 0.5  # largest relative change of a focal length in one step
+ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4  # numbers of free intrinsics: fx = fy; fx, fy; fx, fy, cx, cy
+_Fit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]  # intrinsics, poses, normal equations
+MIN_POINTS = 24  # with fewer points almost any projective camera fits
+_FLAT = 1e-10  # second moment of an axis, divided by the largest one; below this, points lie in a plane across the axis
+_PROJECTIVE_ROUNDS = 8  # of reweighted least squares
+_SMALLEST_ERROR = 1e-6  # divided by the standard deviation of the pixels
+
+
+def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
+    """Solve for the pose ``[4,4]``, world to camera, that shows points ``[n,3]`` at ``pixels [n,2]``; None on failure.
+
+    The solution of SQPnP (Terzakis and Lourakis 2020) is close to the optimum. At least three points are needed, and
+    they should lie near the origin.
+    """
+    try:
+        solved, rotation, shift = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
+    except cv2.error:  # all points coincide
+        return None
+    return motion_matrices(np.concatenate([rotation, shift]).T)[0] if solved else None
+
+
+def projection_errors(points: np.ndarray, pixels: np.ndarray, K: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Measure the distances ``[n]`` of projected points ``[n,3]`` from their ``pixels [n,2]``, pixels."""
+    projected = matmul(matmul(points, pose[:3, :3].T) + pose[:3, 3], K.T)
+    with np.errstate(all="ignore"):
+        return np.asarray(np.linalg.norm(projected[:, :2] / projected[:, 2:] - pixels, axis=1))
+
+
+def refine_poses(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], K: np.ndarray, poses: np.ndarray, *, free: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Refine poses by least squares so that points ``[n,3]`` of each view project to their ``pixels [n,2]``.
+
+    Also solves for ``free`` intrinsics that are common to the views: none, ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS.
+    Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the points do not determine
+    them.
+    """
+
+    def fit(new_K: np.ndarray, new_poses: np.ndarray) -> _Fit:
+        return new_K, new_poses, _linearise(points, pixels, new_K, new_poses, free)
+
+    def step(state: _Fit, damping: float) -> _Fit:
+        current_K, current_poses, (curvature, slope, _) = state
+        with np.errstate(all="ignore"):  # an overflowing step does not reduce the error, so it is rejected
+            change, motions = _step(curvature, slope, damping)
+            return fit(_change_intrinsics(current_K, change), matmul(motion_matrices(motions), current_poses))
+
+    K, poses, _ = descend(fit(K, poses), lambda state: state[2][2], step, DAMPING)
+    return K, poses
+
+
+def _linearise(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], K: np.ndarray, poses: np.ndarray, free: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return Gauss-Newton's curvature ``[v,6+f,6+f]`` and slope ``[v,6+f]`` of the squared error, and the error.
+
+    The parameters are rotation and shift of each camera, the logarithms of focal lengths, and the principal point.
+    """
+    size = 6 + free
+    curvature, slope, error = np.empty((len(poses), size, size)), np.empty((len(poses), size)), 0.0
+    for view, pose in enumerate(poses):
+        jacobian, residual = np.empty((2 * len(points[view]), size)), np.empty(2 * len(points[view]))
+        values = (np.ascontiguousarray(array, np.float64) for array in (points[view], pixels[view], K, pose))
+        reproject.linearise(*values, jacobian, residual)
+        with np.errstate(all="ignore"):  # points in the plane of the camera overflow
+            curvature[view], slope[view] = matmul(jacobian.T, jacobian), matmul(jacobian.T, residual)
+            error += float((residual * residual).sum())
+    return curvature, slope, error
+
+
+def _step(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return changes ``[f]`` of the common intrinsics and motions ``[v,6]`` of the cameras."""
+    size = curvature.shape[1]
+    damped = curvature + damping * np.eye(size) * curvature
+    pose_slope, mixed = slope[:, :6, None], damped[:, :6, 6:]
+    if size == 6:
+        return np.empty(0), -solve(damped, pose_slope)[..., 0]
+    # the Schur complement eliminates the poses
+    solved = solve(damped[:, :6, :6], np.concatenate([pose_slope, mixed], 2))
+    whole = np.concatenate([slope[:, 6:, None], damped[:, 6:, 6:]], 2)
+    reduced = (whole - matmul(mixed.swapaxes(1, 2), solved)).sum(0)
+    change = -solve(reduced[:, 1:], reduced[:, 0])
+    change[:TWO_FOCALS] = change[:TWO_FOCALS].clip(-MAX_STRETCH, MAX_STRETCH)
+    return change, -solved[..., 0] - matmul(solved[..., 1:], change)
+
+
+def _change_intrinsics(K: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Apply changes of the logarithms of focal lengths and of the principal point; see :func:`_linearise`."""
+    K = K.copy()
+    if len(change):
+        K[(0, 1), (0, 1)] *= 1 + change[:TWO_FOCALS]
+        K[:2, 2] += change[TWO_FOCALS:] if len(change) == ALL_INTRINSICS else 0
+    return K
+
+
+def focal_uncertainty(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], Ks: np.ndarray, poses: np.ndarray
+) -> float:
+    """Estimate the relative standard error of one focal length for all views, if pixels have an error of 1.
+
+    ``points [n,3]`` and ``pixels [n,2]`` are given for each view. The result is inf for points in a plane.
+    """
+    weight = 0.0
+    for p, q, K, pose in zip(points, pixels, Ks, poses, strict=True):
+        (curvature,), _, _ = _linearise([p], [q], K, pose[None], ONE_FOCAL)
+        try:
+            explained = matmul(curvature[6, :6], solve(curvature[:6, :6], curvature[:6, 6]))
+        except np.linalg.LinAlgError:  # all points coincide
+            continue
+        weight += float(curvature[6, 6] - explained)
+    return 1 / math.sqrt(weight) if weight > 0 else math.inf
+
+
+def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
+    """Measure the median distance of points ``[n,3]`` from ``pixels [n,2]`` under the best projective camera, pixels.
+
+    Returns 0 if there are too few points to decide.
+    """
+    return 0.0 if len(points) < MIN_POINTS else projective_camera(points, pixels)[1]
+
+
+def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, float]:
+    """Solve for the projective camera ``[3,4]`` that shows points ``[n,3]`` nearest to their ``pixels [n,2]``.
+
+    A projective camera is any ``[3,4]`` matrix. It is solved by the direct linear transform with reweighting (Hartley
+    and Zisserman 2004, section 7.1). Also returns the median distance from the pixels.
+    """
+    middle = medians(points)
+    unit = median(np.abs(points - middle)) or 1.0
+    local, basis = _whiten((points - middle) / unit)
+    centre, size = pixels.mean(0), float(pixels.std()) or 1.0
+    targets = (pixels - centre) / size
+    zero = np.zeros_like(local)
+    across = np.concatenate([local, zero, -targets[:, :1] * local], 1)
+    down = np.concatenate([zero, local, -targets[:, 1:] * local], 1)
+    weights = np.ones(len(points))
+    camera, error = np.zeros((3, local.shape[1])), np.full(len(points), np.inf)
+    for _ in range(_PROJECTIVE_ROUNDS):
+        equations = np.concatenate([across * weights[:, None], down * weights[:, None]])
+        camera = eigh(matmul(equations.T, equations))[1][:, 0].reshape(3, -1)
+        projected = matmul(local, camera.T)
+        with np.errstate(all="ignore"):
+            error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - targets, axis=1)
+            error = np.where(np.isfinite(error), error, np.inf)
+            depth = np.abs(projected[:, 2]) + _SMALLEST_ERROR
+            weights = np.sqrt(robust_weights(error, 2, _SMALLEST_ERROR, depth))
+    camera = matmul(camera, basis.T)
+    camera[:2] = size * camera[:2] + centre[:, None] * camera[2]
+    camera[:, :3] /= unit
+    camera[:, 3] -= matmul(camera[:, :3], middle)
+    return camera, size * median(error)
+
+
+def _whiten(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return homogeneous coordinates ``[n,d]`` of points ``[n,3]`` in a basis of equal second moments, and the basis.
+
+    The basis ``[4,d]`` has fewer than four axes if the points lie in a plane or on a line.
+    """
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
+    homogeneous /= np.linalg.norm(homogeneous, axis=1, keepdims=True)
+    values, axes = eigh(matmul(homogeneous.T, homogeneous))
+    used = values > _FLAT * values[-1]  # points in a plane or on a line do not determine the other axes
+    basis = axes[:, used] / np.sqrt(values[used])
+    return matmul(homogeneous, basis), basis

@@ -1,0 +1,348 @@
+"""Find the cameras that show the Gaussians of a file in place, and the pixel of each row if rows are pixels in order.
+
+Rows in plain order are recognised by one formula: the pose of each view follows from its rows, and one similarity moves
+the file's cameras there. Other rows are followed through the pixels in each frame that exporters use, since some pixels
+may have no row. All other rows get cameras alone, which the colours of the photos choose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmerge.cameras.dropped_rows import follow_rows
+from gsmerge.cameras.estimate import estimate_cameras
+from gsmerge.cameras.frames import exporter_frames, fit_frame, own_poses, scale_by
+from gsmerge.cameras.grids import Grid, PlacedGrid, file_grids, photo_grid, with_photo_size, with_poses
+from gsmerge.cameras.layouts import ESTIMATED, Layout
+from gsmerge.cameras.poses import max_pixels, move_cameras, other_conventions
+from gsmerge.cameras.score import (
+    AS_NEAR,
+    AS_NEAR_PX,
+    SHUFFLED_MARGIN,
+    Alignment,
+    AlignmentInput,
+    check_pairs,
+    pixel_errors,
+)
+from gsmerge.errors import SceneError
+from gsmerge.geometry.transforms import IDENTITY, Similarity, median
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.formats.read import GaussianFile
+from gsmerge.io.image_names import natural_key
+from gsmerge.io.photo_files import NO_IMAGES, PhotoArrays, PhotoTransform, Size, as_floats, photo_size
+from gsmerge.runtime.memory import free_pages
+from gsmerge.types import Cameras
+
+_EVIDENCE = "Gaussians' places in their pixels"  # for a frame, in words
+_PLAIN_PX = 0.5  # rows in order that are nearer to their pixels, pixels, need no other cameras
+_MIN_ROWS, _MIN_SHARE = 24, 0.05  # finite rows needed to find pixels: this number, or this share of all rows
+_MOVED_GAUSSIANS = 2000  # Gaussians of a view that its moved pose is solved from
+_ROUNDING_PX = 0.1  # by which cameras in one frame may fit worse than own poses, since files round numbers
+_FIRST_ROWS = 20_000  # rows that must follow the order of the pixels before all rows are tried
+_MIN_PLACED = 0.99  # share of the rows that must have a pixel
+_MOST_PLACES = 1 << 27  # largest product of rows and views that are followed; each takes four bytes
+
+
+@dataclass(frozen=True, eq=False)
+class RowSource:
+    """The Gaussians, the cameras and the photos of a scene, and hints about the rows; see :func:`align`."""
+
+    ply: GaussianFile
+    camera_file: CameraFile
+    photos: PhotoArrays
+    order: str  # hint on the order of the rows; "auto": unknown
+    scale: float | None  # hint on the length of one unit of the cameras' world in the Gaussians' world
+
+    @property
+    def size(self) -> Size | None:
+        """(width, height) of the photos; None without any."""
+        return photo_size(self.photos)
+
+    @cached_property
+    def images(self) -> np.ndarray:
+        """Photos at their own size, ``[c,h,w,3]`` float32."""
+        return as_floats(self.photos)
+
+    @cached_property
+    def own_cameras(self) -> CameraFile | None:
+        """Cameras that the rows themselves show; None if they are no grid."""
+        return estimate_cameras(Path(self.ply.info.path), self.ply.gaussians.means, self.ply.valid)
+
+    def inputs(self, grid: Grid, *, photos: bool = True) -> AlignmentInput:
+        """Return rows, cameras and photos at the size of a grid; without ``photos`` if only positions matter."""
+        images = NO_IMAGES
+        if photos:
+            images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
+        return AlignmentInput(self.ply.gaussians, self.ply.valid, grid.cameras, images, self.order, self.scale)
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """Rows that are pixels of the cameras of a grid, which are moved into the frame of the Gaussians."""
+
+    place: PlacedGrid
+    layout: Layout
+    alignment: Alignment
+
+    @property
+    def frame(self) -> Similarity:
+        """The similarity from the frame of the cameras to the frame of the Gaussians."""
+        return self.place.frame
+
+    @property
+    def description(self) -> str:
+        """Description of the rows and the frame in words."""
+        words = ", ".join(filter(None, (self.layout.description, self.frame.description)))
+        return f"{words}: median {self.alignment.middle_px:.2f} px from the pixels"
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentResult:
+    """Result of :func:`align`: the pixel of every row, or for rows without pixels the cameras that see them."""
+
+    # ``[n]`` int64, the pixel ``(view·H + y)·W + x`` of each row, -1: none; None if the rows belong to no pixels
+    pixel_ids: np.ndarray | None
+    cameras: Cameras  # all c views, in the frame of the Gaussians, at the size of the grid
+    images: np.ndarray  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32; [0,...] without any
+    camera_file: CameraFile | None  # in the chosen convention and frame; None without cameras
+    notes: tuple[str, ...] = ()  # what was adapted, one sentence each
+    transform: PhotoTransform | None = None  # applied to the photos
+    recovery: Recovery | None = None  # where the pixels of the rows lie; None without pixels
+    moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
+    given: np.ndarray | None = None  # ``[c,4,4]`` given poses, to which views are to be moved with their Gaussians
+    problem: str | None = None  # why the rows belong to no pixels; None if they do
+
+
+def align(
+    ply: GaussianFile,
+    camera_file: CameraFile,
+    photos: PhotoArrays = (),
+    *,
+    order: str = "auto",
+    scale: float | None = None,
+    frames: Callable[[], Sequence[Similarity]] = tuple,
+) -> AlignmentResult:
+    """Find the pixel of every row if rows are pixels in order; for other rows, choose the cameras that see them.
+
+    Also finds the size of the grid, the frame and convention of the poses, and the transform of the photos.
+
+    Args:
+        ply: The file's rows.
+        camera_file: Its cameras.
+        photos: c uint8 photos of one size, or none.
+        order: The order of the rows if it is known, see :class:`gsmerge.settings.reading.ReadHints`.
+        scale: Length of one unit of the cameras' world in the world of the Gaussians, if it is given.
+        frames: Reads the frames that a file gives for the cameras; used only for rows without pixels.
+
+    Raises:
+        SceneError: If sizes do not agree, if no cameras see the Gaussians, or if the rows are the pixels of other
+            cameras.
+    """
+    camera_file = with_photo_size(camera_file, photo_size(photos))
+    source = RowSource(ply, camera_file, photos, order, scale)
+    grids, problem = file_grids(camera_file, source.size), None
+    try:
+        grids.insert(0, photo_grid(camera_file, source.size))
+    except SceneError as error:
+        problem = error
+    recoveries = filter(None, (_find_pixels(source, grid) for grid in grids))
+    if problem is None:
+        recovery = next(recoveries, None)
+        return _choose_cameras(source, grids[0], frames) if recovery is None else _make_result(source, recovery)
+    # photos of another shape are resized or cropped; only their colours show how
+    possible = {id(recovery.place): recovery for recovery in recoveries}
+    places = [recovery.place for recovery in possible.values()] or [PlacedGrid(grid, IDENTITY) for grid in grids]
+    place = _choose_place(source, places)
+    if place is None:
+        raise problem
+    if id(place) in possible:
+        return _make_result(source, possible[id(place)])
+    return _choose_cameras(source, place.grid, frames)
+
+
+def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
+    """Find the pixels of the rows in a grid; None if they are not the pixels in order."""
+    if source.order == "none":
+        return None
+    count, num_pixels = len(source.ply.gaussians), len(grid.cameras) * math.prod(grid.size)
+    layout, layers = Layout(len(grid.cameras), *grid.size), count // num_pixels
+    if source.camera_file.pixel_ids is not None:
+        layouts = [replace(layout, ids=source.camera_file.pixel_ids)]
+    elif count != layers * num_pixels or source.order == "view-fastest":
+        return _follow_order(source, grid)
+    elif layers == 1:  # views are in the order of the camera file, or of the names
+        names = source.camera_file.names
+        by_name = np.array(sorted(range(len(names)), key=lambda view: natural_key(names[view])))
+        pixels = np.arange(num_pixels).reshape(len(names), -1)
+        layouts = [layout, replace(layout, ids=pixels[by_name].reshape(-1))]
+    else:  # several Gaussians of a pixel follow each other, or there are several layers of all pixels
+        rows = np.arange(count)
+        layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
+    if int(source.ply.valid.sum()) < min(_MIN_ROWS, _MIN_SHARE * count):
+        return None
+    return next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
+
+
+def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | None:
+    """Find cameras under which rows lie in the pixels of a layout; None if there are none.
+
+    The cameras are those of the grid, as stored, in another frame or convention, or else each moved to its rows.
+    """
+    inputs = source.inputs(grid, photos=False)
+    pairs = inputs.pairs(layout)
+    shuffled = replace(pairs, pixels=np.random.default_rng(0).permutation(pairs.pixels))
+
+    def accept(grid: Grid, frame: Similarity, limit: float) -> Recovery | None:
+        cameras = frame.move(grid.cameras)
+        alignment = check_pairs(pairs, cameras)
+        far_px = SHUFFLED_MARGIN * max(alignment.worst_px, AS_NEAR_PX)
+        is_right = alignment.ok and alignment.worst_px <= limit and median(pixel_errors(shuffled, cameras)) >= far_px
+        return Recovery(PlacedGrid(grid, frame, _EVIDENCE), layout, alignment) if is_right else None
+
+    usual = exporter_frames(grid.cameras, source.scale)[0]
+    if recovery := accept(grid, usual, _PLAIN_PX):
+        return recovery
+    own = own_poses(pairs, grid.cameras.Ks)
+    if len(own) == len(grid.cameras):
+        poses = np.stack([own[view] for view in range(len(own))])
+        own_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
+        limit = max(AS_NEAR * own_px, own_px + _ROUNDING_PX)
+        for other in _conventions(source, grid):
+            frame = fit_frame(other.cameras, poses, source.scale)
+            if recovery := accept(other, IDENTITY, limit) or accept(other, frame, limit):
+                return recovery
+    return accept(_move_cameras(source, grid, layout), IDENTITY, np.inf)
+
+
+def _conventions(source: RowSource, grid: Grid) -> Iterator[Grid]:
+    """Yield a grid with its poses as stored, then in each other convention."""
+    yield grid
+    for poses in other_conventions(source.camera_file.viewmats, source.camera_file.convention):
+        yield with_poses(grid, poses)
+
+
+def _move_cameras(source: RowSource, grid: Grid, layout: Layout) -> Grid:
+    """Move inexact cameras so that they show rows in their pixels; the same grid if they are too far off."""
+    inputs = source.inputs(grid, photos=False)
+    pairs = inputs.pairs(layout, _MOVED_GAUSSIANS)
+    if not check_pairs(pairs, grid.cameras).worst_px <= max_pixels(*grid.size):
+        return grid
+    path, names = str(source.camera_file.path), source.camera_file.names
+    moved = move_cameras(pairs, grid.cameras, names, path, source.inputs(grid).images)
+    if moved is None:
+        return grid
+    given, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
+    return replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, given=given)
+
+
+def _follow_order(source: RowSource, grid: Grid) -> Recovery | None:
+    """Take rows as pixels in order of which some have no row, in any likely frame; None for rows in another order.
+
+    The rows of a view follow each other, or else those of a pixel.
+    """
+    rows = np.flatnonzero(source.ply.valid)
+    if len(rows) > len(grid.cameras) * math.prod(grid.size) or len(rows) * len(grid.cameras) > _MOST_PLACES:
+        return None
+    orders = [order for order in ("view-major", "view-fastest") if source.order in ("auto", order)]
+    points = np.ascontiguousarray(source.ply.gaussians.means[rows], np.float32)
+    for frame in _list_frames(source, grid):
+        place = PlacedGrid(grid, frame, _EVIDENCE)
+        for order in orders:
+            ids = _follow(points, place.cameras, mixed=order == "view-fastest")
+            if ids is not None:
+                pixel_ids = np.full(len(source.ply.gaussians), -1)
+                pixel_ids[rows] = ids
+                layout = Layout(len(grid.cameras), *grid.size, order, pixel_ids)
+                pairs = source.inputs(grid, photos=False).pairs(layout)
+                return Recovery(place, layout, check_pairs(pairs, place.cameras))
+    return None
+
+
+def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
+    """Yield the frames of exporters, and the frame in which cameras lie where the rows themselves show them."""
+    yield from exporter_frames(grid.cameras, source.scale)
+    if source.own_cameras is not None and len(source.own_cameras) == len(grid.cameras):
+        yield fit_frame(grid.cameras, source.own_cameras.viewmats, source.scale)
+
+
+def _follow(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:
+    """Find the pixels ``[n]`` of rows in the order of pixels, -1 for a few rows; None for rows in another order."""
+    matrices = np.ascontiguousarray(cameras.viewmats, np.float64), np.ascontiguousarray(cameras.Ks, np.float64)
+    ids = None
+    for tried in (points[:_FIRST_ROWS], points):  # the first rows rule out most other orders
+        ids = follow_rows(tried, *matrices, cameras.width, cameras.height, mixed=mixed)
+        if (ids >= 0).sum() < _MIN_PLACED * len(tried):
+            return None
+    return ids
+
+
+# Rows without pixels, and results
+
+
+def _choose_place(source: RowSource, places: Sequence[PlacedGrid]) -> PlacedGrid | None:
+    """Choose the place whose photos show the colours of the rows best; None if no photos show them."""
+    from gsmerge.cameras.unaligned import check_cameras  # here because few files need it
+
+    best, best_score = None, 0.0
+    for place in places:
+        inputs = source.inputs(place.grid)
+        check = check_cameras(inputs.gaussians, inputs.valid, place.cameras, inputs.images)
+        if check.ok and not math.isnan(check.color_ratio) and check.score > best_score:
+            best, best_score = place, check.score
+    return best
+
+
+def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
+    """Choose cameras that see rows without pixels.
+
+    Raises SceneError if no cameras see them, or if the rows turn out to be pixels of other cameras.
+    """
+    from gsmerge.cameras.explain import check_frame, count_error
+    from gsmerge.cameras.unaligned import choose_cameras
+    from gsmerge.cameras.upright import solve_upright, upright_rotation
+
+    camera_file, inputs = source.camera_file, source.inputs(grid)
+    check_frame(inputs, camera_file)
+    if source.scale is not None:
+        grid = replace(grid, cameras=scale_by(source.scale).move(grid.cameras))
+    no_pixels, more_notes = count_error(source.ply.info, grid.cameras), list[str]()
+    rotation = upright_rotation(inputs)
+    if rotation is None:
+        place, more_notes = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), no_pixels)
+    else:
+        upright = solve_upright(inputs, rotation, source.ply.info.path)
+        place = PlacedGrid(grid, upright, "photos' colours")
+    cameras, camera_file = place.cameras, place.grid.camera_file
+    if place.frame is not IDENTITY:
+        camera_file = replace(camera_file, viewmats=cameras.viewmats)
+    notes = (*place.notes(source.camera_file.convention), *more_notes)
+    return AlignmentResult(None, cameras, inputs.images, camera_file, notes, grid.transform, problem=no_pixels.problem)
+
+
+def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
+    """Make the result for rows that are pixels, with cameras in the frame of the Gaussians."""
+    place, grid, usual = recovery.place, recovery.place.grid, source.camera_file
+    inputs, notes = source.inputs(grid), place.notes(usual.convention)
+    free_pages(vars(inputs.gaussians).values())  # the search has read all rows
+    if usual.source == ESTIMATED:
+        separate = len(set(map(bytes, usual.Ks))) > 1
+        subject = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
+        notes.append(f"no cameras are used: {subject} are estimated from the Gaussians' own grid")
+    return AlignmentResult(
+        pixel_ids=recovery.layout.pixel_ids(),
+        cameras=place.cameras,
+        images=inputs.images,
+        camera_file=grid.camera_file,
+        notes=tuple(notes),
+        transform=grid.transform,
+        recovery=recovery,
+        moves=grid.moves,
+        given=None if grid.given is None else place.frame.move_viewmats(grid.given),
+    )

@@ -1,0 +1,283 @@
+"""Choose cameras for rows without pixels, by the share of Gaussians that they see and by the photos' colours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.cameras.frames import exporter_frames
+from gsmerge.cameras.grids import Grid, PlacedGrid, with_poses
+from gsmerge.cameras.poses import Poses, other_conventions
+from gsmerge.cameras.score import AlignmentInput, photo_colors
+from gsmerge.errors import SceneError
+from gsmerge.geometry.transforms import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
+from gsmerge.io.cameras.camera_file import Convention
+from gsmerge.kernels.elementary import exp
+from gsmerge.types import Cameras, Gaussians
+
+# Colour error, divided by the colour error of shuffled pixels. Above this share colours agree no better than at random
+RANDOM_SHARE = 0.85
+SAME_COLORS = 0.01  # colour error of shuffled pixels below which colours vary too little to decide
+# Least score of another convention, divided by the score of the usual one: if photos decide, and if none do
+_COLOR_MARGIN, _MARGIN = 1.3, 2.0
+_FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the given frame
+_PEAK_GAIN = 1.05  # least score of a scale chosen by colours, divided by the score of a scale two steps away
+_SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to count those that cameras see
+# Gaussians compared in other conventions and frames. They have 0.4 % of noise; scores that matter differ by 5 % or more
+_COMPARED_GAUSSIANS = 5000
+_MIN_GAUSSIANS, _MAX_PROJECTED = 200, 4_000_000  # least number of Gaussians, and most Gaussians times cameras
+_MIN_SEEN = 0.5  # share of the Gaussians that must be in some camera
+MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, but for only the foremost Gaussians in a frame chosen by colours
+# Largest depth of a foremost Gaussian, divided by the least depth in its cell; and mean number of Gaussians per cell
+_FRONT, _PER_CELL = 1.05, 3
+_SCALES = np.geomspace(1 / 30, 30, 55)  # of the cameras' positions, tried in turn
+_SCALE_GAUSSIANS = 2000  # Gaussians that the scales are tried on
+# Finer searches around the best scale: range (natural logarithm), steps, Gaussians
+_FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
+
+
+@dataclass(frozen=True)
+class CameraCheck:
+    """The share of Gaussians that cameras see, and how well the colours agree with the photos."""
+
+    share_seen: float  # share of the Gaussians that project into at least one view
+    # colour error of the Gaussians in the photos, divided by the error after shuffling the pixels; NaN without photos,
+    # or if the colours hardly vary
+    color_ratio: float
+    ok: bool  # True if these are probably the cameras of these Gaussians
+    num_compared: int = 0  # Gaussians whose colours were compared in at least one photo
+    ratio_error: float = np.nan  # standard error of the ratio, from sampling alone
+
+    @property
+    def score(self) -> float:
+        """Score in [0, 1] to rank cameras: the share seen, times 1 minus the colour ratio if that is known."""
+        return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
+
+    @property
+    def description(self) -> str:
+        """Description of the measures in one sentence."""
+        seen = f"the cameras see {100 * self.share_seen:.0f} % of the Gaussians"
+        if np.isnan(self.color_ratio):
+            return seen
+        return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as from random pixels"
+
+
+def check_cameras(
+    gaussians: Gaussians,
+    valid: np.ndarray,
+    cameras: Cameras,
+    images: np.ndarray,
+    samples: int = _SEEN_GAUSSIANS,
+    *,
+    foremost: bool = False,
+    hiding: np.ndarray | None = None,
+) -> CameraCheck:
+    """Measure the share of sampled Gaussians that views see, and how well their colours fit ``images [c,h,w,3]``.
+
+    ``images`` may be empty. With ``foremost``, the colours of hidden Gaussians do not count. ``hiding`` are further
+    points ``[n,3]`` that hide Gaussians, but have no colours themselves.
+    """
+    samples = min(samples, max(_MIN_GAUSSIANS, _MAX_PROJECTED // len(cameras)))
+    rows = np.flatnonzero(valid)
+    rows = rows[:: max(1, len(rows) // samples)]
+    points = gaussians.means[rows].astype(np.float64)
+    if hiding is not None:
+        points = np.concatenate([points, hiding[:: max(1, len(hiding) // samples)]])
+    colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
+    visible, compared = np.zeros((2, len(points)), bool)
+    errors, shuffled_errors = list[np.ndarray](), list[np.ndarray]()
+    rng = np.random.default_rng(0)
+    views_at_once = 1 + _SEEN_GAUSSIANS // max(1, len(points))
+    for first_view in range(0, len(cameras), views_at_once):
+        batch = cameras[first_view : first_view + views_at_once]
+        with np.errstate(all="ignore"):
+            xy, depth = project_points(points[None], batch.viewmats, batch.Ks)
+        inside = (depth > 0) & is_inside(xy, cameras)
+        visible |= inside.any(0)
+        for view in np.flatnonzero(inside.any(1)) if len(images) else ():
+            seen = np.flatnonzero(inside[view])
+            column, row = xy[view, seen].astype(np.int64).T
+            if foremost:
+                counts = _are_foremost(column, row, depth[view, seen], cameras.width * cameras.height)
+                counts &= seen < len(rows)
+                seen, column, row = seen[counts], column[counts], row[counts]
+            photo = photo_colors(images, np.full(len(seen), first_view + view), row, column)
+            if (photo == photo[:1]).all():  # a view without a photo is black
+                continue
+            compared[seen] = True
+            errors.append(_mean_difference(colors[seen], photo))
+            shuffled_errors.append(_mean_difference(colors[seen], rng.permutation(photo)))
+    share, num_compared = float(visible[: len(rows)].sum()) / max(1, len(rows)), int(compared.sum())
+    ratio, error = _color_ratio(errors, shuffled_errors, num_compared)
+    return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > RANDOM_SHARE, num_compared, error)
+
+
+def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: int) -> tuple[float, float]:
+    """Divide the mean error by the mean error of shuffled pixels; also return the standard error of the ratio.
+
+    ``count`` is the number of Gaussians. Both results are NaN if the colours hardly vary.
+    """
+    if not errors or not (mean_shuffled := float(np.concatenate(shuffled).mean())) > SAME_COLORS:
+        return np.nan, np.nan
+    ratio = float(np.concatenate(errors).mean()) / mean_shuffled
+    residuals = np.concatenate(errors) - ratio * np.concatenate(shuffled)  # with a mean of 0
+    return ratio, float(np.sqrt(np.square(residuals).mean() / count)) / mean_shuffled
+
+
+def _mean_difference(colors: np.ndarray, other_colors: np.ndarray) -> np.ndarray:
+    """Return the mean absolute difference ``[n]`` over the channels of colours ``[n,3]``."""
+    red, green, blue = np.abs(colors - other_colors).T
+    return np.asarray((red + green + blue) / 3)
+
+
+def _are_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
+    """Return True for each of n points that is about as near as the nearest point of its cell.
+
+    ``column [n]`` and ``row [n]`` are the pixels of the points, and ``depth [n]`` their depths. A cell is a square of
+    pixels; its side follows from the ``area`` of the picture, pixels.
+    """
+    if not len(row):
+        return np.zeros(0, bool)
+    side = max(1, int(np.sqrt(_PER_CELL * area / len(row))))
+    column, row = column // side, row // side
+    cells = row * (column.max() + 1) + column
+    nearest = np.full(cells.max() + 1, np.inf)
+    np.minimum.at(nearest, cells, depth)
+    return np.asarray(depth <= _FRONT * nearest[cells])
+
+
+def choose_poses(
+    gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray, convention: Convention
+) -> tuple[Poses | None, CameraCheck, str | None]:
+    """Choose the pose convention in which the cameras see most Gaussians and the colours fit best.
+
+    ``cameras`` are in the usual ``convention``; for the other arguments see :func:`check_cameras`. Returns the poses in
+    another convention, or None if none is clearly better than the usual one. Also returns the check of the chosen
+    poses, and a note if another convention fits the photos as well.
+    """
+    usual = check_cameras(gaussians, valid, cameras, images)
+    candidates = [
+        (poses, check_cameras(gaussians, valid, replace(cameras, viewmats=poses.viewmats), images, _COMPARED_GAUSSIANS))
+        for poses in other_conventions(cameras.viewmats, convention)
+    ]
+    ranked = sorted(candidates, key=lambda candidate: -candidate[1].score)
+    if not ranked or not ranked[0][1].ok:
+        return None, usual, None
+    poses, best = ranked[0]
+    rivals = [usual, *(check for _, check in ranked[1:2])]
+    margin = _MARGIN if np.isnan(best.color_ratio) else _COLOR_MARGIN
+    if best.score >= margin * max((check.score for check in rivals if check.ok), default=0.0):
+        return poses, best, None
+    # Without photos other conventions may see as many Gaussians of any scene, so no note is needed
+    as_good = usual.ok and usual.num_compared > 0 and _FRAME_GAIN * best.score >= usual.score
+    note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
+    return None, usual, note if as_good else None
+
+
+def choose_cameras(
+    inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], no_pixels: SceneError
+) -> tuple[PlacedGrid, list[str]]:
+    """Choose cameras that see the Gaussians: unchanged, in another frame, or in another convention; also return notes.
+
+    ``frames`` are the frames that a file gives. The usual frames of exporters are tried next. The error ``no_pixels``
+    explains why the rows have no pixels. It is raised, with what was tried, if no camera sees the Gaussians.
+    """
+    rows, unchanged = (inputs.gaussians, inputs.valid), PlacedGrid(grid, IDENTITY)
+    if frames:
+        given_score = check_cameras(*rows, inputs.cameras, inputs.images).score
+        checks = [check_cameras(*rows, frame.move(inputs.cameras), inputs.images) for frame in frames]
+        best = max(checks, key=lambda check: check.score)
+        if best.ok and best.score > given_score:
+            return replace(unchanged, frame=frames[checks.index(best)]), []
+    poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
+    other = _choose_frame(inputs, check)
+    if other is not None:
+        _check_colors(inputs, other.move(inputs.cameras), other.description, no_pixels)
+        return PlacedGrid(grid, other, "photos' colours"), []
+    if not check.ok:
+        raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", no_pixels.remedy)
+    if poses is None:
+        return unchanged, [note] if note else []
+    cameras = replace(inputs.cameras, viewmats=poses.viewmats)
+    _check_colors(inputs, cameras, f"read as {poses.description}", no_pixels)
+    return replace(unchanged, grid=with_poses(grid, poses)), []
+
+
+def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels: SceneError) -> None:
+    """Raise SceneError if the colours of the foremost Gaussians do not fit the photos.
+
+    ``name`` describes the cameras in words. The message begins with the problem of ``no_pixels``.
+    """
+    ratio = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True).color_ratio
+    if ratio > MAX_FRONT_RATIO:
+        measured = (
+            f"even with cameras {name} the colours of the foremost Gaussians are {ratio:.2f} times as far from the"
+            " photos as from random pixels"
+        )
+        remedy = "name the exporter with --hint exporter, export all pixels, or give cameras in the file's frame"
+        raise SceneError(no_pixels.path, f"{no_pixels.problem}; {measured}", remedy)
+
+
+def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
+    """Choose an exporter's frame in which the colours fit the photos clearly better than in the given frame; or None.
+
+    Colours fit best at the true scale. The chosen frame must therefore fit better than the same frame at nearby scales.
+    If no frame does so at the scale of the cameras, the scale is solved for.
+    """
+    if not len(inputs.images):
+        return None
+    frames = exporter_frames(inputs.cameras)
+    best, score = _best_frame(inputs, frames)
+    stands_out = _stands_out(inputs, best, score)
+    if inputs.scale is None and not stands_out:
+        solved = (_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[-1]))
+        best, score = _best_frame(inputs, [best, *solved])
+        stands_out = _stands_out(inputs, best, score)
+    if best is IDENTITY or not stands_out:
+        return None
+    given_score = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
+    return best if score > _FRAME_GAIN * given_score else None
+
+
+def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:
+    """Score the cameras in a frame; 0 if the photos do not decide."""
+    # the first camera is left out, because it may see all Gaussians at any scale
+    later = slice(1 if len(inputs.cameras) > 1 else 0, None)
+    cameras = frame.move(inputs.cameras)[later]
+    check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images[later], samples)
+    return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
+
+
+def _best_frame(
+    inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _COMPARED_GAUSSIANS
+) -> tuple[Similarity, float]:
+    """Return the first frame with the highest score, and the score."""
+    scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
+    return max(scored, key=lambda frame_and_score: frame_and_score[1])
+
+
+def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool:
+    """Return True if the ``score`` of a frame is clearly higher than at scales two steps away."""
+    two_steps = float(_SCALES[2] / _SCALES[0])
+    neighbour_scores = (_score_frame(inputs, _scale_frame(frame, factor)) for factor in (1 / two_steps, two_steps))
+    return all(score > _PEAK_GAIN * neighbour_score for neighbour_score in neighbour_scores)
+
+
+def _scale_frame(frame: Similarity, factor: float) -> Similarity:
+    """Multiply the scale of a frame by ``factor``, about the origin of the Gaussians."""
+    scale = factor * frame.scale
+    text = f"positions scaled by {scale:.4g}"
+    name = frame.description.partition("positions scaled")[0].removesuffix(", ")
+    words = f"{name}, {text}" if name else text
+    return replace(frame, scale=scale, shift=factor * frame.shift, description=words)
+
+
+def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
+    """Solve for the scale of a frame by the colours in the photos, in ever smaller steps."""
+    best, _ = _best_frame(inputs, (_scale_frame(frame, float(scale)) for scale in _SCALES), _SCALE_GAUSSIANS)
+    for reach, steps, samples in _FINER:
+        factors = exp(np.linspace(-reach, reach, steps))
+        best, _ = _best_frame(inputs, [_scale_frame(best, float(factor)) for factor in factors], samples)
+    return best

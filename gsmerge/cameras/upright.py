@@ -1,0 +1,237 @@
+"""Solve for the frame of rows that an exporter of the pixelSplat family centred, rescaled and turned upright.
+
+The exporter subtracts the median, divides by the 95 % quantile of the widest axis and rotates the world upright from
+the first camera. It saves none of these. Often the rows do not determine their cameras: views were fused (FreeSplat),
+layers of a pixel have gaps, or so many far pixels were cut that no lines repeat. But the file is recognised by its
+median and quantile, so the rotation is known. Scale and shift are solved from rows whose pixels are found by colours:
+a stretch of rows without a gap has the colours of a stretch of a photo. Stretches that agree on one frame are right,
+and all other matches are wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.cameras.frames import UPRIGHT, ray_directions, solve_frame
+from gsmerge.cameras.layouts import TRIMS
+from gsmerge.cameras.score import AlignmentInput, Correspondences, pixel_errors, pixel_limit
+from gsmerge.errors import SceneError
+from gsmerge.geometry.transforms import Similarity, sh0_to_rgb
+from gsmerge.kernels.matrices import matmul
+from gsmerge.types import Cameras
+
+_QUANTILE = 0.95  # this quantile of the distances along the widest axis is 1 in these files
+_TOLERANCE = 1e-3  # of the median and the quantile
+_ROUGH_ROWS, _ROUGH = 2000, 1.0  # rows of a first check, and its tolerance before the rotation is undone
+_PER_PIXEL = (1, 2, 3)  # Gaussians of a pixel
+_OUTSIDE = 999  # a colour that no pixel has
+_UNIQUE = 1.1  # least distance of a stretch at its second-best place, divided by the distance at its best place
+_STEP = 2  # every second pixel of a stretch is compared
+_LENGTH, _STRETCHES = 48, 96  # rows of a stretch, and number of stretches that are searched
+_PER_STRETCH = 12  # rows of each stretch that the frame is solved from
+_SHARE = 3  # stretches of fused views are taken from the first and the last third of the rows
+_SLACK = 8  # pixels beyond the bounds on both sides that are searched too
+_MAX_COST = 3.0  # largest distance of a stretch, divided by the lower quartile of all distances
+_NO_PLACE = 1 << 30  # distance of a stretch that cannot be in its photo
+_PAIRS = 200  # pairs of stretches from which a frame is tried
+_NEAR = 3.0  # a stretch agrees with the frame of a pair if its error is below this multiple of the limit
+_ROUNDS = 3  # of solving for the frame from the stretches that agree with it
+_MIN_VIEWS, _MIN_STRETCHES, _MIN_AGREEING = 2, 3, 0.25  # views that agree, stretches of each, share of all stretches
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """A stretch of rows, and where in a photo it is searched."""
+
+    view: int
+    start: int  # first row
+    step: int  # from one row to the next
+    low: int  # first place, among the pixels of a photo, at which the first row is searched
+    high: int  # end of the places, exclusive
+
+
+def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
+    """Find the camera from which rows were centred, rescaled and turned upright; return the rotation, or None."""
+    means = inputs.gaussians.means[inputs.valid].astype(np.float64)
+    sample = means[:: max(1, len(means) // _ROUGH_ROWS)]
+    if not len(sample) or _deviation(sample) > _ROUGH:
+        return None
+    for view, viewmat in enumerate(inputs.cameras.viewmats):
+        rotation = matmul(UPRIGHT, viewmat[:3, :3])
+        if _deviation(matmul(sample, rotation)) < _ROUGH / 2 and _deviation(matmul(means, rotation)) < _TOLERANCE:
+            source = "the first camera" if view == 0 else f"camera {view + 1}"
+            return Similarity(rotation, 1.0, np.zeros(3), f"rotated upright from {source}")
+    return None
+
+
+def _deviation(points: np.ndarray) -> float:
+    """Measure how far points ``[n,3]`` are from a median of 0 and a quantile of 1."""
+    quantile = float(np.quantile(np.abs(points), _QUANTILE, axis=0).max())
+    return max(float(np.abs(np.median(points, 0)).max()), abs(quantile - 1))
+
+
+def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Similarity:
+    """Solve for the frame of upright rows from their colours in the photos; SceneError if too few stretches agree."""
+    for pixels, stretches in _possible_orders(len(inputs.gaussians), inputs.cameras) if len(inputs.images) else ():
+        frame = _solve_agreed_frame(inputs, *_match(inputs, stretches, pixels), rotation)
+        if frame is not None:
+            return frame
+    raise SceneError(
+        path,
+        "expected cameras in the frame of the Gaussians, found Gaussians that were centred, rescaled and turned upright"
+        " by amounts that no file states, and no photos that show where they lie",
+        "give the photos that the model saw, or cameras in the frame of the Gaussians",
+    )
+
+
+def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray, list[_Stretch]]]:
+    """Yield the orders that ``count`` rows may have, as pixels ``[p]`` of a photo and the stretches to search."""
+    grid, trim = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), TRIMS[0]
+    trimmed, whole = grid[trim:-trim, trim:-trim].reshape(-1), grid.reshape(-1)
+    for per_pixel in _PER_PIXEL:
+        stretches = _interleaved_stretches(count, len(cameras), per_pixel, len(trimmed))
+        if stretches:
+            yield trimmed, stretches
+    stretches = _fused_stretches(count, len(cameras), len(whole))
+    if stretches:
+        yield whole, stretches
+
+
+def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: int) -> list[_Stretch]:
+    """List stretches of rows in the order line, column, layer, view, of which some are dropped.
+
+    Each view has ``num_pixels`` pixels with ``per_pixel`` rows. Empty if ``count`` rows do not have this order.
+    """
+    step = views * per_pixel
+    dropped = num_pixels * step - count
+    if not (0 <= dropped < count and count >= _LENGTH * step):
+        return []
+    starts = np.unique(np.linspace(0, count - _LENGTH * step, _STRETCHES).astype(int))
+    bounds = [(int(start), start // step - _SLACK, (start + dropped) // step + _SLACK) for start in starts]
+    return [_Stretch(view, start, step, low, high) for start, low, high in bounds for view in range(views)]
+
+
+def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
+    """List stretches of the first and the last view, if views of ``num_pixels`` were fused one after another.
+
+    The rows of the first view come first, and the rows of the last view last. Empty for too few or too many rows.
+    """
+    if not _SHARE * _LENGTH <= count < views * num_pixels:
+        return []
+    starts = np.unique(np.linspace(0, count // _SHARE, _STRETCHES).astype(int)).tolist()
+    first_view = [_Stretch(0, start, 1, start - _SLACK, num_pixels) for start in starts]
+    last_view = [
+        _Stretch(views - 1, count - _LENGTH - start, 1, 0, num_pixels - start - _LENGTH + _SLACK) for start in starts
+    ]
+    return first_view + last_view
+
+
+def _match(
+    inputs: AlignmentInput, stretches: Sequence[_Stretch], pixels: np.ndarray
+) -> tuple[Correspondences, np.ndarray]:
+    """Search for stretches in the photos; return a sample of the rows of all stretches that match a photo.
+
+    A stretch matches if a single place of its photo has nearly the colours of its rows. Also returns the stretch
+    ``[t]`` of each row.
+    """
+    rows = np.array([stretch.start + stretch.step * np.arange(_LENGTH) for stretch in stretches])
+    places, sums, next_sums = _place_stretches(inputs, stretches, rows, pixels).T
+    is_near = sums <= _MAX_COST * max(1.0, float(np.quantile(sums, 0.25)))
+    matched = np.flatnonzero(is_near & (next_sums > _UNIQUE * sums))
+    sample = np.linspace(0, _LENGTH - 1, _PER_STRETCH).astype(int)
+    ids = rows[matched][:, sample].reshape(-1)
+    matched_pixels = pixels[(places[matched, None] + sample).clip(max=len(pixels) - 1).reshape(-1)]
+    y, x = np.divmod(matched_pixels, inputs.cameras.width)
+    views = np.array([stretch.view for stretch in stretches])[matched].repeat(_PER_STRETCH)
+    parts = np.arange(len(matched)).repeat(_PER_STRETCH)
+    points = inputs.gaussians.means[ids].astype(np.float64)
+    valid = inputs.valid[ids]
+    return Correspondences(points, np.stack([x, y], 1) + 0.5, views).select(valid), parts[valid]
+
+
+def _place_stretches(
+    inputs: AlignmentInput, stretches: Sequence[_Stretch], rows: np.ndarray, pixels: np.ndarray
+) -> np.ndarray:
+    """Return for each stretch its place, its sum and its next sum ``[s,3]``; see :func:`_place_stretch`.
+
+    ``rows [s,l]`` are the rows of the stretches, and ``pixels [p]`` the pixels of a photo in which they are searched.
+    """
+    with np.errstate(invalid="ignore"):
+        base = np.nan_to_num(sh0_to_rgb(inputs.gaussians.sh0[:, 0])).clip(0, 1)
+    colors = np.ascontiguousarray(np.rint(255 * base).astype(np.int16).T)
+    shown = [_shown_colors(np.rint(255 * photo).astype(np.uint8), pixels, _LENGTH) for photo in inputs.images]
+    places = []
+    for stretch, stretch_rows in zip(stretches, rows, strict=True):
+        low, high = max(0, stretch.low), min(len(pixels), stretch.high)
+        if low < high:
+            places.append(_place_stretch(shown[stretch.view], colors[:, stretch_rows], low, high))
+        else:
+            places.append((0, _NO_PLACE, 0))
+    return np.array(places)
+
+
+def _shown_colors(photo: np.ndarray, pixels: np.ndarray, length: int) -> np.ndarray:
+    """Return the colours ``[3,p+length]`` int16 at ``pixels [p]`` of a uint8 ``photo [h,w,3]``, padded at the end."""
+    shown = photo.reshape(-1, 3)[pixels].T.astype(np.int16)
+    return np.concatenate([shown, np.full((3, length), _OUTSIDE, np.int16)], 1)
+
+
+def _place_stretch(shown: np.ndarray, colors: np.ndarray, low: int, high: int) -> tuple[int, int, int]:
+    """Find the place of ``colors [3,l]`` in the colours ``shown [3,m]`` with the least sum of absolute differences.
+
+    Places from ``low`` to before ``high`` are searched. Returns the best place, its sum, and the sum of the second-best
+    place that is more than two pixels away.
+    """
+    sums, difference = np.zeros(high - low, np.int32), np.empty(high - low, np.int16)
+    for offset in range(0, colors.shape[1], _STEP):
+        for channel in range(3):
+            values = shown[channel, low + offset : high + offset]
+            np.subtract(values, colors[channel, offset], out=difference)
+            np.abs(difference, out=difference)
+            sums += difference
+    best = int(sums.argmin())
+    other_sums = np.concatenate([sums[: max(0, best - 2)], sums[best + 3 :]])
+    return low + best, int(sums[best]), int(other_sums.min(initial=np.iinfo(np.int32).max))
+
+
+def _solve_agreed_frame(
+    inputs: AlignmentInput, pairs: Correspondences, parts: np.ndarray, rotation: Similarity
+) -> Similarity | None:
+    """Solve for the scale and shift that most stretches agree on; None if too few agree.
+
+    ``parts [t]`` are the stretches of the pairs.
+    """
+    stretches = np.unique(parts)
+    views = np.array([pairs.views[parts == stretch][0] for stretch in stretches])
+    if len(np.unique(views)) < _MIN_VIEWS:
+        return None
+    limit, rng = pixel_limit(inputs.cameras.width, inputs.cameras.height), np.random.default_rng(0)
+
+    def solve(some_stretches: np.ndarray) -> Similarity | None:
+        selected = pairs.select(np.isin(parts, some_stretches))
+        rays = ray_directions(selected, inputs.cameras)
+        return solve_frame(selected.points, rays, rotation.rotation, shifted=True)
+
+    def find_agreeing(frame: Similarity | None, limit: float) -> np.ndarray:
+        if frame is None:
+            return stretches[:0]
+        errors = pixel_errors(pairs, frame.move(inputs.cameras))
+        return stretches[[float(np.median(errors[parts == stretch])) < limit for stretch in stretches]]
+
+    best = stretches[:0]
+    for _ in range(_PAIRS):
+        first = rng.choice(len(stretches))
+        second = rng.choice(np.flatnonzero(views != views[first]))
+        best = max(best, find_agreeing(solve(stretches[[first, second]]), _NEAR * limit), key=len)
+    frame = None
+    for _ in range(_ROUNDS):
+        frame = solve(best) if len(best) else None
+        best = find_agreeing(frame, limit)
+    counts = np.bincount(views[np.isin(stretches, best)], minlength=1)
+    if frame is None or (counts >= _MIN_STRETCHES).sum() < _MIN_VIEWS or len(best) < _MIN_AGREEING * len(stretches):
+        return None
+    text = f"{rotation.description}, positions scaled by {frame.scale:.4g} and shifted"
+    return replace(frame, description=text)

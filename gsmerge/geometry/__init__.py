@@ -1,0 +1,1 @@
+"""Geometry of Gaussians and cameras: rotations, projection, similarities, the canonical frame, pooling."""

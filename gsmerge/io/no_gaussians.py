@@ -1,0 +1,115 @@
+"""Recognise the output of models and programs that has no Gaussians, and say how to get Gaussians from each."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+from gsmerge.errors import SceneError
+from gsmerge.io.bounds import check_file
+from gsmerge.io.first_bytes import FOREIGN
+from gsmerge.io.formats.ply import header_content
+from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
+from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES, list_images
+from gsmerge.io.scene_files import IMAGE_PLACES
+
+MAX_FOLDERS = 100  # folders that are searched in a folder of scenes
+_NAME = "name the .ply of the Gaussians, or the folder that it is in"
+
+
+@dataclass(frozen=True)
+class PointsOnly:
+    """A model or program whose output has no Gaussians, and how to get Gaussians from it or from another program."""
+
+    title: str  # the name that people use
+    files: tuple[str, ...]  # patterns of its output in a folder; one match is enough
+    remedy: str
+
+
+_TRAIN = "train Gaussians on it, or name the .ply of a model, and this file with --cameras"
+_PHOTOS = "photos", "make Gaussians from the photos first, with a model such as Depth Anything 3 or AnySplat"
+# They are tried in this order
+POINTS_ONLY = (
+    PointsOnly(
+        "Depth Anything 3",
+        ("exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "scene.glb"),
+        'run it with export_format="npz-gs_ply", infer_gs=True and a giant model',
+    ),
+    PointsOnly("gsplat's trainer", ("ckpts/ckpt_*.pt",), "run it with its option save_ply"),
+    PointsOnly("nerfstudio", ("nerfstudio_models/*.ckpt",), "write Gaussians with ns-export gaussian-splat"),
+    PointsOnly("DA3-Streaming or VGGT-Long", ("camera_poses.txt",), _TRAIN),
+    PointsOnly("FLARE", ("pred.npz",), f"FLARE writes no Gaussians; {_TRAIN}"),
+    PointsOnly(
+        "VGGT or MapAnything",
+        ("sparse/points.ply", "dense_mesh.glb", "glbscene_*.glb", "predictions.npz", "points.ply"),
+        _TRAIN,
+    ),
+    PointsOnly(
+        "COLMAP",
+        tuple(f"{folder}cameras.{kind}" for folder in ("sparse/0/", "sparse/", "0/", "") for kind in ("bin", "txt")),
+        _TRAIN,
+    ),
+    PointsOnly("a model of points", ("*.glb", "*.npz"), _TRAIN),
+)
+
+
+def no_gaussians(folder: Path) -> SceneError:
+    """Make the error of a folder without a scene: what it contains instead, and what to do."""
+    try:
+        os.scandir(folder).close()
+    except OSError as error:
+        return SceneError(folder, f"cannot be read ({error.strerror})")
+    content, remedy = _content(folder) or ("", _NAME)
+    problem = "expected a .ply of Gaussians in the folder, found none"
+    return SceneError(folder, f"{problem} but {content}" if content else problem, remedy)
+
+
+def find_remedy(folder: Path) -> str:
+    """Return what to do about a folder whose folders have no scene; empty if none of them has known content."""
+    with suppress(OSError):
+        subfolders = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
+        contents = [(path, _content(path)) for path in (folder, *islice(subfolders, MAX_FOLDERS))]
+        for path, content in sorted(contents, key=lambda entry: entry[1] == _PHOTOS):  # photos come last
+            if content is not None:
+                return f"{path} has {content[0]}: {content[1]}"
+    return ""
+
+
+def _content(folder: Path) -> tuple[str, str] | None:
+    """Describe the known content of a folder without a .ply, and what to do with it; None if no content is known."""
+    files = (
+        path
+        for path in sorted(folder.glob("[!.]*"))
+        if path.is_file() and path.suffix != ".ply" and may_hold_gaussians(path)
+    )
+    named = next(files, None)
+    if named is not None:
+        return named.name, "name that file"
+    for row in POINTS_ONLY:
+        file = next((path for pattern in row.files for path in sorted(folder.glob(pattern))), None)
+        if file is not None:
+            return f"{file.relative_to(folder).as_posix()} of {row.title}", row.remedy
+    points = next((path for path in sorted(folder.glob("[!.]*.ply")) if header_content(path) == "other"), None)
+    if points is not None:
+        return f"points or a mesh ({points.name})", _NAME
+    foreign = next((path for path in sorted(folder.glob("[!.]*")) if path.suffix.lower() in FOREIGN), None)
+    if foreign is not None:
+        kind, remedy = FOREIGN[foreign.suffix.lower()]
+        return f"{kind} ({foreign.name})", remedy.format(path=shlex.quote(str(foreign)))
+    has_photos = any(path.suffix.lower() in IMAGE_SUFFIXES | OTHER_SUFFIXES for path in folder.glob("[!.]*"))
+    return _PHOTOS if has_photos or any(list_images(folder / place) for place in IMAGE_PLACES) else None
+
+
+def check_scene_file(path: Path) -> None:
+    """Raise SceneError, with a remedy, for a file that is known to hold no Gaussians, such as ``results.npz``."""
+    suffix = path.suffix.lower()
+    if suffix not in SEVERAL_USES or not check_file(path) or may_hold_gaussians(path):
+        return
+    matching = (row for row in POINTS_ONLY if any(path.match(Path(file).name) for file in row.files))
+    row = next(matching, POINTS_ONLY[-1])
+    problem = f"expected a file of Gaussians, found a {suffix} without Gaussians, as {row.title} writes it"
+    raise SceneError(path, problem, row.remedy)

@@ -1,0 +1,474 @@
+"""Find the files of a scene: its ``.ply``, cameras, photos and masks."""
+
+from __future__ import annotations
+
+import filecmp
+import os
+import re
+import shlex
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+from gsmerge.errors import SceneError
+from gsmerge.io.bounds import check_file
+from gsmerge.io.cameras.foreign import check_program, find_unread
+from gsmerge.io.cameras.read import find_cameras, find_other_cameras, holds_images, read_cameras, read_sharp_camera
+from gsmerge.io.cameras.table import CHUNK
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
+from gsmerge.io.formats.ply import header_content, header_counts, is_file_from_gsmerge
+from gsmerge.io.formats.table import (
+    HTML,
+    META,
+    OUTPUT_FORMATS,
+    SCENE_SUFFIXES,
+    SEVERAL_USES,
+    STATE_ENDING,
+    find_format,
+    may_hold_gaussians,
+)
+from gsmerge.io.image_names import check_photo_folder, list_images, natural_order
+from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.settings.reading import NONE
+from gsmerge.types import StrPath
+
+_CHECK_SCENE_FILE = LazyFunction("gsmerge.io.no_gaussians", "check_scene_file")
+_NO_GAUSSIANS = LazyFunction("gsmerge.io.no_gaussians", "no_gaussians")
+_HOLDS_VIEWS = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
+# The first of these files that exists and is no result is read; otherwise the folder's only .ply
+PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
+# Among several trained scenes in a folder, the scene of the most steps is read. The places are INRIA's and gsplat's
+TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
+SCENES_PLACE = "gaussians"  # DepthSplat and its relatives write NAME.ply there, with the photos in images/NAME
+IMAGE_PLACES = (
+    "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
+    "keyframes/images",
+)  # fmt: skip
+MASK_PLACES = ("masks",)
+_PICTURES = ("images", "masks", "protect")  # fields of SceneFiles that are folders of pictures
+_POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
+_NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
+_STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
+# Ends of paths that programs give to all their scenes
+_USUAL_END = re.compile(
+    r"/(?:(?:exports/)?gs_ply/\d+|(?:point_cloud/iteration_\d+/)?point_cloud|ply/point_cloud_\d+|scene|gaussians)$"
+)
+# Words before the numbers of files that each have one view or one part of a scene
+_PARTS = {"view", "chunk", "part", "block", "tile"}
+_LEVEL = re.compile(r"\.level\d+(?=\.)")  # in the name of a level of detail, see :func:`level_output`
+_RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
+_PACKED = {*SCENE_SUFFIXES} - {".ply"}
+_MAX_HEADERS = 1_000  # headers of a folder's files that are read; further files count as scenes
+_MAX_DEPTH = 3  # of the folders that are searched below a folder without a scene
+_MAX_ENTRIES = 10_000  # largest number of files and folders in these folders
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """The files of a scene.
+
+    ``cameras`` may be a COLMAP folder, or the ``.ply`` itself if it holds its cameras. ``images`` may be an ``.npz`` or
+    ``.torch`` that holds them. For a ``.gsm`` both are the file itself.
+    """
+
+    ply: Path
+    cameras: Path | None
+    images: Path | None
+    masks: Path | None = None  # a folder
+    protect: Path | None = None  # a folder; never searched
+    more: tuple[SceneFiles, ...] = ()  # other scenes of the same place, each in a frame of its own
+    parts: tuple[Path, ...] = ()  # all files of a scene in several files, ``ply`` first; empty for a single file
+    num_copies: int = 0  # number of other files in the folder with the same bytes
+    named: frozenset[str] = frozenset()  # names of the fields that the caller gave, which are not searched
+    photo_option: str = "--images"  # names the folder of ``images``
+    # Photos and cameras in the folder above or in its folders, if the scene has none, by option; never read
+    above: tuple[tuple[str, Path], ...] = ()
+
+    @property
+    def plys(self) -> tuple[Path, ...]:
+        """Paths of the Gaussians, in the order of their rows."""
+        return self.parts or (self.ply,)
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Paths of all files and folders that the scene is read from: Gaussians, cameras and pictures."""
+        beside = (self.cameras, self.images, self.masks, self.protect)
+        return (*self.plys, *(path for path in beside if path is not None))
+
+    @property
+    def is_state(self) -> bool:
+        """Whether the file is a state (``.gsm``), whose Gaussians have no pixels."""
+        return self.ply.suffix.lower() == STATE_ENDING
+
+    @property
+    def base(self) -> Path:
+        """Path from which the names of results are made: the file, or ``scene.ply`` for a folder of parts."""
+        return self.ply.with_name("scene.ply") if self.parts else self.ply
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes that several files are read as one scene, and on cameras and photos outside its folder."""
+        notes = []
+        if self.num_copies:
+            notes.append(f"{self.num_copies + 1} files have the same bytes; {self.ply.name} is read")
+        elif self.parts:
+            notes.append(f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}")
+        if self.above:
+            kinds = " and ".join({"images": "photos"}.get(option, option) for option, _ in self.above)
+            words = shlex.join(word for option, path in self.above for word in (f"--{option}", str(path)))
+            notes.append(f"{kinds} outside the scene's folder are not read; to read them, pass {words}")
+        return tuple(notes)
+
+
+def find_scene_files(
+    path: StrPath,
+    *,
+    cameras: StrPath | None = None,
+    images: StrPath | None = None,
+    masks: StrPath | None = None,
+    protect: StrPath | None = None,
+    within: StrPath | None = None,
+) -> SceneFiles:
+    """Find a scene's files from its path; files that the caller names, or "none", are not searched.
+
+    These folders are searched in this order:
+
+    - the given folder;
+    - the folder of the ``.ply``, and the folder of the file to which it links;
+    - the folder above it if its own is ``gs_ply/``, ``ply/`` or ``gaussians/``, or the folder two above it if its own
+      is ``point_cloud/iteration_n/``;
+    - the folders above it up to ``within``, by default up to the given folder.
+
+    In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
+    their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, but come last if they
+    may not be its own. Cameras inside the ``.ply`` precede those beside it. If no place has cameras,
+    the only file of any name that holds cameras is taken. Without it, cameras of a program whose files are not read are
+    taken, so that the reader says so. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder,
+    because the model saw these. A result of gsmerge is taken as the scene only if a folder has nothing else.
+
+    Raises:
+        SceneError: If there is no ``.ply``, or several to choose from, or if a named file does not exist. Several files
+            are one scene if they are numbered views or parts, see ``docs/reference/formats.md``.
+    """
+    path, given = Path(path), {"cameras": cameras, "images": images, "masks": masks}
+    if images is not None and images != NONE:
+        check_photo_folder(Path(images))
+    named = frozenset(name for name, value in {**given, "protect": protect}.items() if value is not None)
+    camera_path, image_path, mask_path = map(named_path, given.values())
+    protect = named_path(protect)
+    _check_folders(masks=mask_path, protect=protect)
+    if path.suffix.lower() == STATE_ENDING and not os.path.isdir(path):
+        check_file(path)
+        own = path if cameras is None and _HOLDS_VIEWS(path) else None
+        photos = image_path or (own if images is None else None)
+        return SceneFiles(path, camera_path or own, photos, mask_path, protect, named=named)
+    plys = find_plys(path, camera_path) if os.path.isdir(path) else [path]
+    ply, num_copies = plys[0], len(list_plys(path)) - len(plys) if os.path.isdir(path) else 0
+    for part in plys:
+        check_file(part)
+        if part.suffix.lower() in SEVERAL_USES:
+            _CHECK_SCENE_FILE(part)
+    roots = _search_roots(path, ply, within)
+    if cameras is None:
+        camera_path = _find_camera_path(ply, roots)
+    if images is None:
+        image_path = _find_image_path(ply, camera_path, roots)
+    if masks is None:
+        mask_path = _find_mask_path(image_path, roots)
+    parts = tuple(plys) if len(plys) > 1 else ()
+    pictures = image_path, mask_path, protect
+    files = SceneFiles(ply, camera_path, *pictures, parts=parts, num_copies=num_copies, named=named)
+    return files if within is not None else replace(files, above=_find_above(files, roots))
+
+
+def _find_camera_path(ply: Path, roots: Sequence[Path]) -> Path | None:
+    """Find the cameras of a scene, in the order of precedence of :func:`find_scene_files`; None without."""
+    of_result = result_cameras(ply)
+    if of_result is not None and _count_signs(ply) == 2:
+        return of_result
+    searched = (find(root) for find in (find_cameras, find_other_cameras, find_unread) for root in roots)
+    return next((path for path in searched if path is not None), of_result)
+
+
+def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
+    """Find the images of a scene: inside its cameras' file, or in a folder; None without."""
+    if cameras is not None:
+        holds_all = cameras.suffix in (CHUNK, STATE_ENDING)
+        if holds_all or (cameras.suffix == ".npz" and holds_images(cameras)):
+            return cameras
+    folders = [f for root in roots for place in IMAGE_PLACES if can_be_listed(f := root / place, "images")]
+    # If a folder has several scenes, each may have its own folder of images
+    names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
+    own_folders = [folder / name for folder in folders for name in names]
+    may_be = (folder for folder in own_folders + folders if folder.is_dir() and not _is_other_scene(folder, ply))
+    return next((folder for folder in may_be if list_images(folder)), None)
+
+
+def _is_other_scene(folder: Path, ply: Path) -> bool:
+    """Return whether a folder has other Gaussians than ``ply``, and its photos are in folders below, as in a scene."""
+    if Path(os.path.realpath(ply)).is_relative_to(os.path.realpath(folder)):
+        return False
+    return bool(_plys_in(folder)) and all(photo.parent != folder for photo in list_images(folder))
+
+
+def _find_mask_path(images: Path | None, roots: Sequence[Path]) -> Path | None:
+    """Find the folder of masks beside the images, or else in the searched folders ``roots``; None without."""
+    image_folder = [] if images is None else [images.parent]
+    candidates = (root / place for root in (*image_folder, *roots) for place in MASK_PLACES)
+    return next((folder for folder in candidates if can_be_listed(folder, "masks") and list_images(folder)), None)
+
+
+def can_be_listed(folder: Path, option: str) -> bool:
+    """Return whether a path is a folder; SceneError, which names the ``option``, for a folder that is not readable."""
+    try:
+        os.scandir(folder).close()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError as error:
+        remedy = f"make it readable, name another folder with --{option}, or say --{option} none"
+        raise SceneError(folder, f"cannot be read ({error.strerror})", remedy) from error
+    return True
+
+
+def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Path], ...]:
+    """Find the photos and cameras that a scene lacks in the folder above the searched folders ``roots``.
+
+    Files in a neighbouring folder with Gaussians of its own belong to those.
+    """
+    own = Path(os.path.realpath(files.ply))
+    folder = min((r for r in roots if own.is_relative_to(r)), default=roots[0], key=lambda r: len(r.parts))
+    places = dict[str, Path | None]()
+    with suppress(SceneError, OSError):
+        if files.images is None and "images" not in files.named:
+            pictures = (folder.parent / place for place in IMAGE_PLACES)
+            places["images"] = next((f for f in pictures if f.is_dir() and f not in roots and list_images(f)), None)
+        if files.cameras is None and "cameras" not in files.named:
+            places["cameras"] = find_cameras(folder.parent)
+    paths = ((option, path) for option, path in places.items() if path is not None)
+    return tuple(pair for pair in paths if not _plys_in(folder.parent / pair[1].relative_to(folder.parent).parts[0]))
+
+
+def _search_roots(path: Path, ply: Path, within: StrPath | None) -> list[Path]:
+    """List the folders in which files that belong to a ``.ply`` are searched; see :func:`find_scene_files`."""
+    base = path if ply != path else ply.parent
+    folder = Path(os.path.realpath(ply.parent))
+    above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE))
+    if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
+        above = [folder.parent.parent]
+    target = Path(os.path.realpath(ply)).parent  # of a link
+    top = within or (path if path.is_dir() else None)
+    above += [] if top is None else _list_between(folder, Path(os.path.realpath(top)))
+    return list(dict.fromkeys((Path(os.path.realpath(base)), folder, target, *above)))
+
+
+def _check_folders(**folders: Path | None) -> None:
+    """Raise SceneError if a path is no folder; the names of the arguments are the options."""
+    for option, path in folders.items():
+        if path is not None and not path.is_dir():
+            raise SceneError(path, f"expected a folder of pictures for --{option}, found a file", "name its folder")
+
+
+def _list_between(folder: Path, top: Path) -> list[Path]:
+    """List the folders above a folder up to ``top``, the nearest first."""
+    return [above for above in folder.parents if above.is_relative_to(top)] if folder.is_relative_to(top) else []
+
+
+def scene_title(ply: Path) -> str:
+    """Name a scene for a page: by its file, or by its folder if its program gives the same name to all files."""
+    path = ply.absolute().with_name(ply.stem.removesuffix(".compact")).as_posix()
+    return Path(_USUAL_END.sub("", path)).name or ply.stem
+
+
+def result_cameras(ply: Path) -> Path | None:
+    """Find the cameras that gsmerge wrote beside a result; None without.
+
+    A level of detail has the cameras of the result to which it belongs, if it has none of its own. They belong to a
+    result of the same name beside a ``.ply`` of another program: to ``scene.sog`` beside ``scene.ply``.
+    """
+    names = ply.name, _LEVEL.sub("", ply.name)
+    beside = (viewer_cameras_path(ply.with_name(name)) for name in names)
+    cameras = next((path for path in beside if path.is_file()), None)
+    return None if cameras is None or not _count_signs(ply) else cameras
+
+
+def _count_signs(ply: Path) -> int:
+    """Count the signs that the cameras of a file's name are its own, 0 to 2.
+
+    The signs are that gsmerge wrote it, and that no other file of Gaussians has this name. A result has both, and so
+    has a file of another format, whose header does not say what it is.
+    """
+    if find_format(ply).ending != ".ply" or header_content(ply) == "result":
+        return 2
+    namesakes = (ply.with_suffix(ending) for ending in OUTPUT_FORMATS if ending != ".ply")
+    return is_file_from_gsmerge(ply) + (not any(path.is_file() for path in namesakes))
+
+
+def named_path(path: StrPath | None) -> Path | None:
+    """Return the path that a caller named; None for None and "none", SceneError if it does not exist."""
+    if path is None or path == NONE:
+        return None
+    if not os.path.exists(path):
+        raise SceneError(path, "no such file or folder")
+    if not os.path.isdir(path):
+        check_program(Path(path))
+        check_file(Path(path))
+    return Path(path)
+
+
+def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
+    """Find the files of a folder's only scene, as :func:`find_scene_files`; several files are its parts, in order.
+
+    If all files have the same bytes, the first is returned.
+    """
+    plys = list_plys(folder)
+    if len(plys) == 1:
+        return plys
+    if not plys:
+        raise _NO_GAUSSIANS(folder)
+    places = {path.parent for path in plys}
+    if _are_copies(plys):
+        return plys[:1]
+    parts = _order_parts(folder, plys, cameras or find_cameras(folder)) if len(places) == 1 else None
+    if parts is None:
+        raise _several_scenes(folder, plys)
+    return parts
+
+
+def _are_copies(plys: Sequence[Path]) -> bool:
+    """Return whether numbered files have the same bytes, as Flash3D writes one for each view that it renders."""
+    with suppress(OSError):
+        return _are_numbered(plys) and all(filecmp.cmp(plys[0], path, shallow=False) for path in plys[1:])
+    return False
+
+
+def _are_numbered(plys: Sequence[Path]) -> bool:
+    """Return whether files are in one folder and their names end in numbers."""
+    return len({path.parent for path in plys}) == 1 and all(_NUMBERED.fullmatch(path.name) for path in plys)
+
+
+def _several_scenes(folder: Path, plys: Sequence[Path]) -> SceneError:
+    """Make the error of a folder with several files, which may be scenes, moments of a scene, or its parts."""
+    places = {path.parent for path in plys}
+    start = places.pop() if len(places) == 1 else folder
+    problem = f"expected one .ply file in the folder, found {len(plys)}"
+    names = ", ".join(path.relative_to(start).as_posix() for path in plys[:4]) + ", ..." * (len(plys) > 4)
+    if not _are_numbered(plys):
+        return SceneError(folder, f"{problem} ({names})", "name one, or give the folder to gsmerge batch")
+    counts = {header_counts(path)[0] for path in plys[:_MAX_HEADERS]}
+    kind = f"moments of {counts.pop():,} Gaussians each" if len(counts) == 1 else "moments or parts"
+    calls = f"gsmerge batch {start} for all moments, or gsmerge convert {start}/*.ply one.ply to join parts of a scene"
+    return SceneError(folder, f"{problem} ({names}), numbered like {kind}", f"name one, or run {calls}")
+
+
+def list_plys(folder: Path) -> list[Path]:
+    """List the files that may be a folder's scene.
+
+    The first of these that is there is listed:
+
+    1. the file with a usual name, or else all others in the folder;
+    2. files in ``gaussians/``;
+    3. files in folders below;
+    4. results of gsmerge;
+    5. the ``meta.json`` of a ``.sog``;
+    6. a file with a usual name but without Gaussians, so that its reader reports what it lacks.
+    """
+    plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
+    plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)]
+    plys = plys or _results_in(folder)
+    plys = plys or [path for path in [folder / META] if path.is_file() and may_hold_gaussians(path)]
+    return plys or [folder / place for place in PLY_PLACES if (folder / place).is_file()][:1]
+
+
+def _plys_in(folder: Path) -> list[Path]:
+    named = named_ply(folder)
+    return other_plys(folder) if named is None else [named]
+
+
+def _scenes_below(folder: Path) -> list[Path]:
+    """List the folders of scenes below a folder, down to a limited depth; empty if there are too many entries."""
+    scenes, places, num_entries = [], [(folder, 0)], 0
+    for place, depth in places:  # the loop appends to this list
+        with suppress(OSError), os.scandir(place) as entries:
+            if depth and _plys_in(place):
+                scenes.append(place)
+                continue
+            for entry in entries:
+                num_entries += 1
+                if num_entries > _MAX_ENTRIES:
+                    return []
+                if depth < _MAX_DEPTH and entry.name[0] != "." and entry.is_dir(follow_symlinks=False):
+                    places.append((place / entry.name, depth + 1))
+    return natural_order(scenes)
+
+
+def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:
+    """Return the files that are views or parts of one scene, ordered by number; None if they are several scenes.
+
+    They are parts if their names say so, or if there are as many cameras as files. Files that hold a camera are
+    several scenes, each in its own frame.
+    """
+    matches = [_NUMBERED.fullmatch(path.name) for path in plys]
+    names = {match[1].lower() if match else "" for match in matches}
+    numbers = {int(match[2]): path for match, path in zip(matches, plys, strict=True) if match}
+    if len(names) > 1 or len(numbers) < len(plys):
+        return None
+    ordered = sorted(numbers)
+    if re.split(r"[-_. ]", names.pop())[-1] in _PARTS:
+        missing = next((low + 1 for low, high in pairwise(ordered) if high > low + 1), None)
+        if missing is not None:
+            first, last = (numbers[ordered[place]].name for place in (0, -1))
+            problem = f"expected all parts from {first} to {last}, found no part with the number {missing}"
+            raise SceneError(folder, problem, "add the missing part, or name one of the files")
+    elif plys[0].parent.name == SCENES_PLACE or not _has_camera_each(plys, cameras):
+        return None
+    return None if any(map(_has_own_camera, plys)) else [numbers[number] for number in ordered]
+
+
+def _has_own_camera(path: Path) -> bool:
+    with suppress(SceneError):  # the reader of the part reports it
+        return read_sharp_camera(path) is not None
+    return False
+
+
+def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
+    """Return whether files have equally many Gaussians, and there is one camera for each file."""
+    if cameras is None or len({header_counts(path) for path in plys}) > 1:
+        return False
+    with suppress(SceneError):
+        return len(read_cameras(cameras)) == len(plys)
+    return False
+
+
+def named_ply(folder: Path) -> Path | None:
+    """Find the scene with a usual name in a folder; among trained scenes, the scene of the most steps. None without."""
+    for place in PLY_PLACES:
+        if (folder / place).is_file() and _is_scene(folder / place):
+            return folder / place
+    patterns = (*TRAINED_PLACES, *(["point_cloud_*.ply"] if folder.name == "ply" else []))
+    trained = {path: _STEPS.search(str(path)) for pattern in patterns for path in folder.glob(pattern)}
+    steps = {path: int(match[1]) for path, match in trained.items() if match is not None}
+    return next((path for path in sorted(steps, key=lambda path: -steps[path]) if _is_scene(path)), None)
+
+
+def other_plys(folder: Path) -> list[Path]:
+    """List the ``.ply`` files directly in a folder that may be scenes: no results of gsmerge, no point clouds.
+
+    If there are none, list the only file of another format. The exception is a web site, whose scene is a result.
+    """
+    plys = natural_order(folder.glob("[!.]*.ply"))
+    scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
+    packed = [] if scenes or (folder / HTML.site).exists() else [p for p in folder.glob("[!.]*") if p.suffix in _PACKED]
+    return packed if len(packed) == 1 and may_hold_gaussians(packed[0]) else scenes
+
+
+def _results_in(folder: Path) -> list[Path]:
+    plys = natural_order(folder.glob("[!.]*.ply"))[:_MAX_HEADERS]
+    return [path for path in plys if _RESULT.search(path.name) or header_content(path) == "result"]
+
+
+def _is_scene(path: Path) -> bool:
+    """Return whether a file may be a scene, because neither its name nor its header shows a result or a point cloud."""
+    is_other = path.name in _POINT_CLOUDS or _RESULT.search(path.name)
+    return not is_other and header_content(path) == "Gaussians"

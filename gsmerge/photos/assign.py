@@ -1,0 +1,333 @@
+"""Assign photos to views: find which photo shows which view, and in which orientation.
+
+File names propose a photo for each view. A comparison of the photo with the Gaussians of the view decides. A proposed
+photo is replaced or left out
+
+- if another photo or another orientation matches the view clearly better,
+- if it matches the view no better than wrong pairs match, or
+- if its parts lie farther from their places than the parts of the other proposed photos do.
+
+For all other views the photos with the highest scores are compared part by part. This tells neighbouring views apart,
+because their photos show the same things in different places.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from gsmerge.geometry.transforms import median
+from gsmerge.kernels.pictures import turn_picture
+from gsmerge.photos.offsets import NEAR_PIXELS, SIDE, TOLERANCE, PhotoOffsets, find_offsets
+from gsmerge.photos.pictures import ViewPictures
+from gsmerge.photos.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
+from gsmerge.runtime.threads import parallel_map
+
+SIGNIFICANT = 2.0  # standard deviations of noise; smaller scores and smaller differences of scores count as noise
+MAX_COMPARED = 4  # photos with the highest scores that are compared with a view part by part
+MIN_EXPLAINED = 0.5  # share of the variance of a view that a photo explains; above it, the photo matches the view
+MIN_CONTRAST = 1 / 255  # root mean square, the rounding of 8 bits; pictures with less contrast cannot be compared
+IMPOSSIBLE = 1e6  # cost of a pair whose shapes differ
+MIN_PER_TASK, MAX_TASKS = 8, 16  # photos per task, and number of tasks; each task reads the pictures of all views
+FIRST_PHOTOS = 256  # evenly spaced photos of a film that are compared first; their best neighbourhoods come next
+
+
+class Assignment(NamedTuple):
+    """The photo of a view, and its orientation, 0 to 7; see :func:`gsmerge.kernels.pictures.turn_picture`."""
+
+    photo: int
+    orientation: int
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Photos that may show the views of a scene."""
+
+    read: Callable[[int], np.ndarray]  # [h,w,3] photo as it is stored, sRGB in [0, 1]; may be reduced to SIDE pixels
+    count: int
+    tags: Sequence[int]  # orientation in each photo's EXIF tag, 0 to 7
+
+
+@dataclass(frozen=True, eq=False)
+class _Scores:
+    """Fisher's z of some photos in all views and orientations, in units of the noise of wrong pairs."""
+
+    photos: tuple[int, ...]
+    # [v,p,8]; NaN for views without Gaussians, and where an oriented photo is portrait but the views are landscape or
+    # vice versa
+    values: np.ndarray
+    correlations: np.ndarray  # [v,p,8]
+
+    def of(self, view: int, assignment: Assignment) -> float:
+        """Return the score of an assignment in a view; NaN where the shapes differ."""
+        return float(self.values[view, self.photos.index(assignment.photo), assignment.orientation])
+
+    def fits(self, assignment: Assignment) -> bool:
+        """Return True if the oriented photo has the shape, portrait or landscape, of the views."""
+        return bool(np.isfinite(self.values[:, self.photos.index(assignment.photo), assignment.orientation]).any())
+
+    def best(self) -> np.ndarray:
+        """Return the score ``[v,p]`` of each photo in its best orientation."""
+        return np.nan_to_num(self.values, nan=-np.inf).max(2)
+
+    def choose_orientation(self, view: int, photo: int, tag: int) -> int:
+        """Choose the orientation of a photo: as stored or as tagged, unless another one scores clearly higher."""
+        scores = np.nan_to_num(self.values[view, self.photos.index(photo)], nan=-np.inf)
+        likely = (orientation for orientation in (0, tag) if scores[orientation] > scores.max() - SIGNIFICANT)
+        return next(likely, int(scores.argmax()))
+
+
+class Assigner:
+    """Assigns photos to the views of a scene, and caches all comparisons.
+
+    ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side. Small pictures are compared
+    first, larger ones where the small ones do not decide.
+    """
+
+    def __init__(self, show: Callable[[int], ViewPictures], candidates: Candidates) -> None:
+        small = show(SIZES[-1])
+        self.candidates, self._show = candidates, show
+        self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
+        self._offsets = dict[tuple[int, Assignment], PhotoOffsets | None]()
+        self.has_contrast = self._comparer.measure_contrast() > MIN_CONTRAST  # [v] the view can be compared
+
+    @cached_property
+    def shown(self) -> ViewPictures:
+        """Pictures of the views, large enough to search for parts."""
+        return self._show(SIDE)
+
+    def score(self, photos: Iterable[int]) -> _Scores:
+        """Compare photos with all views."""
+        ids = tuple(dict.fromkeys(photos))
+        new = [photo for photo in ids if photo not in self._correlations]
+        task_size = max(MIN_PER_TASK, -(-len(new) // MAX_TASKS))
+
+        def compare(start: int) -> np.ndarray:
+            return self._comparer.correlate([self.candidates.read(photo) for photo in new[start : start + task_size]])
+
+        compared = parallel_map(compare, range(0, len(new), task_size))
+        self._correlations |= dict(zip(new, itertools.chain(*compared), strict=True))
+        correlations = np.stack([self._correlations[photo] for photo in ids], 1)
+        z = fisher_z(correlations)
+        middle, noise = measure_noise(z, self._comparer.least_noise)
+        return _Scores(ids, (z - middle[:, None, None]) / noise, correlations)
+
+    def compare(self, view: int, assignment: Assignment) -> float | None:
+        """Compare a photo with a view part by part.
+
+        Returns their similarity, at least 1, if the photo shows the view; 0 if it was taken from elsewhere; None if the
+        parts do not decide.
+        """
+        offsets = self.find_offsets(view, assignment)
+        if offsets is None or offsets.verdict is None:
+            return None
+        return 1 + max(offsets.similarity, 0.0) if offsets.verdict else 0.0
+
+    def find_offsets(self, view: int, assignment: Assignment) -> PhotoOffsets | None:
+        """Find the parts of a photo in the picture of a view; None if the picture is too small for parts."""
+        if (view, assignment) not in self._offsets:
+            photo = turn_picture(self.candidates.read(assignment.photo), assignment.orientation)
+            self._offsets[view, assignment] = find_offsets(self.shown, view, np.ascontiguousarray(photo))
+        return self._offsets[view, assignment]
+
+    def lies_elsewhere(self, view: int, assignments: Mapping[int, Assignment]) -> bool:
+        """Return True if the parts of a view's photo are displaced farther than the parts of the other views' photos.
+
+        The threshold is twice the median distance in the other views. Wrong depth displaces the drawn Gaussians of all
+        views, but by no more than ``NEAR_PIXELS``, the largest differences between the offsets of one view.
+        """
+        offsets = self.find_offsets(view, assignments[view])
+        if offsets is None or offsets.verdict is not False:
+            return False
+        other_pairs = [pair for pair in assignments.items() if pair[0] != view]
+        other_offsets = parallel_map(lambda pair: self.find_offsets(*pair), other_pairs)
+        distances = np.concatenate(
+            [np.zeros(0), *(view_offsets.distances for view_offsets in other_offsets if view_offsets)]
+        )
+        threshold = 2 * float(np.median(distances)) if len(distances) else 0.0
+        return replace(offsets, tolerance=TOLERANCE + min(threshold, NEAR_PIXELS)).verdict is False
+
+    def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
+        """Check the photos that names or their order propose for views.
+
+        Returns the assignment of each view, None where the proposed photo is rejected, and a list that is True where
+        the comparison confirms the photo. A photo is rejected
+
+        - if another orientation, or another photo that no other view needs, scores clearly higher in its view,
+        - if it scores no higher than wrong pairs do, or
+        - if its parts lie farther from their places than the parts of the other proposed photos do.
+
+        Noise of the drawings lowers the scores of all photos and moves their parts. The thresholds therefore follow
+        from the scores and parts of the proposed photos themselves.
+
+        Where names are ``exact``, a photo is confirmed if its score is high and no other assignment raises it. Other
+        photos are confirmed by their parts.
+        """
+        out, confirmed = list[Assignment | None]([None] * len(named)), [False] * len(named)
+        named_pairs = [(view, photo) for view, photo in enumerate(named) if photo is not None]
+        if not named_pairs:
+            return out, confirmed
+        scores = self.score(photo for _, photo in named_pairs)
+        proposed = {view: Assignment(photo, self._stored_or_tagged(scores, view, photo)) for view, photo in named_pairs}
+        columns = [scores.photos.index(photo) for _, photo in named_pairs]
+        best = scores.best()[np.ix_(list(proposed), columns)]  # of each proposed view with each proposed photo
+        own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)
+        matched = _match(best)
+        least = _least_score(own[self.has_contrast[list(proposed)]])
+        for row, (view, assignment) in enumerate(proposed.items()):
+            score, highest = own[row], max(best[row, row], best[row, matched[row]])
+            correlation = scores.correlations[view, columns[row], assignment.orientation]
+            matches = score > least or correlation**2 > MIN_EXPLAINED
+            matches = matches and score > highest - SIGNIFICANT
+            is_clear = score > MARGIN and score >= highest
+            if is_clear and exact:
+                out[view], confirmed[view] = assignment, True
+            elif matches or (not self.has_contrast[view] and scores.fits(assignment)):
+                parts = self.compare(view, assignment)
+                out[view] = None if self.lies_elsewhere(view, proposed) else assignment
+                confirmed[view] = bool(parts) or (is_clear and parts is None) or not self.has_contrast[view]
+        return out, confirmed
+
+    def match_together(self, assignments: Sequence[Assignment | None]) -> bool:
+        """Return True if assigned photos together match their views better than equally many wrong pairs would."""
+        scores = self.score(self._correlations)
+        own = [
+            scores.of(view, assignment)
+            for view, assignment in enumerate(assignments)
+            if assignment is not None and self.has_contrast[view]
+        ]
+        return not own or _exceed_noise(np.array(own))
+
+    def _stored_or_tagged(self, scores: _Scores, view: int, photo: int) -> int:
+        """Return the orientation of a photo's tag if it scores clearly higher than the stored orientation, else 0."""
+        tag = self.candidates.tags[photo]
+        stored, tagged = np.nan_to_num(scores.values[view, scores.photos.index(photo), [0, tag]], nan=-np.inf)
+        return tag if tagged > stored + SIGNIFICANT else 0
+
+    def search(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, Assignment]:
+        """Find which of ``photos`` show ``views``; the most similar photos are compared part by part."""
+        likely_by_view = self.list_likely(views, photos)
+        pairs = [(view, assignment) for view, likely in likely_by_view.items() for assignment in likely]
+        if not pairs:
+            return {}
+        scores = self.score(self._correlations)
+
+        def compare(pair: tuple[int, Assignment]) -> float:
+            similarity = self.compare(*pair)
+            if similarity is not None:
+                return similarity
+            score = scores.of(*pair)
+            return 1 - MARGIN / score if score > MARGIN else 0.0  # always below the similarity of parts
+
+        return _choose(pairs, parallel_map(compare, pairs))
+
+    def list_likely(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, list[Assignment]]:
+        """List the ``photos`` with the highest scores in each of ``views``.
+
+        Of many photos an evenly spaced sample is compared first, then the photos around the best of the sample.
+        """
+        if not views or not photos:
+            return {}
+        step, tags = -(-len(photos) // FIRST_PHOTOS), self.candidates.tags
+        compared = set(range(0, len(photos), step))  # indices into ``photos``
+        while True:
+            scores = self.score(photos[index] for index in sorted(compared))
+            best = scores.best()
+            columns = {view: np.argsort(-best[view], kind="stable")[:MAX_COMPARED] for view in views}
+            peaks = {photos.index(scores.photos[column]) for ids in columns.values() for column in ids}
+            neighbours = {peak + offset for peak in peaks for offset in range(1 - step, step)}
+            neighbours &= set(range(len(photos)))
+            if neighbours <= compared:
+                break
+            compared, step = compared | neighbours, 1
+
+        def list_assignments(view: int) -> list[Assignment]:
+            likely = [scores.photos[column] for column in columns[view] if np.isfinite(best[view, column])]
+            return [Assignment(photo, scores.choose_orientation(view, photo, tags[photo])) for photo in likely]
+
+        return {view: list_assignments(view) for view in views}
+
+
+def assign_photos(
+    show: Callable[[int], ViewPictures],
+    candidates: Candidates,
+    named: Sequence[int | None],
+    *,
+    exact: bool,
+    stored: Candidates | None = None,
+) -> list[Assignment | None]:
+    """Assign a photo to each view; None where no photo shows the view.
+
+    ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side. ``named`` is the photo that
+    names or order propose for each view, or None. If names are ``exact`` and most of them prove right, a view whose
+    name has no photo gets none, since each other photo carries the name of its own view. ``stored`` are the photos as
+    stored in their files, if ``candidates`` are resampled to the views.
+    """
+    assigner = Assigner(show, candidates)
+    out, confirmed = assigner.confirm(named, exact=exact)
+    num_assigned = sum(assignment is not None for assignment in out)
+    most_match = 2 * num_assigned > len(out) and assigner.match_together(out)
+    if exact and most_match:  # search only for the views whose proposed photo was rejected
+        unknown = [view for view, photo in enumerate(named) if photo is not None and out[view] is None]
+    else:
+        unknown = [view for view, is_confirmed in enumerate(confirmed) if not is_confirmed]
+    if not unknown:
+        return out
+    used = {assigned.photo for view, assigned in enumerate(out) if assigned is not None and view not in unknown}
+    if stored is not None:
+        assigner = Assigner(show, stored)
+    results = assigner.search(unknown, [photo for photo in range(candidates.count) if photo not in used])
+    for view in unknown:
+        out[view] = results.get(view) or (out[view] if most_match else None)
+    return out
+
+
+def _least_score(scores: np.ndarray) -> float:
+    """Return the least score of a right photo, from the scores ``[n]`` of all proposed photos.
+
+    If the proposed photos together are right, it is half their median, half-way from wrong pairs to right pairs.
+    """
+    return min(SIGNIFICANT, median(scores) / 2) if _exceed_noise(scores) else SIGNIFICANT
+
+
+def _exceed_noise(scores: np.ndarray) -> bool:
+    """Return True if the median of scores ``[n]`` is significantly above the median of equally many wrong pairs.
+
+    The median is used because a single score hardly moves it.
+    """
+    return bool(len(scores) and median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
+
+
+def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:
+    """Give each photo to one view so that the sum of the scores is largest."""
+    possible = [(*pair, score) for pair, score in zip(pairs, scores, strict=True) if score > 0]
+    if not possible:
+        return {}
+    views = sorted({view for view, _, _ in possible})
+    photos = sorted({assignment.photo for _, assignment, _ in possible})
+    gains, assignments = np.zeros((len(views), len(photos))), dict[tuple[int, int], Assignment]()
+    for view, assignment, score in possible:
+        gains[views.index(view), photos.index(assignment.photo)] = score
+        assignments[view, assignment.photo] = assignment
+    matched = ((view, photos[column]) for view, column in zip(views, _match(gains), strict=True) if column >= 0)
+    return {view: assignments[view, photo] for view, photo in matched if (view, photo) in assignments}
+
+
+def _match(scores: np.ndarray) -> np.ndarray:
+    """Choose a column for each row of ``scores [r,c]`` so that the sum is largest.
+
+    No column is chosen twice; -1 for a row without a column.
+    """
+    best, out = scores.argmax(1), np.full(len(scores), -1)
+    if len(set(best.tolist())) == len(best):  # the best columns differ, so no search is needed
+        return np.asarray(best)
+    from scipy.optimize import linear_sum_assignment  # here because it takes long to load
+
+    rows, columns = linear_sum_assignment(np.where(np.isfinite(scores), -scores, IMPOSSIBLE))
+    out[rows] = columns
+    return out

@@ -1,0 +1,172 @@
+"""Test whether a change of colours makes photos equal to what the Gaussians show.
+
+A change is a hypothesis with parameters: red and blue exchanged, a tone curve for each channel, or a linear map of
+colours. Pictures are cut into blocks, which are dealt into two halves like the squares of a chess board. The change of
+one half is fitted to the other half, so no block is scored by a change that was fitted to it. A change is accepted if
+it reduces the errors of blocks by more than their noise and by more than half. The error of a block is the error of its
+mean colour, because wrong depth displaces few Gaussians across a block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from gsmerge.kernels.matrices import matmul, solve
+from gsmerge.photos.pictures import Pairs
+from gsmerge.photos.scores import stands_out
+from gsmerge.runtime.threads import parallel_map
+
+BLOCKS = 12  # along the longer side
+SOLID = 0.2  # least opacity of a block that is compared; fainter blocks show only a few Gaussians
+LEVELS = 33  # number of quantiles of a tone curve
+STEP = 0.05  # change of middle grey by a third of a stop, the smallest exposure step of cameras
+VISIBLE = 0.01  # root mean square of differences that are just visible on plain surfaces
+RIDGE = 1e-6  # ridge of the least squares, relative to the mean square of colours; keeps maps of grey photos finite
+Change = Callable[[np.ndarray], np.ndarray]  # maps colours [...,3]
+Fit = Callable[[np.ndarray, np.ndarray, np.ndarray], Change]  # from colours [n,3] to targets [n,3], weights [n]
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Photos of v views and pictures of their Gaussians, as means of blocks."""
+
+    photos: np.ndarray  # [v,H,W,3]
+    pictures: np.ndarray  # [v,H,W,3] colours of the Gaussians
+    solid: np.ndarray  # [v,H,W] True where a block is opaque enough to be compared
+
+    def errors(self, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
+        """Return the mean difference ``[n]`` between photo and picture, for each block of some views; NaN if faint."""
+        return self.distances(self.pictures, views)
+
+    def distances(self, colors: np.ndarray, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
+        """Return the mean difference ``[n]`` between photos and ``colors [v,H,W,3]``, for each block; NaN if faint."""
+        differences = np.abs(self.photos - colors).mean(-1)
+        return np.where(self.solid, differences, np.nan)[views].reshape(-1)
+
+
+def is_visible(errors: np.ndarray) -> bool:
+    """Return True if errors of blocks ``[n]`` are visible."""
+    return _sum_squares(errors) > VISIBLE**2 * np.isfinite(errors).sum()
+
+
+def explains(before: np.ndarray, after: np.ndarray) -> bool:
+    """Return True if a change reduces the errors of blocks ``[n]`` significantly and halves their sum of squares."""
+    return stands_out(before - after) and _sum_squares(before) > 2 * _sum_squares(after)
+
+
+def _sum_squares(errors: np.ndarray) -> float:
+    return float(np.nansum(errors.astype(np.float64) ** 2))
+
+
+def cut_blocks(pairs: Pairs) -> Blocks:
+    """Average photos and pictures over blocks."""
+    small = pairs.shrink(BLOCKS)
+    return Blocks(small.photos, small.shown.pictures, small.shown.weights > SOLID)
+
+
+def fit_tones(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Fit a tone curve ``[3,256]`` that maps quantiles of ``colors`` to quantiles of ``targets``.
+
+    The curve is proportional at both ends. Wrong depth and noise hardly change quantiles.
+    """
+    return np.stack([_join_quantiles(colors[:, channel], targets[:, channel], weights) for channel in range(3)])
+
+
+def map_tones(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """Map the colours of a photo ``[...,3]`` in [0, 1] by a tone curve ``[3,256]``, one row per channel."""
+    levels = photo.astype(np.float32) * np.float32(255)
+    lower = np.clip(levels.astype(np.int64), 0, 254)
+    fraction, channel = levels - lower, np.arange(3)
+    return np.asarray(tones[channel, lower] * (1 - fraction) + tones[channel, lower + 1] * fraction)
+
+
+def fit_map(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Fit the linear map ``[4,3]`` of colours to targets by least squares; its last row is a constant."""
+    columns = np.concatenate([colors, np.ones((len(colors), 1))], 1).astype(np.float64)
+    weighted = columns * weights[:, None]
+    normal = matmul(weighted.T, columns) + RIDGE * len(colors) * np.eye(4)
+    return solve(normal, matmul(weighted.T, targets.astype(np.float64)))
+
+
+def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """Map the colours of a photo ``[...,3]`` by a matrix ``[4,3]``; float32."""
+    flat = photo.reshape(-1, 3).astype(np.float64)
+    return np.asarray((matmul(flat, matrix[:3]) + matrix[3]).reshape(photo.shape), np.float32)
+
+
+def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
+    """Return blocks of photos after a tone curve for each group of views; see :func:`_cross_fit`."""
+    toned = pairs.photos.copy()
+
+    def fit(group: Sequence[int]) -> None:
+        group_pairs = pairs[group]
+        shown = group_pairs.shown
+        toned[group] = _cross_fit(group_pairs.photos, shown.pictures, shown.weights, _tone_change)
+
+    parallel_map(fit, groups)
+    return cut_blocks(pairs.with_photos(toned))
+
+
+def map_blocks(blocks: Blocks) -> Blocks:
+    """Return blocks after a linear map of colours; see :func:`_cross_fit`."""
+    mapped = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _map_change)
+    return Blocks(mapped, blocks.pictures, blocks.solid)
+
+
+def plain_blocks(blocks: Blocks) -> Blocks:
+    """Return blocks of one colour, the mean colour of the Gaussians; see :func:`_cross_fit`."""
+    plain = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _plain_change)
+    return Blocks(plain, blocks.pictures, blocks.solid)
+
+
+def _tone_change(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Change:
+    return partial(map_tones, fit_tones(colors, targets, weights))
+
+
+def _map_change(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Change:
+    return partial(map_colors, fit_map(colors, targets, weights))
+
+
+def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Change:
+    mean = (targets * weights[:, None]).sum(0, dtype=np.float64) / max(float(weights.sum(dtype=np.float64)), 1e-9)
+    return partial(np.full_like, fill_value=mean)
+
+
+def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: Fit) -> np.ndarray:
+    """Change photos ``[v,h,w,3]`` by two-fold cross-fitting.
+
+    Each half of the blocks is changed by the fit to the other half.
+    """
+    out, side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
+    y, x = ((np.arange(size) / side).astype(int) for size in photos.shape[1:3])
+    black_squares = (y[:, None] + x) % 2 == 1  # of the chess board
+    for fold in (black_squares, ~black_squares):
+        colors, targets = photos[:, ~fold].reshape(-1, 3), pictures[:, ~fold].reshape(-1, 3)
+        change = fit(colors, targets, weights[:, ~fold].reshape(-1))
+        out[:, fold] = change(photos[:, fold])
+    return out
+
+
+def _join_quantiles(levels: np.ndarray, tones: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the curve ``[256]`` float32 from quantiles of ``levels`` to those of ``tones``; both ends are linear."""
+    used = weights > 0
+    if not used.any():
+        return np.linspace(0, 1, 256, dtype=np.float32)
+    x, y = (np.round(_weigh_quantiles(values[used], weights[used]), 6) for values in (levels, tones))
+    is_distinct = np.concatenate([[True], np.diff(x) > 1 / 255]) & (x > 0) & (x < 1)
+    x, y = x[is_distinct], np.maximum.accumulate(y[is_distinct].clip(0, 1))
+    end = min(1.0, max(y[-1], y[-1] / x[-1])) if len(x) else 1.0
+    curve = np.interp(np.arange(256) / 255, [0, *x, 1], [0, *y, end])
+    return np.round(curve, 6).astype(np.float32)
+
+
+def _weigh_quantiles(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return evenly spaced quantiles of weighted values."""
+    order = np.argsort(values, kind="stable")
+    sums = np.cumsum(weights[order], dtype=np.float64)
+    shares = (sums - weights[order] / 2) / sums[-1]
+    return np.interp((np.arange(LEVELS) + 0.5) / LEVELS, shares, values[order].astype(np.float64))

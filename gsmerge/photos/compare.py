@@ -1,0 +1,294 @@
+"""Scene -> the scene with photos that look like its Gaussians, without photos that do not show it.
+
+Photos with another tone (linear light, exposure or gamma) are corrected by a curve for each channel. Photos that do not
+show their views are left out, and all photos if they have another look, such as red and blue in the wrong order. If a
+pixel of a photo still differs from the Gaussians of this pixel, at any depth, something covers the scene there. Then
+the Gaussians' colours are used instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.geometry.transforms import sh0_to_rgb
+from gsmerge.kernels.pictures import convolve
+from gsmerge.photos.assign import Assigner, Candidates
+from gsmerge.photos.colors import (
+    STEP,
+    cut_blocks,
+    explains,
+    fit_map,
+    fit_tones,
+    is_visible,
+    map_blocks,
+    map_colors,
+    map_tones,
+    plain_blocks,
+    tone_blocks,
+)
+from gsmerge.photos.photo_change import PhotoChange, change_large
+from gsmerge.photos.pictures import SIDE, Pairs, ViewPictures, pair_photos, show_views
+from gsmerge.photos.row_colors import RowPicture, fill_gaps, picture_rows
+from gsmerge.photos.scores import stands_out
+from gsmerge.photos.views import camera_kinds
+from gsmerge.raster import render
+from gsmerge.raster.photos import row_pictures
+from gsmerge.runtime.record import choose, list_some, note
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.stages import Look
+from gsmerge.types import PicturedScene
+
+# Signed differences of single pixels are averaged over 5 x 5 pixels. Then a blur of 1.5 pixels, as by models, makes
+# 0.5 % of the pixels differ by a step.
+WINDOW = np.full(5, 1 / 5, np.float32)
+TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
+FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
+MIDDLE_GREY = 128  # level of 255 at which notes report the change of tone
+LEAST_PERCENT = 1  # of a photo; no note says that less of it differs
+STRAY_PHOTOS = "do not show what the Gaussians show"  # said of photos that are not used
+
+
+def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedScene, tuple[int, ...]]:
+    """Correct the photos of a canonical scene, and replace photos, or parts of them, that do not show it.
+
+    Returns the scene and the views whose photos show it. There are no such views if most photos do not show the scene,
+    or if the photos have another look. With ``look`` "photos" all photos count unchanged, with "scene" none counts. The
+    record gets notes and the choices ``photos_changed`` and ``photos_left_out``.
+    """
+    photo_views = scene.photo_views
+    if look != "auto" or not photo_views:
+        return scene, tuple(photo_views) if look != "scene" else ()
+    pairs = pair_photos(scene, scene.images)
+    matching = find_matching_views(scene, photo_views, list(scene.images), pairs.shown)
+    if _has_other_look(scene, pairs, matching or photo_views):
+        problem = "the scene has another look than its photos, so it keeps its own colours"
+        note(f"{problem}; --set look=photos gives it the look of the photos")
+        return scene, ()
+    stray = [view for view in photo_views if view not in matching]
+    if stray and not _leave_out(scene, stray, photo_views):
+        return scene, ()
+    tones = find_tones(pairs, matching)
+    if pairs.shown.drawn and not have_other_tones(scene, matching):
+        tones = [None] * len(pairs)
+    changes = [PhotoChange(curve) for curve in tones]
+    _note_tones(scene, changes, matching)
+    hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
+    if scene.has_own_pixels:
+        hidden, pictures = _find_hidden(scene, changes)
+        _note_hidden(scene, hidden, matching)
+    changed = [view for view in matching if hidden[view].any() or changes[view]]
+    if changed:
+        choose(photos_changed=[scene.names[view] for view in changed])
+    return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching)
+
+
+def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
+    """Find the tone curves ``[3,256]`` from photos to their Gaussians; None for a photo with the right tone.
+
+    Drawings have one curve for all photos. If no photo changes by at least a step, no curve counts, because models have
+    a tone of their own. A curve also has to work in the other direction, from Gaussians to photos. Otherwise the cause
+    is noise, which flattens the colours of the Gaussians.
+    """
+    curves, is_clear = list[np.ndarray | None]([None] * len(pairs)), False
+    stored, groups = cut_blocks(pairs), _group(pairs, views)
+    groups = [group for group in groups if is_visible(stored.errors(group))]
+    toned, back = tone_blocks(pairs, groups), tone_blocks(pairs.exchange(), groups)
+    for group in groups:
+        before = stored.errors(group)
+        if explains(before, toned.errors(group)) and stands_out(before - back.errors(group)):
+            is_clear |= bool(np.nanmedian(stored.distances(toned.photos, group)) > STEP)
+            colors, targets = (images[group].reshape(-1, 3) for images in (pairs.photos, pairs.shown.pictures))
+            curve = fit_tones(colors, targets, pairs.shown.weights[group].reshape(-1))
+            for view in group:
+                curves[view] = curve
+    return curves if is_clear else [None] * len(pairs)
+
+
+def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
+    """Return whether the base colours of all Gaussians have another tone than the photos of some views.
+
+    If depth is wrong, wrong Gaussians in front may set the tone of a drawing. The base colours of all Gaussians come
+    from the photos, even if other Gaussians hide them in drawings. So they show whether the tone really differs.
+    """
+    solid = np.flatnonzero(scene.gaussians.opacities > FAINT)
+    step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
+    counting = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
+    levels = np.concatenate([scene.images[view][counting[view]][::step] for view in views])
+    if not (len(solid) and len(levels)):
+        return True
+    rows = solid[np.linspace(0, len(solid) - 1, len(levels)).astype(np.int64)]
+    colors = sh0_to_rgb(scene.gaussians.sh0[rows, 0]).clip(0, 1)
+    curve = fit_tones(levels, colors, np.ones(len(levels), np.float32))
+    return bool(np.median(np.abs(map_tones(curve, levels) - levels).mean(1)) > STEP)
+
+
+def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
+    """Group the views by tone curve: one group if their pictures are drawings, because these show tones less exactly.
+
+    Otherwise each view is a group of its own.
+    """
+    return [list(views)] if pairs.shown.drawn else [[view] for view in views]
+
+
+def find_matching_views(
+    scene: PicturedScene, views: Sequence[int], photos: Sequence[np.ndarray], shown: ViewPictures
+) -> list[int]:
+    """Find the views whose ``photos [h,w,3]`` show them; see :mod:`gsmerge.photos.assign`.
+
+    There are none if all photos together fit no better than wrong pairs. Layers of one camera share one photo.
+    ``shown`` are small pictures of the Gaussians in all views; if they are drawings, they are reused.
+    """
+    kinds = camera_kinds(scene.cameras)
+    ids = sorted({kinds[view]: view for view in reversed(views)}.values())
+    candidates = Candidates(lambda photo: photos[ids[photo]], len(ids), [0] * len(ids))
+
+    def show(side: int) -> ViewPictures:
+        return (shown.shrink(side) if shown.drawn and side <= SIDE else show_views(scene, side))[ids]
+
+    assigner = Assigner(show, candidates)
+    confirmed_photos, _ = assigner.confirm(range(len(ids)), exact=True)
+    if not assigner.match_together(confirmed_photos):
+        return []
+    # views without contrast cannot be compared, so they count as matching
+    rows = zip(ids, confirmed_photos, assigner.has_contrast, strict=True)
+    matching = {kinds[view] for view, photo, has_contrast in rows if photo is not None or not has_contrast}
+    return [view for view in views if kinds[view] in matching]
+
+
+def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> bool:
+    """Return whether a linear map, but no tone curve, explains the difference between photos and Gaussians.
+
+    It may map photos to Gaussians, or Gaussians to photos, which are grey then. Photos of another scene are excluded:
+    one colour explains them as well as a map, or they do not show their views even after the map.
+    """
+    view_pairs = pairs[views]
+    if _is_mapped(view_pairs):
+        blocks = cut_blocks(view_pairs)
+        solid = blocks.solid
+        matrix = fit_map(blocks.photos[solid], blocks.pictures[solid], np.ones(solid.sum()))
+        mapped = [map_colors(matrix, photo).clip(0, 1) for photo in scene.images]
+        return bool(find_matching_views(scene, views, mapped, pairs.shown))
+    return _is_mapped(view_pairs.exchange()) and bool(
+        find_matching_views(scene, views, list(scene.images), pairs.shown)
+    )
+
+
+def _is_mapped(pairs: Pairs) -> bool:
+    """Return whether a linear map of the photos' colours explains the pictures better than tones or one colour do."""
+    stored = cut_blocks(pairs)
+    if not is_visible(stored.errors()):
+        return False
+    toned, mapped = tone_blocks(pairs, _group(pairs, range(len(pairs)))), map_blocks(stored)
+    simpler = toned, plain_blocks(stored)
+    return is_visible(toned.errors()) and all(explains(blocks.errors(), mapped.errors()) for blocks in simpler)
+
+
+def _leave_out(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence[int]) -> bool:
+    """Note which photos do not show the scene; return whether the other photos are used."""
+    names = [scene.names[view] for view in stray]
+    choose(photos_left_out=names)
+    are_few, listed = 2 * len(stray) <= len(photo_views), list_some(names)
+    result = f" and are not used: {listed}"
+    if not are_few:
+        result = f", so no photo is used: {listed}; check their names and order"
+    note(f"{len(stray)} of {len(photo_views)} photos {STRAY_PHOTOS}{result}")
+    return are_few
+
+
+def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Sequence[int]) -> None:
+    """Note by which factors the tones of photos change."""
+    toned = {view: changes[view].tones for view in views if changes[view].tones is not None}
+    if not toned:
+        return
+    factors = [
+        float(curve[:, MIDDLE_GREY].mean()) / (MIDDLE_GREY / 255) for curve in toned.values() if curve is not None
+    ]
+    low, high = min(factors), max(factors)
+    factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
+    note(
+        f"{len(toned)} of {len(views)} photos have another tone than their Gaussians (exposure, gamma or linear"
+        f" light), which is corrected; middle grey times {factor}: {list_some([scene.names[view] for view in toned])}"
+    )
+
+
+def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int]) -> None:
+    """Note in which of some photos something covers the scene, at the pixels ``hidden [v,h,w]``."""
+    with_hidden = [view for view in views if hidden[view].any()]
+    max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
+    if max_percent < LEAST_PERCENT:
+        return
+    note(
+        f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians"
+        f" (up to {max_percent:.0f} % of a photo; perhaps a mask, a mark, a finger, another look or camera):"
+        " the Gaussians' colours are used there, with"
+        f" --set look=scene everywhere: {list_some([scene.names[view] for view in with_hidden])}"
+    )
+
+
+def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[np.ndarray, np.ndarray]:
+    """Find the pixels ``[v,h,w]`` at which changed photos differ from their rows; also return the rows' pictures.
+
+    A pixel without a row takes the result of the nearest pixel with one. If the rows' base colours differ, each view's
+    own Gaussians are drawn from its camera, which takes longer; a photo that looks like the drawing does not differ.
+    """
+
+    def differ(view: int, picture: np.ndarray, known: np.ndarray) -> np.ndarray:
+        weights = known.astype(np.float32)
+        difference = (changes[view](scene.images[view]) - picture) * weights[..., None]
+        red, green, blue = np.moveaxis(np.abs(convolve(difference, WINDOW, WINDOW)), -1, 0)
+        differs = known & ((red + green + blue) / 3 > STEP * convolve(weights, WINDOW, WINDOW))
+        return fill_gaps(differs[..., None], known)[..., 0]
+
+    def differ_drawn(views: np.ndarray, rows: RowPicture) -> None:
+        for view in views:
+            known = shown[view] & inside[view] & rows.known  # not where only neighbours' Gaussians reach into a pixel
+            pictures[view] = rows.picture
+            hidden[view] = differ(view, rows.picture, known) & differ(view, rows.drawing, known)
+
+    inside = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
+    pictures, pixels = row_pictures(scene), scene.get_pixels()
+    shown = pixels.shown
+    known = shown & (scene.gaussians.opacities[pixels.fronts] > FAINT) & inside
+    hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
+    picture_rows(scene, differ_drawn, np.asarray((hidden | ~inside).any((1, 2))))
+    return hidden, pictures
+
+
+def _change_photos(
+    scene: PicturedScene,
+    changes: Sequence[PhotoChange],
+    hidden: np.ndarray,
+    pictures: np.ndarray | None,
+    views: Sequence[int],
+) -> PicturedScene:
+    """Change photos at both sizes; use the Gaussians' colours at ``hidden [v,h,w]`` pixels, and in all other views.
+
+    The photos of ``views`` show the scene. The Gaussians' colours are ``pictures [v,h,w,3]``; None: drawings. In views
+    without a photo these colours count as a photo.
+    """
+    other_views = sorted({*range(len(scene))} - {*views})
+    hidden[other_views] = True
+    if scene.masks is not None:
+        hidden |= ~scene.masks
+        absent = sorted({*other_views} - {*scene.photo_views})
+        if absent:
+            masks = scene.masks.copy()
+            masks[absent] = True
+            scene = replace(scene, masks=None if masks.all() else masks)
+    with_hidden = np.flatnonzero(hidden.any((1, 2)))
+    if len(with_hidden) == 0 and not any(changes):
+        return scene
+    changes = list(changes)
+    if len(with_hidden):
+        if pictures is None:
+            covers = render(scene.gaussians, scene.cameras[with_hidden]).images.clip(0, 1)
+        else:
+            covers = pictures[with_hidden]
+        for view, colors in zip(with_hidden, covers, strict=True):
+            changes[view] = replace(changes[view], cover=hidden[view], colors=colors)
+    images = np.stack([change(photo) for change, photo in zip(changes, scene.images, strict=True)])
+    large = None if scene.large_photos is None else change_large(scene.large_photos, changes)
+    return replace(scene, images=images, large_photos=large)

@@ -1,0 +1,212 @@
+"""Read masks of photos from files and from transparency: which pixels count, and with which weight."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.image_names import match_masks
+from gsmerge.io.photo_files import Size, decode_alpha, decode_levels, decode_small, image_size, same_shape
+from gsmerge.io.scene_files import SceneFiles
+from gsmerge.kernels.pictures import turn_picture
+from gsmerge.photos.offsets import SIDE
+from gsmerge.photos.scene_photos import ScenePhotos
+from gsmerge.runtime.record import list_some
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import PROTECTED, Cameras
+
+_MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
+_WHITE = np.uint8(255)
+_ROUNDING = 1 / 255  # mean difference of two pictures or channels that rounding to 8 bits may cause
+_MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
+
+
+@dataclass(frozen=True, eq=False)
+class Masks:
+    """Masks and weights of the pixels of v views."""
+
+    counts: np.ndarray | None = None  # [v,h,w] bool: whether a pixel counts; None: all pixels count
+    importance: np.ndarray | None = None  # [v,h,w] float32: weight of a pixel in a fit; None: all weights are 1
+
+    def __getitem__(self, views: Sequence[int]) -> Masks:
+        """Return the masks of some views."""
+        return Masks(*(None if values is None else values[views] for values in (self.counts, self.importance)))
+
+
+NO_MASKS = Masks()
+
+
+@dataclass(frozen=True, eq=False)
+class MaskFiles:
+    """The mask files of v photos, and how a picture of a photo is cropped to its view."""
+
+    photos: tuple[Path | None, ...]  # files of the photos; empty if the photos are inside another file
+    turns: Sequence[int]  # quarter turns from each photo's file to its upright picture
+    masks: Sequence[Path | None]  # dark where a photo does not count
+    protecting: Sequence[Path | None]  # white where a photo counts more
+    stored: Size  # of upright photos
+    cut: Callable[[int, np.ndarray], np.ndarray]  # view, picture of the size ``stored`` -> the part that the view shows
+    cameras: Cameras
+
+    def read(self, view: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Read which pixels ``[h,w]`` of a view count, and their weights; None: all pixels count, with weight 1."""
+        photo, counts, importance = self.photos[view] if self.photos else None, None, None
+        alpha = None if photo is None else decode_alpha(photo)
+        if alpha is not None:
+            counts = self._reduce(turn_picture(alpha, self.turns[view]) * _WHITE, view) > _MASK_LEVEL
+        if (mask := self.masks[view]) is not None:
+            levels = self._read_levels(mask, view)
+            is_light = levels > _WHITE // 2
+            light = self._reduce(is_light * _WHITE, view)
+            counts = (light > _MASK_LEVEL) if counts is None else counts & (light > _MASK_LEVEL)
+            if (levels[is_light] < _WHITE).any():  # the weight is the mean over the pixels that count
+                importance = self._reduce(levels * is_light, view) / np.maximum(light, np.float32(1))
+        if (mask := self.protecting[view]) is not None:
+            share = self._reduce(self._read_levels(mask, view), view) / np.float32(_WHITE)
+            importance = (1 if importance is None else importance) * (1 + (PROTECTED - 1) * share)
+        return counts, importance
+
+    def _read_levels(self, mask: Path, view: int) -> np.ndarray:
+        """Read the brightness of a mask, and turn it upright if it has the orientation of the photo's file."""
+        photo = self.photos[view] if self.photos else None
+        whole, turns = decode_levels(mask, photo), self.turns[view]
+        if photo is not None and turns % 2 and same_shape(image_size(photo), whole.shape[1::-1]):
+            whole = turn_picture(whole, turns)
+        if not same_shape(self.stored, whole.shape[1::-1]):
+            (width, height), (columns, lines) = self.stored, whole.shape[1::-1]
+            problem = (
+                f"expected a mask with the aspect ratio of its photo, {width} x {height}, found {columns} x {lines}"
+            )
+            raise SceneError(mask, problem, "save it with the aspect ratio of the upright photo")
+        return whole
+
+    def _reduce(self, levels: np.ndarray, view: int) -> np.ndarray:
+        """Average the brightness of a mask over each pixel of the view."""
+        whole = cv2.resize(levels, self.stored, interpolation=cv2.INTER_NEAREST)
+        shown = self.cut(view, whole[..., None].repeat(3, -1))[..., 0]
+        size = self.cameras.width, self.cameras.height
+        return np.asarray(cv2.resize(shown, size, interpolation=cv2.INTER_AREA))
+
+
+def read_masks(
+    files: SceneFiles,
+    names: Sequence[str],
+    photos: ScenePhotos,
+    stored: Size,
+    cut: Callable[[int, np.ndarray], np.ndarray],
+    cameras: Cameras,
+) -> tuple[Masks, list[str]]:
+    """Read the masks of photos whose upright size is ``stored``; return them and notes.
+
+    ``names``: names of the views, used if their photos are inside another file. ``cut``: as in :class:`MaskFiles`.
+    """
+    paths = photos.paths
+    if paths:
+        names = [path.as_posix() for path in paths if path is not None]
+    masks, notes = _match_masks(files, names)
+    protecting: Sequence[Path | None] = [None] * len(names)
+    if files.protect is not None:
+        protecting, unused = match_masks(files.protect, names, "--protect")
+        notes += unused
+    if paths:
+        index_of_photo = {path: i for i, path in enumerate(path for path in paths if path is not None)}
+
+        def spread(pictures: Sequence[Path | None]) -> list[Path | None]:
+            """Spread the pictures of existing photos over all views; None for a view without a photo."""
+            return [None if path is None else pictures[index_of_photo[path]] for path in paths]
+
+        masks, protecting = spread(masks), spread(protecting)
+    turns = photos.turns or (0,) * len(masks)
+    mask_files = MaskFiles(tuple(paths), turns, masks, protecting, stored, cut, cameras)
+    counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
+    shape = cameras.height, cameras.width
+    result = Masks(_stack(counts, True, shape), _stack(importance, np.float32(1), shape))
+    if files.protect is not None:
+        notes.append(_describe_protected(result.importance, protecting))
+    for option, pictures in (("masks", masks), ("protect", protecting)):
+        notes += _doubt_masks(option, pictures, paths)
+    return result, notes
+
+
+def _doubt_masks(option: str, masks: Sequence[Path | None], photos: Sequence[Path | None]) -> list[str]:
+    """Note masks that seem to be photos, because they have colours or show the same as their photos."""
+
+    def is_photo(view: int) -> bool:
+        mask = masks[view]
+        if mask is None:
+            return False
+        picture = decode_small(mask, SIDE)
+        if np.ptp(picture, axis=-1).mean() > _ROUNDING:
+            return True
+        photo = photos[view] if photos else None
+        shown = None if photo is None else decode_small(photo, SIDE)
+        return shown is not None and shown.shape == picture.shape and bool(np.abs(shown - picture).mean() <= _ROUNDING)
+
+    answers = parallel_map(is_photo, range(len(masks)))
+    doubtful = [mask.name for mask, answer in zip(masks, answers, strict=True) if mask is not None and answer]
+    if not doubtful:
+        return []
+    expected = "white where a photo is protected" if option == "protect" else "dark where photos do not count"
+    count = sum(mask is not None for mask in masks)
+    problem = f"{len(doubtful)} of {count} pictures look like photos, {list_some(doubtful)}"
+    return [f"{option}: {problem}; expected grey pictures, {expected}"]
+
+
+def _stack(
+    values: Sequence[np.ndarray | None], default: bool | np.float32, shape: tuple[int, int]
+) -> np.ndarray | None:
+    """Stack values ``[h,w]`` of views to ``[v,h,w]``, with the ``default`` for None; None if all are the default."""
+    if all(view_values is None or (view_values == default).all() for view_values in values):
+        return None
+    return np.stack([np.full(shape, default) if view_values is None else view_values for view_values in values])
+
+
+def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | None]) -> str:
+    """Describe which share of the pixels is protected, and how many photos have a picture that protects pixels."""
+    count = sum(mask is not None for mask in masks)
+    max_weight = 1.0 if importance is None else float(importance.max())
+    photos = f"{count} photo{'' if count == 1 else 's'} of {len(masks)}"
+    if importance is None or max_weight <= 1:
+        return f"protect: the pictures of {photos} have no white pixel, so no pixel gets a higher weight"
+    has_white = max_weight >= PROTECTED / 2
+    threshold = PROTECTED / 2 if has_white else (1 + max_weight) / 2
+    share = 100 * float((importance >= threshold).mean())
+    weight = f"{PROTECTED:g}" if has_white else f"at most {max_weight:.2g}"
+    return f"protect: {share:.1f} % of the photos' pixels have a weight of {weight}, by the pictures of {photos}"
+
+
+def _match_masks(files: SceneFiles, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
+    """Find the masks of photos; return them and notes. SceneError if a folder that the user named has none of them."""
+    if files.masks is None:
+        return [None] * len(names), []
+    try:
+        return match_masks(files.masks, names)
+    except SceneError as error:
+        if "masks" in files.named:
+            raise
+        return [None] * len(names), [f"masks are not used: {error.path}: {error.problem}"]
+
+
+def check_masks(masks: Masks, files: SceneFiles) -> tuple[Masks, list[str]]:
+    """Note the share of the photos that masks leave out; SceneError if named masks leave out nearly everything."""
+    counts = masks.counts
+    if counts is None:
+        return masks, []
+    share = float(1 - counts.mean())
+    if share < _MAX_MASKED:
+        count = int((~counts.all((1, 2))).sum())
+        pixels = f"{100 * share:.0f} % of the photos' pixels"
+        return masks, [f"masks leave out {pixels}; {count} of {len(counts)} photos have a mask"]
+    if files.masks is None:
+        return NO_MASKS, [
+            "the photos' transparency is not used as a mask, since they are transparent nearly everywhere"
+        ]
+    problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % of their pixels dark"
+    if "masks" not in files.named:
+        return NO_MASKS, [f"masks are not used: {files.masks}: {problem}; name them with --masks"]
+    raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")

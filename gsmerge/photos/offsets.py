@@ -1,0 +1,121 @@
+"""Search for the parts of a photo in the picture of a view, to decide whether the photo was taken from there.
+
+Pictures of neighbouring views are similar as a whole, but their parts are displaced. Each part of the view's picture is
+searched for around the same place in the photo. The offset of a part counts if its best place stands out from all other
+places. Parts of the view's own photo have no offset. Parts of a neighbour's photo have one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gsmerge.photos.pictures import ViewPictures
+from gsmerge.photos.scores import MARGIN, NORMAL, find_contrast, fisher_z
+from gsmerge.raster.photos import shrink_pictures
+
+SIDE = 256  # pixels of the longer side of both pictures
+PART, REACH = 32, 12  # pixels: side of a part, and largest offset that is searched
+AROUND = 30  # pixels: side of the square whose mean is subtracted to get contrast
+TAPS = 64  # size of the Fourier transforms, at least PART + 2 REACH
+TOLERANCE = 1  # pixels: offsets up to it count as zero, since the peak of a correlation is that wide
+NEAR_PIXELS = 3  # pixels by which offsets of parts may differ in one common motion, because their depths differ
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoOffsets:
+    """Offsets of the parts of a photo whose best place stands out from all other places."""
+
+    offsets: np.ndarray  # [n,2] pixels down and right
+    similarity: float  # mean of Fisher's z of all parts at offset zero
+    tolerance: float = TOLERANCE  # pixels: offsets up to it count as zero
+
+    @cached_property
+    def distances(self) -> np.ndarray:
+        """Length ``[n]`` of the offsets in pixels, as the larger of both components."""
+        return np.abs(self.offsets).max(1)
+
+    @property
+    def num_in_place(self) -> int:
+        """Number of parts in their places."""
+        return int((self.distances <= self.tolerance).sum())
+
+    @property
+    def num_moved_together(self) -> int:
+        """Largest number of displaced parts with about the same offset."""
+        displaced = self.offsets[self.distances > self.tolerance]
+        return int((np.abs(displaced[:, None] - displaced).max(2) <= NEAR_PIXELS).sum(1).max(initial=0))
+
+    @property
+    def verdict(self) -> bool | None:
+        """True if the photo was taken from the view, False if it was taken from elsewhere, None in doubt.
+
+        The photo was taken from the view if more parts are in place than moved together, and from elsewhere if fewer
+        are. The difference must exceed the standard error of a fair coin.
+        """
+        in_place, together = self.num_in_place, self.num_moved_together
+        return in_place > together if abs(in_place - together) > np.sqrt(in_place + together) else None
+
+
+def correlate_parts(shown: ViewPictures, view: int, photo: np.ndarray) -> np.ndarray:
+    """Return Fisher's z ``[n]`` of the correlations between parts of a photo and the same parts of a view."""
+    weight = shown.weights[view]
+    height, width = weight.shape
+    photo_contrast = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
+    view_contrast = find_contrast(shown.pictures[view], weight, AROUND)
+    starts = [np.arange(0, side, max(1, PART * max(height, width) // SIDE)) for side in (height, width)]
+
+    def add(values: np.ndarray) -> np.ndarray:
+        """Add weighted values ``[h,w,3]`` over each part."""
+        return np.add.reduceat(np.add.reduceat(values.sum(-1) * weight, starts[0], 0), starts[1], 1).reshape(-1)
+
+    squares = add(photo_contrast * photo_contrast) * add(view_contrast * view_contrast)
+    return fisher_z(add(photo_contrast * view_contrast) / np.sqrt(np.maximum(squares, 1e-12)))
+
+
+def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffsets | None:
+    """Search for the parts of a view in an upright ``photo [h,w,3]``, which may have any size.
+
+    ``shown`` are pictures of the views with up to :data:`SIDE` pixels on the longer side. None if they are too small to
+    be cut into parts.
+    """
+    weight = shown.weights[view]
+    height, width = weight.shape
+    if min(height, width) < 2 * PART:
+        return None
+    photo_contrast = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
+    view_contrast = find_contrast(shown.pictures[view], weight, AROUND)
+    padded = np.pad(photo_contrast, ((REACH, REACH), (REACH, REACH), (0, 0)))
+    scores = _score_offsets(padded, view_contrast, weight)
+    middle = np.median(scores, 1)
+    noise = NORMAL * np.median(np.abs(scores - middle[:, None]), 1) + 1e-6
+    stand_out = scores.max(1) - middle > MARGIN * noise
+    offsets = np.stack(np.divmod(scores[stand_out].argmax(1), 2 * REACH + 1), 1) - REACH
+    return PhotoOffsets(offsets, float(scores[:, scores.shape[1] // 2].mean()))
+
+
+def _score_offsets(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return Fisher's z ``[n,(2 REACH + 1)^2]`` of each part of a picture at every offset in a padded photo."""
+    rows, columns = (np.arange(0, side - PART + 1, PART) + (side % PART) // 2 for side in weight.shape)
+    corners = [(top, left) for top in rows for left in columns]
+
+    def transform_parts(array: np.ndarray, side: int) -> np.ndarray:
+        """Cut out the parts, squares of ``side`` pixels, and return their Fourier transforms."""
+        parts = np.stack([array[top : top + side, left : left + side] for top, left in corners])
+        return np.fft.rfft2(np.moveaxis(parts, -1, 1) if parts.ndim == 4 else parts, (TAPS, TAPS))
+
+    shifts = slice(0, 2 * REACH + 1)
+    searched = PART + 2 * REACH  # side of the square of the photo in which a part is searched
+    weighted, photo_squares = picture * weight[..., None], (photo * photo).sum(-1)
+    spectrum = transform_parts(photo, searched) * transform_parts(weighted, PART).conj()
+    products = np.fft.irfft2(spectrum.sum(1))[:, shifts, shifts]
+    photo_spectrum = transform_parts(photo_squares, searched) * transform_parts(weight, PART).conj()
+    photo_energies = np.fft.irfft2(photo_spectrum)[:, shifts, shifts]
+    picture_squares = (weighted * picture).sum(-1)
+    picture_energies = np.stack([
+        picture_squares[top : top + PART, left : left + PART].sum() for top, left in corners
+    ])  # fmt: skip
+    lengths = np.sqrt(np.maximum(photo_energies, 1e-9) * np.maximum(picture_energies, 1e-9)[:, None, None])
+    return fisher_z(products / lengths).reshape(len(corners), -1)

@@ -1,0 +1,56 @@
+"""Changes that make a photo look like its Gaussians, applied at every size at which it is read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from gsmerge.photos.colors import map_tones
+from gsmerge.types import LargePhotos
+
+CLIPPED = 0.985  # a pixel may be clipped from this level on
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoChange:
+    """Changes of one photo, in this order."""
+
+    tones: np.ndarray | None = None  # [3,256] float32, new value of each level of each channel
+    cover: np.ndarray | None = None  # [h,w] bool, pixels that get `colors`
+    colors: np.ndarray | None = None  # [h,w,3] sRGB in [0, 1]
+
+    def __bool__(self) -> bool:
+        """Return whether the photo changes at all."""
+        return self.tones is not None or self.cover is not None
+
+    def __call__(self, photo: np.ndarray) -> np.ndarray:
+        """Change a photo ``[h,w,3]`` in [0, 1], at the size of the cover or a larger one; float32."""
+        if self.tones is not None:
+            photo = map_tones(self.tones, photo)
+        if self.cover is not None and self.colors is not None:
+            cover, colors = self.cover, self.colors
+            if cover.shape != photo.shape[:2]:
+                cover, colors = _enlarge(cover, photo.shape) > 0, _enlarge(colors, photo.shape)
+            photo = np.where(cover[..., None], colors, photo)
+        return np.ascontiguousarray(photo, np.float32)
+
+
+def _enlarge(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Enlarge a picture in [0, 1] as integers, which OpenCV resizes to the same values on every processor."""
+    levels = np.rint(255 * picture.astype(np.float32).clip(0, 1)).astype(np.uint8)
+    return np.asarray(cv2.resize(levels, shape[1::-1], interpolation=cv2.INTER_LINEAR) / np.float32(255))
+
+
+def change_large(large: LargePhotos, changes: Sequence[PhotoChange]) -> LargePhotos:
+    """Return larger photos that are changed whenever they are read."""
+
+    def read(view: int) -> np.ndarray:
+        photo = large.read(large.ids[view])
+        if not changes[view]:
+            return photo
+        return np.asarray(np.rint(255 * changes[view](photo / np.float32(255)).clip(0, 1)), np.uint8)
+
+    return replace(large, ids=tuple(range(len(changes))), read=read)

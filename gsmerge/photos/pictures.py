@@ -1,0 +1,147 @@
+"""Make small pictures of what Gaussians show from cameras, to compare them with photos.
+
+Transparency is divided out, so faint or sparse Gaussians have the colours of solid ones. The opacity of a pixel is its
+weight. Photos are averaged with the same weights, so pixels without Gaussians count in neither photos nor pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.geometry.frame import Frame, canonicalise
+from gsmerge.geometry.transforms import sh0_to_rgb
+from gsmerge.raster.images import thin_out
+from gsmerge.raster.photos import LEAST_OPACITY, blank_photos, photo_errors, photos_of, pixel_weights, shrink_pictures
+from gsmerge.types import Cameras, Gaussians, Scene
+
+SAMPLE_GAUSSIANS = 1 << 17  # Gaussians that are drawn
+SIDE = 96  # pixels of the longer side of pictures that photos are compared with
+_CANONICAL = Frame(np.zeros(3), 1.0)  # of canonical scenes
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPictures:
+    """Small pictures of what the Gaussians show in v views."""
+
+    pictures: np.ndarray  # [v,h,w,3] colours in [0, 1], transparency divided out; 0 where nothing is shown
+    weights: np.ndarray  # [v,h,w] opacity, in [0, 1]; 0 outside masks
+    drawn: bool  # True for renders, which wrong depth displaces; False for colours of each view's own Gaussians
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def __getitem__(self, views: Sequence[int]) -> ViewPictures:
+        """Return the pictures of some views."""
+        ids = list(views)
+        return replace(self, pictures=self.pictures[ids], weights=self.weights[ids])
+
+    def shrink(self, side: int) -> ViewPictures:
+        """Average the pictures by their weights to at most ``side`` pixels of the longer side."""
+        width, height = fit_size(self.weights.shape[2:0:-1], side)
+        weights = shrink_pictures(self.weights, width, height)
+        return replace(self, pictures=average(self.pictures, self.weights, weights), weights=weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Photos of v views, and pictures of the Gaussians from the same cameras."""
+
+    photos: np.ndarray  # [v,h,w,3] at the size of the pictures
+    shown: ViewPictures
+
+    def __len__(self) -> int:
+        return len(self.photos)
+
+    def shrink(self, side: int) -> Pairs:
+        """Average photos and pictures by opacity to at most ``side`` pixels of the longer side."""
+        small = self.shown.shrink(side)
+        return Pairs(average(self.photos, self.shown.weights, small.weights), small)
+
+    def exchange(self) -> Pairs:
+        """Return pairs with photos and pictures exchanged."""
+        return Pairs(self.shown.pictures, replace(self.shown, pictures=self.photos))
+
+    def with_photos(self, photos: np.ndarray) -> Pairs:
+        """Return a copy with other photos."""
+        return replace(self, photos=photos)
+
+    def __getitem__(self, views: Sequence[int]) -> Pairs:
+        """Return the pairs of some views."""
+        ids = list(views)
+        return Pairs(self.photos[ids], self.shown[ids])
+
+
+def fit_size(size: Sequence[int], side: int) -> tuple[int, int]:
+    """Return width and height in the proportion of ``size``, with at most ``side`` pixels on the longer side."""
+    reduction = max(1.0, max(size) / side)
+    width, height = (max(1, round(full_side / reduction)) for full_side in size)
+    return width, height
+
+
+def average(pictures: np.ndarray, weights: np.ndarray, small: np.ndarray) -> np.ndarray:
+    """Average pictures ``[v,h,w,3]`` by ``weights [v,h,w]`` to the size of ``small [v,H,W]``, the reduced weights."""
+    sums = shrink_pictures((pictures * weights[..., None]).astype(np.float32), small.shape[2], small.shape[1])
+    return np.asarray(
+        np.divide(sums, small[..., None], out=np.zeros_like(sums), where=small[..., None] > LEAST_OPACITY)
+    )
+
+
+def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
+    """Pair ``photos [v,h,w,3]`` with pictures of the Gaussians of a canonical scene."""
+    shown = show_views(scene, frame=_CANONICAL)
+    if scene.has_own_pixels:
+        return Pairs(photos[_sample_grid(scene.cameras, SIDE)], shown)
+    reduction = max(1.0, max(scene.cameras.width, scene.cameras.height) / SIDE)
+    return Pairs(photos_of(photos, scene.cameras, reduction).images, shown)
+
+
+def show_views(
+    scene: Scene, side: int | None = None, samples: int = SAMPLE_GAUSSIANS, frame: Frame | None = None
+) -> ViewPictures:
+    """Make small pictures of what a scene's Gaussians show in its views.
+
+    Where each view has Gaussians of its own, a picture has the colours of a sample of them. Otherwise it is a render of
+    ``samples`` Gaussians of the scene. ``frame`` is the canonical frame of the scene, if known.
+    """
+    if scene.has_own_pixels:
+        return _show_rows(scene, SIDE) if side is None else _show_rows(scene, 2 * side).shrink(side)
+    sampled = Scene(thin_out(scene.gaussians, samples), scene.cameras, None, None, scene.names)
+    canonical, _ = canonicalise(sampled, frame)
+    shown = draw_views(canonical.gaussians, canonical.cameras, side or SIDE)
+    inside = pixel_weights(scene.masks, *shown.weights.shape[2:0:-1])
+    return shown if inside is None else replace(shown, weights=shown.weights * (inside == 1))
+
+
+def _show_rows(scene: Scene, side: int) -> ViewPictures:
+    """Return the colours of the views' own Gaussians on a regular grid of at most ``side`` pixels per side."""
+    grid = _sample_grid(scene.cameras, side)
+    rows = scene.get_pixels().fronts[grid]
+    weights = np.where(rows >= 0, scene.gaussians.opacities[rows], 0)
+    if scene.masks is not None:
+        weights = weights * scene.masks[grid]
+    colors = sh0_to_rgb(scene.gaussians.sh0[rows, 0]).clip(0, 1)
+    return ViewPictures(colors, weights.astype(np.float32), drawn=False)
+
+
+def _sample_grid(cameras: Cameras, side: int) -> tuple[slice, slice, slice]:
+    """Return slices of views, lines and columns that sample pixels in equal steps, at most ``side`` per line.
+
+    The first sample is in the middle of the first step.
+    """
+    step = -(-max(cameras.width, cameras.height) // side)
+    pixels = slice(min(step // 2, cameras.width - 1, cameras.height - 1), None, step)
+    return slice(None), pixels, pixels
+
+
+def draw_views(gaussians: Gaussians, cameras: Cameras, side: int) -> ViewPictures:
+    """Render canonical Gaussians, and divide their transparency out."""
+    blank = blank_photos(cameras, max(1.0, max(cameras.width, cameras.height) / side))
+    renders = photo_errors(gaussians, blank, lambda _, image, transmittance: (image, 1 - transmittance))
+    images, opacities = map(np.stack, zip(*renders, strict=True))
+    pictures = np.divide(
+        images, opacities[..., None], out=np.zeros_like(images), where=opacities[..., None] > LEAST_OPACITY
+    )
+    return ViewPictures(pictures.clip(0, 1), opacities, drawn=True)

@@ -1,0 +1,542 @@
+"""Find and read the photos of a scene's views.
+
+Names and folders propose a file for each camera. The content of the photos decides which photo belongs to which view,
+and how it is turned (:mod:`gsmerge.photos.assign`).
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+
+from gsmerge.cameras import ESTIMATED
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile, select_views
+from gsmerge.io.cameras.embedded import SHARP
+from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.cameras.table import CHUNK
+from gsmerge.io.first_bytes import CONVERT
+from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_order, propose_images
+from gsmerge.io.photo_files import (
+    PhotoArrays,
+    Size,
+    decode_image,
+    decode_images,
+    decode_small,
+    decode_views,
+    image_size,
+    orientation_turn,
+    same_shape,
+)
+from gsmerge.io.scene_files import SceneFiles
+from gsmerge.kernels.pictures import is_mirrored, turn_picture
+from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
+from gsmerge.photos.grid_fit import GridFit, choose_fit, list_fits
+from gsmerge.photos.offsets import SIDE, correlate_parts
+from gsmerge.photos.pictures import ViewPictures, show_views
+from gsmerge.photos.scores import stands_out
+from gsmerge.raster.photos import row_pictures
+from gsmerge.runtime.record import list_some
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Scene
+
+_MODEL_FOLDERS = ("0", "sparse", "colmap")  # names of COLMAP models in a scene's folder, which may also be one itself
+UNNAMED = "view 0"  # name of the first camera if the format, or rows without cameras, have no names
+_REDUCED = "images_*"  # folders of smaller copies; their names end with the factor
+SEEN_PLACE = "images_resized"  # WorldMirror writes its input photos there; tall photos in "images" are squeezed
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePhotos:
+    """The photos of c cameras, of one size, and their files."""
+
+    pictures: PhotoArrays = ()  # [h,w,3] uint8, black for a camera without a photo; empty without photos
+    paths: tuple[Path | None, ...] = ()  # None for a camera without a photo; empty if the photos are inside a file
+    turns: tuple[int, ...] = ()  # how each file is turned; see gsmerge.kernels.pictures.turn_picture
+    notes: tuple[str, ...] = ()  # how the photos were chosen, one sentence each
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    @property
+    def absent(self) -> list[int]:
+        """Cameras without a photo."""
+        return [view for view, path in enumerate(self.paths) if path is None]
+
+    @property
+    def file_size(self) -> Size | None:
+        """Most frequent size of turned photos in their files, of two the larger one; None if they are in no files."""
+        sizes = [_turned_size(path, turn) for path, turn in zip(self.paths, self.turns, strict=True) if path]
+        return max(set(sizes), key=lambda size: (sizes.count(size), size[0] * size[1])) if sizes else None
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Files of photos, and which of them the names of c cameras propose."""
+
+    folder: Path
+    pool: tuple[Path, ...]
+    named: tuple[int | None, ...]  # for each camera, the index of its file in the pool; None without a proposed file
+    exact: bool  # True: names propose the files; False: their order does
+    faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None without a reason
+
+    @cached_property
+    def tags(self) -> Sequence[int]:
+        """For each file of the pool, the turn by its orientation tag."""
+        return _Tags(self.pool)
+
+    @property
+    def choice(self) -> list[Assignment | None]:
+        """The proposed file of each camera, not turned."""
+        return [None if photo is None else Assignment(photo, 0) for photo in self.named]
+
+    def without_views(self, cameras: Sequence[int]) -> Proposal:
+        """Return a copy with faults for ``cameras`` whose views have no Gaussians, and so no photos."""
+        faults = list(self.faults)
+        for camera in cameras:
+            photo = self.named[camera]
+            which = f"view {camera}" if photo is None else _inside(self.pool[photo], self)
+            faults[camera] = f"{which}: its camera is unknown, since no Gaussian belongs to it"
+        return replace(self, faults=tuple(faults))
+
+    def without_broken(self) -> Proposal | None:
+        """Return a copy without the proposed files that cannot be decoded; None if all or none can be decoded."""
+        named = [None if photo is None else self.pool[photo] for photo in self.named]
+        sound = _drop_unreadable(replace(self, named=()), named, decode=True)
+        return None if len(sound.pool) == len(self.pool) or not any(sound.choice) else sound
+
+
+def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | None:
+    """Propose the photo file of every camera by its name; None if there are no files of photos.
+
+    Files that cannot be read are left out.
+    """
+    names = camera_file.names
+    if files.images is None and "images" not in files.named:
+        folder, pool, named = _find_near_cameras(files, camera_file)
+    elif files.images is not None and files.images.is_dir():
+        folder, pool = files.images, list_images(files.images)
+        named = propose_images(folder, pool, names, _count_pixels)
+    else:
+        return None
+    exact = any(named) and camera_file.source != ESTIMATED
+    if not any(named) and len(pool) == len(names):
+        named = list(pool)
+    if not pool:
+        return None
+    faults = tuple(
+        _describe_missing(folder, name) if exact and path is None else None
+        for name, path in zip(names, named, strict=True)
+    )
+    return _drop_unreadable(Proposal(folder, tuple(pool), (), exact, faults), named)
+
+
+def _find_near_cameras(files: SceneFiles, camera_file: CameraFile) -> tuple[Path, list[Path], list[Path | None]]:
+    """Find photos near the camera file: the files that it names, smaller copies of them, or files beside the ``.ply``.
+
+    Returns their folder, all files, and the file that belongs to each camera by its name; None without.
+    """
+    path, names = Path(camera_file.path), camera_file.names
+    folder = path if path.is_dir() and path.name not in _MODEL_FOLDERS else path.parent
+    named = [find_image(folder, name, path, option=files.photo_option) for name in names]
+    pool = list(dict.fromkeys(path for path in named if path is not None))
+    if not pool:
+        pool, named = _find_reduced(folder, names)
+        named = named or [None] * len(names)
+    is_nameless = all(name.removeprefix("view ").isdecimal() for name in names)
+    if not pool and is_nameless:
+        folder, pool = files.ply.parent, images_beside(files.ply)  # AnySplat writes its Gaussians among the photos
+    return folder, pool, named
+
+
+def _find_reduced(folder: Path, names: Sequence[str]) -> tuple[list[Path], list[Path | None]]:
+    """Find photos in the first folder of smaller copies, ``images_2`` and so on, that has any with these names."""
+    reduced = [place for place in folder.glob(_REDUCED) if place.name.rpartition("_")[2].isdecimal() and place.is_dir()]
+    for place in natural_order(reduced):
+        pool = list_images(place)
+        named = propose_images(place, pool, names, _count_pixels)
+        if any(named):
+            return pool, named
+    return [], []
+
+
+def _describe_missing(folder: Path, name: str) -> str:
+    """Say that a file does not exist, and name a file of the same stem whose format is not read."""
+    inner, unread = PurePath(name), set[str]()
+    for place in {folder, folder if inner.is_absolute() or ".." in inner.parts else folder / inner.parent}:
+        with suppress(OSError, ValueError):
+            unread |= {file for file in os.listdir(place) if PurePath(file).stem == inner.stem}
+    unread = {file for file in unread if PurePath(file).suffix.lower() not in IMAGE_SUFFIXES}
+    shown = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner
+    if not unread:
+        return f"{shown}: no such file"
+    return f"{shown}: no such file, and the format of {min(unread)} is not read; {CONVERT}"
+
+
+def _drop_unreadable(proposal: Proposal, named: Sequence[Path | None], *, decode: bool = False) -> Proposal:
+    """Return a proposal of the ``named`` file of each camera, without unreadable files.
+
+    Their headers are read, and with ``decode`` also their pixels. An unreadable file leaves the pool, and becomes a
+    fault of its cameras.
+    """
+    paths = list(dict.fromkeys(path for path in named if path is not None))
+    faults = parallel_map(lambda path: _find_fault(path, decode=decode), paths)
+    broken = {path: fault for path, fault in zip(paths, faults, strict=True) if fault is not None}
+    camera_faults = tuple(
+        f"{_inside(path, proposal)}: {broken[path]}" if path in broken and path is not None else before
+        for path, before in zip(named, proposal.faults or [None] * len(named), strict=True)
+    )
+    pool = tuple(path for path in proposal.pool if path not in broken)
+    ids = {path: number for number, path in enumerate(pool)}
+    photos = tuple(None if path is None else ids.get(path) for path in named)
+    return replace(proposal, pool=pool, named=photos, faults=camera_faults)
+
+
+def _count_pixels(path: Path) -> int:
+    """Count the pixels of an image file; 0 where it cannot be read."""
+    try:
+        width, height = image_size(path)
+    except SceneError:
+        return 0
+    return width * height
+
+
+def _find_fault(path: Path, *, decode: bool = False) -> str | None:
+    """Return why the header of an image file, or with ``decode`` its pixels, cannot be read; None if they can."""
+    try:
+        size = image_size(path)
+        if decode:
+            decode_image(path, size)
+    except SceneError as error:
+        return f"{error.problem}; {CONVERT}" if error.remedy == CONVERT else error.problem
+    return None
+
+
+def images_beside(ply: Path) -> list[Path]:
+    """List the images directly in the folder of a ``.ply``, in the order of :func:`list_images`."""
+    named = (path for path in ply.parent.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    return natural_order(path for path in named if path.is_file())
+
+
+def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
+    """Read the photos of all cameras by their names, or from a file that holds them; empty without photos.
+
+    SceneError if a photo is missing or cannot be read, or if two differ in size.
+    """
+    proposal = propose_photos(files, camera_file)
+    if proposal is None:
+        if files.images is not None and files.images.is_dir():
+            raise SceneError(files.images, f"expected photos of {len(camera_file)} cameras, found none")
+        return photos_inside(files, camera_file)
+    if None in proposal.named:
+        if files.images is None:
+            return ()
+        view = proposal.named.index(None)
+        reason = proposal.faults[view] or f"{camera_file.names[view]}: no such file"
+        raise SceneError(proposal.folder, f"expected a photo for each of {len(camera_file)} cameras, found {reason}")
+    return decode_images([proposal.pool[photo] for photo in proposal.named if photo is not None])
+
+
+def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
+    """Read the photos inside a file; empty if the scene has no file with photos."""
+    if files.images is None or files.images.is_dir():
+        return ()
+    same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
+    stored = (camera_file if same_file else read_cameras(files.images, scene=files.ply.stem)).images
+    may_lack = same_file and files.images.suffix == CHUNK and not len(stored)
+    if not may_lack and len(stored) != len(camera_file):
+        raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {len(stored)}")
+    return stored
+
+
+def read_photos(
+    proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile, notes: Sequence[str] = ()
+) -> ScenePhotos:
+    """Read the chosen photo of each camera, turned, and resized to the size of most photos.
+
+    Photos of SHARP are resized to the size of their camera. SceneError if a photo cannot be read, or if its aspect
+    ratio differs from most photos.
+    """
+    paths = tuple(None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen)
+    turns = tuple(0 if assignment is None else assignment.orientation for assignment in chosen)
+    size = ScenePhotos((), paths, turns).file_size
+    if size is None:
+        return ScenePhotos()
+    if camera_file.source == SHARP:
+        size = int(camera_file.widths[0]), int(camera_file.heights[0])
+    for path, turn in zip(paths, turns, strict=True):
+        if path is not None and camera_file.source != SHARP and not same_shape(_turned_size(path, turn), size):
+            width, height = _turned_size(path, turn)
+            problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
+            raise SceneError(proposal.folder, problem)
+    return ScenePhotos(decode_views(paths, turns, size), paths, turns, tuple(notes))
+
+
+def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:
+    """Leave out photos that do not have the aspect ratio of most photos, and their views if the cameras have neither.
+
+    Returns the cameras and the photos of all other views, and a note on the views that are left out. None if that is
+    not possible, because there are no photos, all have one aspect ratio, or a single view would remain.
+    """
+    paths = [None if photo is None else proposal.pool[photo] for photo in proposal.named]
+    if not any(paths):
+        return None
+    camera_sizes = list(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True))
+    sizes = [size if path is None else image_size(path) for path, size in zip(paths, camera_sizes, strict=True)]
+    photo_sizes = Counter(size for size, path in zip(sizes, paths, strict=True) if path is not None)
+    (width, height), _ = photo_sizes.most_common(1)[0]
+    # a size of 1 pixel means that the size is unknown
+    has_shape = [min(size) <= 1 or same_shape(size, (width, height)) for size in sizes]
+    camera_fits = [min(size) > 1 and same_shape(size, (width, height)) for size in camera_sizes]
+    used = [view for view in range(len(sizes)) if has_shape[view] or camera_fits[view]]
+    unused = [view for view in range(len(sizes)) if view not in used]
+    if all(has_shape) or len(used) == 1:
+        return None
+    shape = f"the aspect ratio of {width} x {height}"
+    names = list_some([f"{camera_file.names[view]} ({sizes[view][0]} x {sizes[view][1]})" for view in unused])
+    note = f"{len(unused)} of {len(sizes)} views are left out, since they do not have {shape}: {names}"
+    other_paths = {path for path, fits in zip(paths, has_shape, strict=True) if not fits}
+    faults = [
+        proposal.faults[view]
+        if has_shape[view]
+        else f"{camera_file.names[view]}: {sizes[view][0]} x {sizes[view][1]}, not {shape}"
+        for view in used
+    ]
+    pool = tuple(path for path in proposal.pool if path not in other_paths)
+    fewer = replace(proposal, pool=pool, named=(), faults=tuple(faults))
+    named = [paths[view] if has_shape[view] else None for view in used]
+    return select_views(camera_file, used), _drop_unreadable(fewer, named), [note] if unused else []
+
+
+def _turned_size(path: Path, turn: int) -> Size:
+    """Read the size of a photo after a turn."""
+    width, height = image_size(path)
+    return (height, width) if turn % 2 else (width, height)
+
+
+class _Tags(Sequence[int]):
+    """The turns by the orientation tags of files; a tag is read once, when it is asked for."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths, self._turns = paths, dict[int, int]()
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __getitem__(self, photo: Any) -> Any:
+        if photo not in self._turns:
+            self._turns[photo] = orientation_turn(self._paths[photo])
+        return self._turns[photo]
+
+
+def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
+    """Make candidates of the files: small versions, resized and cropped to the pixels of a grid by ``fit``."""
+
+    def read(photo: int) -> np.ndarray:
+        try:
+            small = decode_small(proposal.pool[photo], SIDE)
+        except SceneError:  # an unreadable photo is black and fits no view
+            small = np.zeros((SIDE, SIDE, 3), np.float32)
+        return small if fit is None else fit.cut(small)
+
+    return Candidates(read, len(proposal.pool), proposal.tags)
+
+
+def assign_to_views(
+    scene: Scene,
+    cameras: Sequence[int],
+    proposal: Proposal,
+    *,
+    read: bool,
+    guessed: Sequence[int] = (),
+    fit: GridFit | None = None,
+) -> list[Assignment | None]:
+    """Assign files to the views of a scene, each with its camera; see :func:`gsmerge.photos.assign.assign_photos`.
+
+    Args:
+        scene: The scene; its photos are those that names propose if ``read``.
+        cameras: The camera of each view. Cameras without a view keep their proposed file.
+        proposal: The files.
+        read: The scene has the proposed photos. Otherwise files are read small.
+        guessed: Cameras that get no photo.
+        fit: How files are resized and cropped to the pixels of a grid.
+
+    Returns:
+        The file of each camera with its turn; None without a photo.
+    """
+    views = [list(cameras).index(camera) for camera in dict.fromkeys(cameras)]  # layers of a camera have one photo
+    named = [proposal.named[cameras[view]] for view in views]
+    stored, images = _list_candidates(proposal, fit), scene.images
+    candidates = stored
+    if read and images is not None:
+        view_of_photo = {photo: view for view, photo in zip(views, named, strict=True) if photo is not None}
+        candidates = replace(stored, read=lambda photo: images[view_of_photo[photo]])
+
+    masks = None if scene.masks is None else scene.masks | ~scene.masks.any((1, 2), keepdims=True)
+
+    def show(side: int) -> ViewPictures:
+        return show_views(replace(scene, masks=masks), side)[views]
+
+    assigned = assign_photos(show, candidates, named, exact=proposal.exact, stored=stored)
+    chosen = proposal.choice
+    for view, assignment in zip(views, assigned, strict=True):
+        chosen[cameras[view]] = assignment
+    return [None if camera in guessed else assignment for camera, assignment in enumerate(chosen)]
+
+
+def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
+    """List the views without Gaussians if cameras were estimated, since the cameras of these views are guesses."""
+    if camera_file.source != ESTIMATED or scene.pixels is None:
+        return []
+    return np.flatnonzero(~scene.pixels.shown.any((1, 2))).tolist()
+
+
+def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
+    """Find how the photos that show a scene's views were resized and cropped to the grid of its rows."""
+    simple, *other_fits = list_fits((scene.cameras.width, scene.cameras.height))
+    views = range(len(scene))
+    shown, chosen = show_views(scene, SIDE), list[np.ndarray | None]()
+    assigner = Assigner(partial(show_views, scene), _list_candidates(proposal, None))
+    for view, likely in assigner.list_likely(views, range(len(proposal.pool))).items():
+        photos = [turn_picture(assigner.candidates.read(photo), turn) for photo, turn in likely]
+        scores = [float(correlate_parts(shown, view, simple.cut(photo)).mean()) for photo in photos]
+        chosen.append(photos[int(np.argmax(scores))] if photos else None)
+    return choose_fit(shown, chosen, (simple, *other_fits)) if any(photo is not None for photo in chosen) else simple
+
+
+def shows_better(scene: Scene, other: Scene) -> bool:
+    """Return whether the photos of ``scene`` match its Gaussians better than the photos of ``other`` match its own."""
+    if len(scene) != len(other):
+        return False
+    scores = list[np.ndarray]()
+    for scored in (scene, other):
+        shown, images = show_views(scored, SIDE), scored.images
+        assert images is not None
+        scores.append(np.concatenate([correlate_parts(shown, view, images[view]) for view in range(len(scored))]))
+    return stands_out(scores[0] - scores[1])
+
+
+def name_by_photos(
+    camera_file: CameraFile, proposal: Proposal, chosen: Sequence[Assignment | None], fit: GridFit | None
+) -> CameraFile:
+    """Name estimated cameras by the photos of their views; set their ``photo_map`` to the fit of the photos."""
+    if camera_file.source != ESTIMATED:
+        return camera_file
+    files = [None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen]
+    names = [
+        name if file is None else _inside(file, proposal) for name, file in zip(camera_file.names, files, strict=True)
+    ]
+    turns = [0 if assignment is None else assignment.orientation for assignment in chosen]
+    size = ScenePhotos((), tuple(files), tuple(turns)).file_size
+    named = replace(camera_file, names=tuple(names))
+    return named if fit is None or size is None else fit.cameras(named, size)
+
+
+def _inside(path: Path, proposal: Proposal) -> str:
+    """Return the path of a file inside the folder of photos, or its name."""
+    folder = proposal.folder
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
+
+
+def describe_assignment(
+    proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile
+) -> tuple[list[str], list[str]]:
+    """Describe where the assignment of photos differs from their names; return notes, and notes on missing photos."""
+    count, notes = len(chosen), list[str]()
+    changes: dict[str, list[str]] = {"turned": [], "mirrored": []}
+    for assignment in chosen:
+        if assignment is not None and assignment.orientation != (tag := proposal.tags[assignment.photo]):
+            kind = "turned" if is_mirrored(assignment.orientation) == is_mirrored(tag) else "mirrored"
+            changes[kind].append(_inside(proposal.pool[assignment.photo], proposal))
+    for kind, files in changes.items():
+        if files:
+            names = list_some(files)
+            notes.append(f"{len(files)} of {count} photos are {kind} relative to their orientation tags: {names}")
+    moved = [
+        f"photo {_inside(proposal.pool[assignment.photo], proposal)} for view {camera_file.names[view]}"
+        for view, assignment in enumerate(chosen)
+        if assignment is not None and assignment.photo != proposal.named[view]
+    ]
+    if moved:
+        names = "names" if proposal.exact else "their order"
+        notes.append(f"photos are matched with views by their content, not by {names}: {list_some(moved)}")
+    notes += _describe_spare(proposal, chosen)
+    missing = [view for view, assignment in enumerate(chosen) if assignment is None]
+    if not missing:
+        return notes, []
+    reasons = [_explain(proposal, view, camera_file.names[view]) for view in missing]
+    return notes, [f"photos of {len(missing)} of {count} views are left out: {list_some(reasons, '; ')}"]
+
+
+def _explain(proposal: Proposal, view: int, name: str) -> str:
+    """Say why a camera has no photo."""
+    fault = proposal.faults[view]
+    if fault is not None:
+        return fault
+    photo = proposal.named[view]
+    if photo is None:
+        return f"{name}: no photo shows this view"
+    return f"{_inside(proposal.pool[photo], proposal)}: shows something else than its camera"
+
+
+def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None]) -> list[str]:
+    """Note photos without a camera in the folders of the used photos, if they are fewer than the used photos."""
+    used = [proposal.pool[assignment.photo] for assignment in chosen if assignment is not None]
+    named = [proposal.pool[photo] for photo in proposal.named if photo is not None]
+    folders, stems = {path.parent for path in used}, {path.stem for path in (*used, *named)}
+    spare = [path for path in proposal.pool if path.parent in folders and path.stem not in stems]
+    if not proposal.exact or not 0 < len(spare) < len(used):
+        return []
+    which = list_some([_inside(path, proposal) for path in spare])
+    return [f"photos without a camera are not used, {len(spare)} of {len(spare) + len(used)}: {which}"]
+
+
+def describe_unused(proposal: Proposal, camera_file: CameraFile) -> str:
+    """Note that none of the photos is used, and why."""
+    verb = "not used" if camera_file.source == ESTIMATED else "left out"
+    return f"the photos in {proposal.folder} are {verb}: {_describe_mismatch(proposal, camera_file)}"
+
+
+def refuse_photos(
+    files: SceneFiles, proposal: Proposal, camera_file: CameraFile, cause: SceneError | None
+) -> SceneError | None:
+    """Return the error that no photo shows any view; None if the photos may be left out.
+
+    ``cause``: why photos and cameras do not fit. The files that the caller named are at fault, not those beside them.
+    """
+    is_of_cameras = cause is not None and cause.path == camera_file.path and "cameras" not in files.named
+    if "images" not in files.named or not (cause is None or is_of_cameras):
+        return cause
+    return SceneError(proposal.folder, _describe_mismatch(proposal, camera_file), "name their folder with --images")
+
+
+def _describe_mismatch(proposal: Proposal, camera_file: CameraFile) -> str:
+    """Say that no photo shows any view, and which photos are missing."""
+    views = f"the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
+    faults = [fault for fault in proposal.faults if fault is not None]
+    reasons = f" ({list_some(faults, '; ')})" if faults else ""
+    return f"expected photos of {views}, found none that shows one of them{reasons}"
+
+
+def without_photo(scene: Scene, views: Sequence[int]) -> Scene:
+    """Return a scene whose ``views`` have no photo: renders of its Gaussians replace them, and no pixel counts."""
+    if not views or scene.images is None:
+        return scene
+    images, ids = scene.images.copy(), list(views)
+    shape = len(scene), scene.cameras.height, scene.cameras.width
+    masks = np.ones(shape, bool) if scene.masks is None else scene.masks.copy()
+    masks[ids] = False
+    images[ids] = (
+        row_pictures(scene)[ids]
+        if scene.has_own_pixels
+        else show_views(replace(scene, masks=None), max(shape))[ids].pictures
+    )
+    return replace(scene, images=images, masks=masks)

@@ -1,0 +1,170 @@
+"""Score the similarity of photos and pictures, in units of the noise of wrong pairs.
+
+Two pictures are compared by the correlation of their local contrast at two sizes. Exposure, white balance and soft
+colours hardly change it. Fisher's z of the correlation has the same spread for all values. Nearly all pairs are wrong,
+so the median absolute deviation of all z is the noise of wrong pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gsmerge.geometry.transforms import median
+from gsmerge.kernels.elementary import log
+from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.pictures import ORIENTATIONS, blur, turn_back
+from gsmerge.photos.pictures import ViewPictures, fit_size
+from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
+
+SIZES = (24, 64)  # pixels of the longer side at which pictures are compared
+AROUND = 6  # side of the picture in standard deviations of the local mean
+REACH = 2  # standard deviations at which the local mean is cut off
+MARGIN = 5.0  # standard deviations of noise by which evidence must exceed the noise
+NORMAL = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
+CLOSEST = 0.999  # larger correlations are clipped to it
+
+
+def fisher_z(correlations: np.ndarray) -> np.ndarray:
+    """Return Fisher's z, the inverse hyperbolic tangent of correlations."""
+    clipped = correlations.clip(-CLOSEST, CLOSEST)
+    return np.asarray(0.5 * log((1 + clipped) / (1 - clipped)))
+
+
+def find_contrast(picture: np.ndarray, weight: np.ndarray | None = None, side: int | None = None) -> np.ndarray:
+    """Subtract the local mean from the colours of a picture ``[h,w,3]``.
+
+    The local mean is a Gaussian blur with a standard deviation of a sixth of ``side``, by default of the longer side of
+    the picture. ``weight [h,w]`` are weights of the pixels, by default 1.
+    """
+    weight = np.ones(picture.shape[:2], np.float32) if weight is None else weight
+    sigma = (side or max(picture.shape[:2])) / AROUND
+    sums = blur(np.dstack([picture * weight[..., None], weight]), sigma, round(REACH * 2 * sigma) | 1)
+    return np.asarray(picture - sums[..., :3] / np.maximum(sums[..., 3:], np.float32(LEAST_OPACITY)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Filters:
+    """Contrast of the views at one size, in each orientation that a stored photo may have."""
+
+    size: tuple[int, int]  # width and height of the photos that are multiplied with the filters
+    orientations: tuple[int, ...]  # t of those photos
+    products: np.ndarray  # [v·t,h·w·3] weight times contrast, normalised to length 1
+    weights: np.ndarray  # [v·t,h·w]
+    lengths: np.ndarray  # [v] of the products before they were normalised
+
+
+class Comparer:
+    """Correlate any number of photos, in all orientations, with the pictures of the views of a scene."""
+
+    def __init__(self, shown: ViewPictures) -> None:
+        self.views = len(shown)
+        self._small = small = [shown.shrink(side) for side in SIZES]
+        width, height = small[0].weights.shape[2:0:-1]
+        self._portrait, self._square = height > width, height == width
+        self.least_noise = 1 / np.sqrt(width * height)  # of Fisher's z, if all pixels are independent
+        self._empty = small[0].weights.max((1, 2)) < LEAST_OPACITY  # views without Gaussians
+
+    @cached_property
+    def _upright(self) -> list[_Filters]:
+        """Filters at each size for photos that are stored upright or upside down."""
+        return [_make_filters(shown, (0, 2)) for shown in self._small]
+
+    @cached_property
+    def _sideways(self) -> list[_Filters]:
+        """Filters at each size for photos that are stored on their side."""
+        return [_make_filters(shown, (1, 3)) for shown in self._small]
+
+    def measure_contrast(self) -> np.ndarray:
+        """Return the root mean square contrast ``[v]`` of each view, over the pixels that show Gaussians."""
+        weight = self._small[-1].weights.sum((1, 2), dtype=np.float64)
+        return np.asarray(self._upright[-1].lengths / np.sqrt(3 * np.maximum(weight, 1.0)))
+
+    def correlate(self, photos: Sequence[np.ndarray]) -> np.ndarray:
+        """Return correlations ``[p,v,8]`` of stored photos in each orientation with each view, averaged over the sizes.
+
+        A photo ``[h,w,3]`` is resized to the shape of the views. NaN where an oriented photo is portrait and the views
+        are landscape or vice versa, and for views without Gaussians.
+        """
+        out = np.full((len(photos), self.views, ORIENTATIONS), np.nan)
+        small = [shrink_pictures(photo[None], *fit_size(photo.shape[1::-1], SIZES[-1]))[0] for photo in photos]
+        shapes = np.array([photo.shape for photo in photos]).reshape(-1, 3)
+        square, portrait = shapes[:, 0] == shapes[:, 1], shapes[:, 0] > shapes[:, 1]
+        upright = self._square | square | (portrait == self._portrait)
+        sideways = self._square | square | (portrait != self._portrait)
+        for is_upright, fits in ((True, upright), (False, sideways)):
+            ids = np.flatnonzero(fits)
+            if len(ids):
+                filters = self._upright if is_upright else self._sideways
+                fitting = [small[photo] for photo in ids]
+                scores = np.mean([_correlate(fitting, size_filters) for size_filters in filters], 0)
+                orientations = np.array(filters[0].orientations)
+                out[np.ix_(ids, np.arange(self.views), orientations)] = scores.reshape(len(ids), self.views, -1)
+        out[:, self._empty] = np.nan
+        return out
+
+
+def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
+    """Make filters for photos that are stored turned by one of ``quarters``, quarter turns, plain or mirrored."""
+    orientations = tuple(quarter + mirrored for mirrored in (0, ORIENTATIONS // 2) for quarter in quarters)
+    products, weights, lengths = [], [], []
+    for picture, weight in zip(small.pictures, small.weights, strict=True):
+        weighted = find_contrast(picture, weight) * weight[..., None]
+        squares = weighted * weighted / np.maximum(weight, LEAST_OPACITY)[..., None]
+        length = float(np.sqrt(squares.sum(dtype=np.float64)))
+        weighted = weighted / max(length, 1e-9)
+        lengths.append(length)
+        products += [turn_back(weighted, orientation).reshape(-1) for orientation in orientations]
+        weights += [turn_back(weight, orientation).reshape(-1) for orientation in orientations]
+    height, width = turn_back(small.weights[0], orientations[0]).shape
+    return _Filters((width, height), orientations, np.stack(products), np.stack(weights), np.array(lengths))
+
+
+def _correlate(photos: Sequence[np.ndarray], filters: _Filters) -> np.ndarray:
+    """Correlate the contrast of photos with filters in all their orientations, ``[p,v·t]``."""
+    contrast = np.stack([find_contrast(shrink_pictures(photo[None], *filters.size)[0]) for photo in photos])
+    products = matmul(filters.products, contrast.reshape(len(photos), -1).T)
+    squares = matmul(filters.weights, (contrast * contrast).sum(-1).reshape(len(photos), -1).T)
+    return np.asarray(products / np.sqrt(np.maximum(squares, 1e-12))).T
+
+
+def measure_noise(z_scores: np.ndarray, least: float) -> tuple[np.ndarray, float]:
+    """Return the median ``[v]`` of each view's scores ``[v,...]``, and the standard deviation of all scores about it.
+
+    Both are robust and ignore NaN. ``least`` is the smallest standard deviation that is returned.
+    """
+    flat = z_scores.reshape(len(z_scores), -1)
+    middle = np.array([_median_of_known(scores) for scores in flat], flat.dtype)
+    return middle, max(NORMAL * _median_of_known(np.abs(flat - middle[:, None]).reshape(-1)), least)
+
+
+def _median_of_known(scores: np.ndarray) -> float:
+    """Return the median of ``scores [n]`` that are not NaN; 0 without any, as for views without Gaussians."""
+    known = scores[~np.isnan(scores)]
+    return median(known) if len(known) else 0.0
+
+
+def signed_ranks(gains: np.ndarray) -> float:
+    """Return the sum of the signed ranks of gains ``[n]`` in standard deviations (Wilcoxon 1945).
+
+    Ranks do not depend on the distribution of the gains, so a few large gains do not decide. Gains of 0 and NaN are
+    left out. Returns 0 if no gain remains.
+    """
+    gains = gains[np.isfinite(gains) & (gains != 0)]
+    count = len(gains)
+    if count == 0:
+        return 0.0
+    ranks = np.empty(count)
+    ranks[np.argsort(np.abs(gains), kind="stable")] = np.arange(1, count + 1)
+    return float((np.sign(gains) * ranks).sum() / np.sqrt(count * (count + 1) * (2 * count + 1) / 6))
+
+
+def stands_out(gains: np.ndarray) -> bool:
+    """Return True if gains ``[n]`` are above zero by more than :data:`MARGIN` standard deviations of their noise.
+
+    The gains must be held out: their views, or their parts of views, were not used to fit the change.
+    """
+    return signed_ranks(gains) > MARGIN

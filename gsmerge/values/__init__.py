@@ -1,0 +1,1 @@
+"""Values of arguments and messages: arrays or tensors, checks, words."""

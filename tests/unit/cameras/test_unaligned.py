@@ -1,0 +1,138 @@
+"""Rows without pixels in the frame of the first camera, with the cameras of the data set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from exports import export_rows, save_export, smooth_scene, turned
+from messages import noted, refuses
+from model_rows import merge_voxels
+from sweeps import sweep
+from tiny_scene import make_tiny, write_images
+
+from gsmerge.cameras import unaligned
+from gsmerge.errors import SceneError
+from gsmerge.geometry.transforms import Similarity
+from gsmerge.kernels import elementary
+from gsmerge.scene.read import load_scene
+from gsmerge.types import SH_C0, Cameras
+
+WIDTH, HEIGHT = 56, 40
+SMOOTH = smooth_scene(WIDTH, HEIGHT)
+
+
+def voxels() -> np.ndarray:
+    """Rows of merged Gaussians, a prime number, in an order of space."""
+    return export_rows(replace(SMOOTH, gaussians=merge_voxels(SMOOTH, 0.07)), np.arange(4027))
+
+
+def padded(rows: np.ndarray) -> np.ndarray:
+    """As VolSplat writes them: filled up with equal rows, then every view and border cut as if they were pixels."""
+    full = np.zeros(3 * WIDTH * HEIGHT, rows.dtype)
+    full[: len(rows)] = rows
+    for name in full.dtype.names:
+        if name.startswith("f_dc"):
+            full[name][len(rows) :] = 0.1
+    for name in ("opacity", "scale_0", "scale_1", "scale_2"):
+        full[name][len(rows) :] = -4.6
+    full["rot_0"][len(rows) :] = 1
+    grid = np.arange(len(full)).reshape(3, HEIGHT, WIDTH)[:, 8:-8, 8:-8]
+    return full[grid.transpose(1, 2, 0).reshape(-1)]
+
+
+def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path) -> None:
+    rows = turned(padded(voxels()), SMOOTH.w2c[0, :3, :3])
+    loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
+    assert not loaded.scene.has_own_pixels
+    assert "the cameras are rotated into the first camera, as the photos' colours show" in loaded.notes
+    assert any(" empty rows at the origin, set aside" in note for note in loaded.notes)
+    viewmats = loaded.scene.cameras.viewmats
+    assert np.allclose(viewmats[0, :3, :3], np.eye(3), atol=1e-6)
+    assert np.allclose(viewmats[:, :3, 3], SMOOTH.w2c[:, :3, 3], atol=1e-6)
+
+
+@sweep("scale", [0.2, 1.0, 3.0])
+def test_voxels_in_the_first_camera_at_any_scale(tmp_path: Path, scale: float) -> None:
+    first = SMOOTH.w2c[0]
+    rows = turned(voxels(), first[:3, :3], scale=scale, shift=scale * first[:3, 3])
+    rows["opacity"] = 1 / (1 + elementary.exp(-rows["opacity"]))
+    loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
+    assert not loaded.scene.has_own_pixels
+    assert any("moved into the first camera" in note for note in loaded.notes)
+    assert np.allclose(loaded.scene.cameras.viewmats[0], np.eye(4), atol=1e-6)
+    centres = (SMOOTH.c2w[:, :3, 3] - SMOOTH.c2w[0, :3, 3]) @ SMOOTH.c2w[0, :3, :3]
+    assert np.allclose(loaded.scene.cameras.centres, scale * centres, atol=0.03 * scale)
+
+
+def test_voxels_turned_to_y_up(tmp_path: Path) -> None:
+    """As files are that were written in the axes of .spz, beside OpenCV cameras."""
+    half = np.diag([1.0, -1, -1])
+    loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxels(), half)))
+    assert any("turned to y up" in note for note in loaded.notes)
+    assert np.allclose(loaded.scene.cameras.viewmats[:, :3, :3], SMOOTH.w2c[:, :3, :3] @ half, atol=1e-6)
+
+
+def test_without_photos_no_other_frame_is_tried(tmp_path: Path) -> None:
+    rows = turned(voxels(), np.diag([-1.0, 1, -1]))
+    folder = save_export(tmp_path, SMOOTH, rows)
+    for photo in (folder / "images").rglob("*.png"):
+        photo.unlink()
+    with refuses(SceneError, "scene.ply", 6720, "cameras"):
+        load_scene(folder, cameras=folder)
+
+
+def test_no_other_frame_stands_against_the_foremost_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever chooses a frame: where the photos are far from what they should show, it is refused."""
+    wrong = Similarity(np.eye(3), 1.0, np.array([0.9, 0.4, 0.0]), "somewhere else")
+    rows = voxels()
+    rows["x"] += np.random.default_rng(0).uniform(-0.05, 0.05, len(rows))  # a pixel to each side
+    folder = save_export(tmp_path, SMOOTH, rows)
+    monkeypatch.setattr(unaligned, "_choose_frame", lambda inputs, usual: wrong)
+    with refuses(SceneError, "scene.ply", "somewhere else", "colours", "--hint exporter"):
+        load_scene(folder, cameras=folder)
+
+
+def test_hidden_gaussians_say_nothing_about_the_foremost() -> None:
+    cameras = Cameras(np.eye(4)[None], np.array([[[50.0, 0, 50], [0, 50, 50], [0, 0, 1]]]), 100, 100)
+    rng = np.random.default_rng(0)
+    photo = rng.random((1, 10, 10, 3)).repeat(10, 1).repeat(10, 2).astype(np.float32)
+    xy = rng.uniform(-1, 1, (4000, 2))
+    places = np.floor(50 * xy + 50).astype(int)
+    colors = photo[0, places[:, 1], places[:, 0]]
+    front = np.concatenate([xy, np.ones((4000, 1))], 1)
+    means = np.concatenate([front, 3 * front]).astype(np.float32)
+    shown = (np.concatenate([colors, rng.random((4000, 3))]) - 0.5) / SH_C0
+    tiny = make_tiny().gaussians[np.zeros(8000, int)]
+    gaussians = replace(tiny, means=means, sh0=shown[:, None].astype(np.float32))
+    every, foremost = (
+        unaligned.check_cameras(gaussians, np.ones(8000, bool), cameras, photo, foremost=foremost).color_ratio
+        for foremost in (False, True)
+    )
+    assert every > 0.4
+    assert foremost < 0.1
+
+
+@pytest.mark.parametrize("shows", ["images_resized", "images"])
+def test_photos_that_the_model_saw_where_others_do_not_show_the_scene(tmp_path: Path, shows: str) -> None:
+    """As WorldMirror leaves a portrait: whole photos squeezed to the shape of what was cut out of them."""
+    folder = save_export(tmp_path, SMOOTH, voxels())
+    squeezed = [cv2.resize(np.pad(i, ((16, 16), (0, 0), (0, 0)), "reflect"), (WIDTH, HEIGHT)) for i in SMOOTH.images]
+    for place in ("images", "images_resized"):
+        write_images(folder / place, SMOOTH if place == shows else replace(SMOOTH, images=np.stack(squeezed)))
+    loaded = load_scene(folder)
+    assert np.abs(loaded.scene.images - SMOOTH.images / 255).mean() < 0.01
+    assert noted(loaded.notes, "images_resized") == (shows == "images_resized")
+    assert loaded.files.images.name == shows
+
+
+def test_rows_that_are_all_padding_are_refused(tmp_path: Path) -> None:
+    rows = np.repeat(voxels()[:1], 100)
+    for name in "xyz":
+        rows[name] = 0
+    folder = save_export(tmp_path, SMOOTH, rows)
+    with refuses(SceneError, "scene.ply", 100, "origin"):
+        load_scene(folder, cameras=folder)

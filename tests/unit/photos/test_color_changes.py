@@ -1,0 +1,111 @@
+"""Changes of colours are fitted to half of the blocks, and judged on the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from panoramas import cut_views, shrunk
+
+from gsmerge.photos.colors import (
+    Blocks,
+    cut_blocks,
+    explains,
+    fit_map,
+    fit_tones,
+    is_visible,
+    map_blocks,
+    map_colors,
+    map_tones,
+    plain_blocks,
+    tone_blocks,
+)
+from gsmerge.photos.pictures import Pairs, ViewPictures
+
+Change = Callable[[np.ndarray], np.ndarray]
+
+
+def pair(change: Change, noise: float = 0.0) -> Pairs:
+    """Photos of four views, which ``change`` brings to what the Gaussians show, but for noise of their pixels."""
+    photos = shrunk(cut_views(4), 96)
+    grain = noise * np.random.default_rng(0).standard_normal(photos.shape)
+    pictures = (change(photos) + grain).clip(0, 1).astype(np.float32)
+    return Pairs(photos, ViewPictures(pictures, np.ones(photos.shape[:3], np.float32), drawn=True))
+
+
+def gamma(photos: np.ndarray) -> np.ndarray:
+    return photos ** np.float32(1.8)
+
+
+def mix(photos: np.ndarray) -> np.ndarray:
+    return np.asarray(0.1 + photos @ np.array([[0.2, 0.5, 0.1], [0.3, 0.1, 0.6], [0.4, 0.2, 0.1]], np.float32))
+
+
+GROUPS = [[0, 1, 2, 3]]
+
+
+def test_a_curve_joins_quantiles() -> None:
+    pairs = pair(gamma)
+    colors, targets = pairs.photos.reshape(-1, 3), pairs.shown.pictures.reshape(-1, 3)
+    curve = fit_tones(colors, targets, np.ones(len(colors)))
+    np.testing.assert_allclose(curve[:, 40:216], np.tile((np.arange(40, 216) / 255) ** 1.8, (3, 1)), atol=0.01)
+    inner = (pairs.photos > 0.15) & (pairs.photos < 0.85)  # beyond the outer quantiles it is proportional
+    away = map_tones(curve, pairs.photos) - pairs.shown.pictures
+    assert np.abs(away[inner]).max() < 0.01
+    slow = np.array(
+        [[np.interp(value * 255, np.arange(256), curve[c]) for c, value in enumerate(row)] for row in colors]
+    )
+    np.testing.assert_allclose(map_tones(curve, colors), slow, atol=1e-5)
+
+
+def test_faint_pixels_do_not_choose_a_curve() -> None:
+    pairs = pair(gamma)
+    colors, targets = pairs.photos.reshape(-1, 3).copy(), pairs.shown.pictures.reshape(-1, 3).copy()
+    weights = np.ones(len(colors))
+    plain = fit_tones(colors, targets, weights)
+    half = len(colors) // 2
+    both = fit_tones(np.tile(colors, (2, 1)), np.concatenate([targets, targets[::-1] * 0]), np.repeat([1, 0], 2 * half))
+    np.testing.assert_array_equal(both, plain)
+
+
+def test_a_map_is_least_squares() -> None:
+    pairs = pair(mix)
+    colors, targets = pairs.photos.reshape(-1, 3), pairs.shown.pictures.reshape(-1, 3)
+    matrix = fit_map(colors, targets, np.ones(len(colors)))
+    expected = np.linalg.lstsq(np.c_[colors, np.ones(len(colors))].astype(float), targets.astype(float), rcond=None)[0]
+    np.testing.assert_allclose(matrix, expected, atol=1e-3)
+    np.testing.assert_allclose(map_colors(matrix, pairs.photos), pairs.shown.pictures, atol=1e-2)
+
+
+@pytest.mark.parametrize("change", [gamma, mix])
+def test_a_change_explains_what_it_made(change: Change) -> None:
+    pairs = pair(change, noise=0.02)
+    stored = cut_blocks(pairs)
+    after = tone_blocks(pairs, GROUPS) if change is gamma else map_blocks(stored)
+    assert is_visible(stored.errors())
+    assert explains(stored.errors(), after.errors())
+    assert not is_visible(after.errors())
+    if change is mix:
+        assert explains(plain_blocks(stored).errors(), after.errors())
+        assert is_visible(tone_blocks(pairs, GROUPS).errors())
+
+
+def test_noise_is_explained_by_nothing() -> None:
+    """What is fitted to some blocks gains nothing on the others."""
+    pairs = pair(lambda photos: np.random.default_rng(1).random(photos.shape))
+    stored = cut_blocks(pairs)
+    assert not explains(plain_blocks(stored).errors(), map_blocks(stored).errors())
+    same = cut_blocks(pair(lambda photos: photos, noise=0.05))
+    assert not explains(same.errors(), map_blocks(same).errors())
+    assert not is_visible(same.errors())
+
+
+def test_faint_blocks_are_not_compared() -> None:
+    pairs = pair(gamma)
+    weights = np.ones(pairs.photos.shape[:3], np.float32)
+    weights[:, :36] = 0.01
+    blocks: Blocks = cut_blocks(Pairs(pairs.photos, ViewPictures(pairs.shown.pictures, weights, drawn=True)))
+    errors = blocks.errors().reshape(blocks.solid.shape)
+    assert np.isnan(errors[:, :4]).all()
+    assert np.isfinite(errors[:, 5:]).all()

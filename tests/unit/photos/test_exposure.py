@@ -1,0 +1,138 @@
+"""What tells exposures that are to be compensated from those that are better left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Scene
+from gsmerge.geometry.frame import canonicalise
+from gsmerge.geometry.transforms import camera_distances
+from gsmerge.kernels import elementary
+from gsmerge.photos.exposure import (
+    FARTHER,
+    FOLLOWS,
+    NEARER,
+    NEAREST,
+    UNEXPECTED,
+    _divide,
+    _measure_pairs,
+    _solve_gains,
+    choose_partners,
+    equalise_exposure,
+    is_metered,
+    root_mean_square,
+    share_left,
+    share_unexpected,
+)
+
+VIEWS = range(5)
+
+
+def grey(*gains: float) -> np.ndarray:
+    """The same logarithmic gain for red, green and blue."""
+    return np.repeat(np.array(gains)[:, None], 3, 1)
+
+
+def row(count: int) -> np.ndarray:
+    """Distances of cameras side by side."""
+    return np.abs(np.subtract.outer(np.arange(count), np.arange(count))).astype(float)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return canonicalise(scenes.make_scene(scenes.room(), scenes.arc(len(VIEWS), 64, 48)))[0]
+
+
+def brightened(scene: Scene, gains: np.ndarray) -> Scene:
+    return replace(scene, images=(scene.images * elementary.exp(gains)[:, None, None]).clip(0, 1).astype(np.float32))
+
+
+def test_size_of_gains() -> None:
+    assert root_mean_square(grey(0.9, 1.1)) == pytest.approx(0.1)
+
+
+def test_gains_bring_the_same_surfaces_nearer(scene: Scene) -> None:
+    gains = grey(0.2, -0.3, 0.1, 0.2, -0.2)
+    pairs = _measure_pairs(brightened(scene, gains), VIEWS)
+    assert share_left(pairs, gains) < 0.2
+    assert share_left(pairs, np.zeros((5, 3))) == 1
+    assert share_left(pairs, -gains) > 1 > NEARER
+
+
+def test_few_views_are_compared_with_all_others_and_many_with_some() -> None:
+    few, many = choose_partners(row(NEAREST + FARTHER + 1)), choose_partners(row(200))
+    assert all(sorted({*others, view}) == list(range(len(few))) for view, others in enumerate(few.tolist()))
+    assert many.shape == (200, NEAREST + FARTHER)
+    assert set(range(100 - NEAREST // 2, 101 + NEAREST // 2)) - {100} <= set(many[100])
+    assert many[100].min() == 0  # some are far away
+    assert (np.diff(many) > 0).all()
+
+
+def test_gains_of_many_views_follow_from_some_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("NEAREST", "FARTHER"):
+        monkeypatch.setattr(f"gsmerge.photos.exposure.{name}", 4)
+    count = 16
+    scene, _ = canonicalise(scenes.make_scene(scenes.room(), scenes.arc(count, 24, 16)))
+    gains = grey(*np.random.default_rng(0).uniform(-0.2, 0.2, count))
+    solved = _solve_gains(_measure_pairs(brightened(scene, gains), range(count)), count)
+    assert solved is not None
+    np.testing.assert_allclose(solved - solved.mean(0), gains - gains.mean(0), atol=0.03)
+
+
+def test_metered_photos_are_equally_bright() -> None:
+    places, gains = grey(-0.4, 0.1, 0.3, 0.0), grey(0.1, -0.2, 0.3, -0.2)
+    assert is_metered(np.zeros((4, 3)), -places)
+    assert is_metered(places - 0.9 * places, -0.9 * places)
+    assert not is_metered(places + gains, gains)  # whatever the places
+    assert not is_metered(gains, gains)
+
+
+def test_half_of_the_light_made_up_for_is_metered() -> None:
+    places = grey(-0.4, 0.1, 0.3, 0.0)
+    slopes = [(-share * (1 - share)) / share**2 for share in (0.5, 0.7)]  # photos brighter where gains are lower
+    assert max(slopes) < FOLLOWS
+    assert all(is_metered((1 - share) * places, -share * places) for share in (0.5, 0.7))
+
+
+def test_drift_is_expected_and_a_change_at_every_photo_is_not() -> None:
+    for count in (4, 5, 12):
+        assert share_unexpected(grey(*np.linspace(-1, 1, count)), row(count)) < UNEXPECTED
+        assert share_unexpected(grey(*[0.2, -0.2] * (count // 2)), row(count // 2 * 2)) > 1
+    gains = np.random.default_rng(0).normal(size=(2000, 3))
+    assert share_unexpected(gains, row(2000)) == pytest.approx(1, abs=0.05)
+
+
+def test_the_order_of_views_does_not_matter() -> None:
+    gains, order = grey(0.3, 0.1, -0.1, 0.2, -0.5), np.array([3, 0, 4, 1, 2])
+    shuffled = share_unexpected(gains[order], row(5)[np.ix_(order, order)])
+    assert shuffled == pytest.approx(share_unexpected(gains, row(5)))
+
+
+def test_two_views_say_nothing_of_drift() -> None:
+    assert share_unexpected(grey(0.2, -0.2), row(2)) >= 1
+
+
+def test_cameras_are_apart_by_place_and_direction() -> None:
+    poses = [scenes.look_at(np.array([x, 0.0, 0.0]), np.array([x, 0.0, z])) for x, z in ((0, 1), (2, 1), (0, -1))]
+    cameras = scenes.Cameras(np.stack(poses), scenes.intrinsics(3, 8, 8), 8, 8)
+    np.testing.assert_allclose(camera_distances(cameras), [[0, 2, 2], [2, 0, 4], [2, 4, 0]], atol=1e-9)
+
+
+def test_small_gains_are_left_without_a_word(scene: Scene) -> None:
+    assert equalise_exposure(scene, VIEWS, "auto") is scene
+
+
+def test_clipped_pixels_count_where_no_other_photo_shows_more(scene: Scene) -> None:
+    gains = elementary.exp(grey(0.4, -0.1, -0.1, -0.1, -0.1))
+    one = scene.images.copy()
+    one[0] = 1
+    masks = _divide(replace(scene, images=one), gains).masks
+    assert masks is not None
+    assert masks[0].mean() < 0.3  # what others see; borders and edges are seen by no other
+    assert masks[1:].all()
+    all_of_them = replace(scene, images=np.ones_like(scene.images))
+    assert _divide(all_of_them, np.full((5, 3), 1.5)).masks is None

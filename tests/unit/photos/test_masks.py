@@ -1,0 +1,209 @@
+"""Masks beside the photos and inside them, and bars around them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from messages import refuses
+from tiny_scene import Tiny
+
+from gsmerge.errors import SceneError
+from gsmerge.io.image_names import match_masks
+from gsmerge.io.photo_files import decode_alpha, decode_levels
+from gsmerge.photos.views import subset
+from gsmerge.scene.read import load_scene, read_scene
+
+
+def half(tiny: Tiny) -> np.ndarray:
+    """A mask of the left half."""
+    mask = np.zeros((tiny.height, tiny.width), bool)
+    mask[:, : tiny.width // 2] = True
+    return mask
+
+
+def write(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+NAMINGS: list[Callable[[str], str]] = [
+    lambda name: name,  # masks/a b/2.png
+    lambda name: f"{name}.png",  # COLMAP: masks/a b/2.png.png
+    lambda name: Path(name).name,  # masks/2.png
+]
+
+
+@pytest.mark.parametrize("naming", NAMINGS)
+def test_masks_beside_the_photos_by_their_names(tiny_folder: Path, tiny: Tiny, naming: Callable[[str], str]) -> None:
+    write(tiny_folder / "masks" / naming(tiny.names[1]), half(tiny).astype(np.uint8) * 255)
+    load = load_scene(tiny_folder)
+    assert load.scene.masks is not None
+    assert np.array_equal(load.scene.masks[1], half(tiny))
+    assert load.scene.masks[[0, 2]].all()  # they have none
+    assert "masks leave out 17 % of the photos' pixels; 1 of 3 photos have a mask" in load.notes
+
+
+def test_a_folder_of_masks_that_is_named(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+    """Of twice the size, in another format, of 0 and 1."""
+    large = half(tiny).repeat(2, 0).repeat(2, 1).astype(np.uint8)
+    for name in tiny.names:
+        write(tmp_path / "other" / Path(name).with_suffix(".bmp"), large)
+    scene = read_scene(tiny_folder, masks=tmp_path / "other")
+    assert np.array_equal(scene.masks, np.stack([half(tiny)] * 3))
+    with pytest.raises(SceneError, match="no such"):
+        read_scene(tiny_folder, masks=tmp_path / "missing")
+    with refuses(SceneError, "scene.ply", "--masks", "file"):
+        read_scene(tiny_folder, masks=tiny_folder / "scene.ply")
+    shutil.copytree(tmp_path / "other" / "a b", tmp_path / "wrong")
+    for number, path in enumerate(sorted((tmp_path / "wrong").iterdir())):
+        path.rename(path.with_name(f"x{number}.bmp"))
+    with refuses(SceneError, "wrong", "2.png", "--masks"):
+        read_scene(tiny_folder, masks=tmp_path / "wrong")
+
+
+def test_where_photos_are_transparent_they_do_not_count(tiny_folder: Path, tiny: Tiny) -> None:
+    alpha = half(tiny).astype(np.uint8) * 255
+    for name, image in zip(tiny.names, tiny.images, strict=True):
+        write(tiny_folder / "images" / name, np.dstack([image[..., ::-1], alpha]))
+    scene = read_scene(tiny_folder)
+    assert np.array_equal(scene.masks, np.stack([half(tiny)] * 3))
+    assert np.array_equal((scene.images * 255).round(), tiny.images)
+
+
+def test_opaque_photos_have_no_masks(tiny_folder: Path, tiny: Tiny) -> None:
+    path = tiny_folder / "images" / tiny.names[0]
+    write(path, np.dstack([tiny.images[0][..., ::-1], np.full((tiny.height, tiny.width), 255, np.uint8)]))
+    assert decode_alpha(path) is None
+    assert read_scene(tiny_folder).masks is None
+
+
+def test_a_mask_that_is_no_image(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"\0no image")
+    with pytest.raises(SceneError, match="decoded"):
+        decode_levels(tmp_path / "a.png")
+
+
+def test_bars_around_photos_are_cut_off(tiny_folder: Path, tiny: Tiny) -> None:
+    for name, image in zip(tiny.names, tiny.images, strict=True):
+        write(tiny_folder / "images" / name, np.pad(image, ((3, 4), (0, 0), (0, 0)))[..., ::-1])
+    load = load_scene(tiny_folder)
+    assert np.array_equal((load.scene.images * 255).round(), tiny.images)
+    assert "bars around the photos are cut off: 20 x 21 pixels become 20 x 14" in load.notes
+
+
+def test_a_folder_of_masks_in_a_format_that_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "0.tga").write_bytes(b"")
+    with refuses(SceneError, tmp_path, "0.png", "1 .tga", "convert"):
+        match_masks(tmp_path, ["0.jpg"])
+
+
+def test_masks_of_many_bits_and_of_transparency(tmp_path: Path) -> None:
+    levels = np.array([[0, 256, 65535, 40000]], np.uint16)
+    write(tmp_path / "deep.png", levels)
+    assert decode_levels(tmp_path / "deep.png").tolist() == [[0, 1, 255, 156]]
+    clear = np.dstack([np.full((1, 4, 3), 255, np.uint8), np.array([[0, 0, 255, 255]], np.uint8)])
+    write(tmp_path / "clear.png", clear)
+    assert decode_levels(tmp_path / "clear.png").tolist() == [[0, 0, 255, 255]]
+
+
+def test_a_folder_of_other_masks_beside_the_photos_is_not_used(tiny_folder: Path, tiny: Tiny) -> None:
+    write(tiny_folder / "masks" / "object_0.png", half(tiny).astype(np.uint8) * 255)
+    load = load_scene(tiny_folder)
+    assert load.scene.masks is None
+    assert any(note.startswith("masks are not used: ") and "found none" in note for note in load.notes)
+
+
+def test_masks_without_photos_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
+    write(tiny_folder / "masks" / tiny.names[0], half(tiny).astype(np.uint8) * 255)
+    shutil.rmtree(tiny_folder / "images")
+    assert "the pictures of --masks are not used, since there are no photos" in load_scene(tiny_folder).notes
+
+
+def test_bright_pixels_count_by_their_opacity(tmp_path: Path) -> None:
+    """Rows beyond the first that are converted at once count, too."""
+    levels = np.random.default_rng(0).integers(0, 256, (600, 3, 2), np.uint8)
+    write(tmp_path / "a.png", np.dstack([levels[..., 0]] * 3 + [levels[..., 1]]))
+    products = levels[..., 0].astype(int) * levels[..., 1]
+    assert np.array_equal(decode_levels(tmp_path / "a.png"), np.round(products / np.float32(255)))
+
+
+@pytest.mark.parametrize(("most", "dtype", "white"), [
+    (1, np.uint8, 255), (64, np.uint8, 64), (255, np.uint8, 255), (1, np.uint16, 255), (32768, np.uint16, 128),
+])  # fmt: skip
+def test_grey_is_a_weight(tmp_path: Path, most: int, dtype: type, white: int) -> None:
+    """Only a picture of 0 and 1 alone is stretched."""
+    write(tmp_path / "a.png", np.array([[0, most, 0]], dtype))
+    assert decode_levels(tmp_path / "a.png").tolist() == [[0, white, 0]]
+
+
+def test_a_mask_may_take_what_its_photo_allows(tmp_path: Path) -> None:
+    mask, photo = tmp_path / "mask.png", tmp_path / "photo.jpg"
+    write(mask, np.full((6000, 6000), 255, np.uint8))
+    photo.write_bytes(bytes(1_000_000))
+    with refuses(SceneError, mask, "6000 x 6000", "108 MB"):
+        decode_levels(mask)
+    assert (decode_levels(mask, photo) == 255).all()
+
+
+def test_the_grey_of_a_mask_is_a_weight(tiny_folder: Path, tiny: Tiny) -> None:
+    """Where it counts at all; black and white pixels have the weights that they have without greys."""
+    mask = half(tiny).astype(np.uint8) * 255
+    mask[:, 0] = 204
+    write(tiny_folder / "masks" / tiny.names[1], mask)
+    scene = read_scene(tiny_folder)
+    assert np.array_equal(scene.masks[1], half(tiny))
+    assert np.allclose(scene.importance[1][:, 0], 0.8)
+    assert (scene.importance[1][:, 1 : tiny.width // 2] == 1).all()
+    assert (scene.importance[[0, 2]] == 1).all()
+    assert scene.protected is None
+
+
+def test_what_has_to_stay_sharp_counts_four_times(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+    levels = half(tiny).astype(np.uint8) * 255
+    levels[:, 0] = 51
+    write(tmp_path / "signs" / tiny.names[1], levels)
+    load = load_scene(tiny_folder, protect=tmp_path / "signs")
+    scene = load.scene
+    assert scene.masks is None
+    assert np.allclose(scene.importance[1][:, 0], 1.6)
+    assert (scene.importance[1][half(tiny) & (levels == 255)] == 4).all()
+    assert (scene.importance[1][~half(tiny)] == 1).all()
+    assert np.array_equal(scene.protected[1], levels == 255)
+    assert (scene.importance[[0, 2]] == 1).all()
+    (note,) = (note for note in load.notes if note.startswith("protect: "))
+    assert note.endswith("of 1 photo of 3")
+    assert subset(scene, [1, 2]).importance.shape[0] == 2
+
+
+def test_pictures_to_protect_that_do_not_fit(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+    with refuses(SceneError, "missing", "no such"):
+        read_scene(tiny_folder, protect=tmp_path / "missing")
+    with refuses(SceneError, "scene.ply", "--protect", "file"):
+        read_scene(tiny_folder, protect=tiny_folder / "scene.ply")
+    write(tmp_path / "wrong" / "sign.png", np.zeros((2, 2), np.uint8))
+    with refuses(SceneError, "wrong", "2.png", "--protect"):
+        read_scene(tiny_folder, protect=tmp_path / "wrong")
+
+
+@pytest.mark.parametrize("grey", [False, True])
+def test_photos_in_place_of_masks_are_doubted(grey: bool, tiny_folder: Path, tiny: Tiny) -> None:
+    """Also of grey photos, which may be masks by their looks; not of masks that are grey."""
+    if grey:
+        for path in sorted((tiny_folder / "images").rglob("*.png")):
+            write(path, cv2.cvtColor(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), cv2.COLOR_GRAY2BGR))
+    notes = load_scene(tiny_folder, protect=tiny_folder / "images").notes
+    assert any(note.startswith("protect: 3 of 3 pictures look like photos, ") for note in notes)
+    for name in tiny.names:
+        write(tiny_folder / "signs" / f"{name}.png", half(tiny).astype(np.uint8) * 200)
+    assert not any("look like photos" in note for note in load_scene(tiny_folder, protect=tiny_folder / "signs").notes)
+
+
+def test_a_picture_that_is_too_large_has_a_remedy(tmp_path: Path) -> None:
+    write(tmp_path / "a.png", np.full((4800, 6400), 255, np.uint8))
+    with refuses(SceneError, "a.png", "6400 x 4800", "a mask to that of its photo"):
+        decode_levels(tmp_path / "a.png")

@@ -1,0 +1,13 @@
+"""Words of messages follow their numbers."""
+
+from gsmerge.values.words import count_words
+
+
+def test_only_one_is_singular() -> None:
+    numbers = 0, 1, 2, 1200
+    assert [count_words(number, "row") for number in numbers] == ["0 rows", "1 row", "2 rows", "1,200 rows"]
+
+
+def test_nouns_that_end_with_ch_and_words_behind() -> None:
+    assert count_words(2, "batch") == "2 batches"
+    assert count_words(1, "empty row", "set aside") == "1 empty row set aside"
