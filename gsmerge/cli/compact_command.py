@@ -45,7 +45,7 @@ PARAMETERS = (
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
     opt.output(f"{opt.COMPACT_SCENE} .html: one page with a viewer, to send. lod-meta.json: levels for streaming. "
-               "colmap: a COLMAP model. Any other folder gets SCENE.compact.ply.", "SCENE.compact.ply"),
+               "A folder gets SCENE.compact.ply.", "SCENE.compact.ply"),
     "overwrite strict dry_run seed threads",
 )  # fmt: skip
 
@@ -107,7 +107,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     default = default_output(files.base)
     out = output_file(args.output or default, default.name, site=writing.site)
     settings = _fit_format(args, settings, out)
-    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not find_format(out).cameras else None
+    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not find_format(out).has_cameras else None
     _check_outputs(args, files, settings, writing, out, cameras)
     if args.dry_run:
         print_plan(args, files, settings, out, hints)

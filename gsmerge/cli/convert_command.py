@@ -18,15 +18,14 @@ from gsmerge.settings.stages import CleanOptions
 class PhotoOptions(Settings):
     """Photos that a conversion reads."""
 
-    images: str | None = setting(None, "Folder of the photos of the cameras. `--drop sky` needs it, and a COLMAP model "
-        "links it. For a model, a folder `images` beside the cameras is found without this setting.")  # fmt: skip
+    images: str | None = setting(None, "Folder of the photos of the cameras, which `--drop sky` needs.")
 
 
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
                  "Files or folders of Gaussians, such as a .ply, .spz or .sog. Several files in one coordinate frame "
                  "are joined. The last path is the output, and its name sets the format, also .html (a page to send), "
-                 "lod-meta.json, a folder, or a folder named colmap."),
+                 "lod-meta.json, or a folder."),
     opt.changed("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
     opt.changed("hint", help="How the files store opacity and scales, if it is not recognised: opacity=logit or "

@@ -44,17 +44,15 @@ def output_file(output: Path, name: str, *, site: bool = False) -> Path:
     """Return the file that an output names; for a folder, return a file in it.
 
     A name without an ending is a folder unless a file of this name exists. The file in a folder is the page of a
-    ``site``, or the main file of a format if the folder has the name of the format, or otherwise ``name``.
+    ``site``, or otherwise ``name``.
     """
-    from gsmerge.io.formats.table import FOLDERS, FORMATS, OUTPUT_FORMATS
+    from gsmerge.io.formats.table import FORMATS, OUTPUT_FORMATS
 
     if site:
         page = next(row for row in FORMATS if row.site)
         if output.suffix.lower() in OUTPUT_FORMATS:
             raise UsageError(f"site: expected a folder to write into, got {output}")
         return output if page.names(output) else output / page.site
-    if output.name in FOLDERS:
-        return output / FOLDERS[output.name].place / FOLDERS[output.name].ending
     is_folder = output.is_dir() or not (output.suffix or os.path.lexists(output))
     return output / name if is_folder else output
 
@@ -92,7 +90,7 @@ def check_format(output: Path, options: FileOptions) -> None:
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Raise UsageError for an output that is an input, exists without ``overwrite``, or is given twice.
 
-    ``inputs`` are the files that are read, and folders of photos or COLMAP models; no file in them is replaced.
+    ``inputs`` are the files that are read, and folders of photos or cameras; no file in them is replaced.
     SceneError if the output cannot be written. Missing folders are made together with their first file, so a run that
     fails earlier makes no folders.
     """
@@ -112,7 +110,6 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     """Check one output as :func:`check_outputs` does; ``inputs``: real paths."""
-    from gsmerge.io.formats.table import MODEL_NAMES
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:
@@ -125,7 +122,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     if output.is_dir():
         raise UsageError(f"{output}: expected a file to write, found a folder; name a file in it")
     target = Path(os.path.realpath(output))
-    is_read = (target.suffix.lower() in IMAGE_SUFFIXES or target.name in MODEL_NAMES) and target.exists()
+    is_read = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
     if str(target) in inputs or (is_read and str(target.parent) in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another output")
     if os.path.lexists(output) and not overwrite:

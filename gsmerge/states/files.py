@@ -11,14 +11,14 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.files import read_input
-from gsmerge.compaction.outputs import add_views, name_photos
+from gsmerge.compaction.outputs import add_views
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents
-from gsmerge.io.formats.write import output_notes
+from gsmerge.io.formats.write import lost_harmonics
 from gsmerge.io.locks import lock_file
 from gsmerge.io.scene_files import SceneFiles, scene_title
 from gsmerge.measure.documents import document_head, seconds_document, seconds_line
@@ -167,17 +167,15 @@ def decode_file(
         return document | {"dry_run": True, "output": output, "notes": []}
     read_end = perf_counter()
     format_, names = output_format(out, levels=True, cameras=True), features.names
-    cameras_path = viewer_cameras_path(out) if viewer_cameras and not format_.cameras else None
+    cameras_path = viewer_cameras_path(out) if viewer_cameras and not format_.has_cameras else None
     with atomic_outputs(overwrite=overwrite) as add:
         temporary = add(out)
         gaussians, decode_end = decode_features(features, options), perf_counter()
         if len(gaussians) == 0:
             raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
-        cameras, photos = features.frame.leave_cameras(features.cameras), name_photos(None, names)
-        notes = [*output_notes(out, gaussians.sh_degree, photos), *rounding_notes(out, gaussians)]
-        contents = Contents(
-            [gaussians], [RESULT_COMMENT], cameras, photos, scene_title(path), normals=normals, apart=site
-        )
+        cameras = features.frame.leave_cameras(features.cameras)
+        notes = [*lost_harmonics(out, gaussians.sh_degree), *rounding_notes(out, gaussians)]
+        contents = Contents([gaussians], [RESULT_COMMENT], cameras, scene_title(path), normals, apart=site)
         (files,) = format_.write(add, out, temporary, contents).values()
         num_bytes = sum(file.stat().st_size for file in files)
         if cameras_path is not None:

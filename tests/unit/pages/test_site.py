@@ -109,7 +109,6 @@ def test_without_cameras_one_may_look_from_any_side() -> None:
         ("file", False, "file"),  # which no format names
         ("new.html", False, "new.html"),
         ("b.ply", False, "b.ply"),
-        ("colmap", False, "colmap/sparse/0/points3D.bin"),
         ("new", True, "new/index.html"),
         ("full.dir", True, "full.dir/index.html"),
         ("full.dir/page.html", True, "full.dir/page.html"),
