@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
-from gsmerge.cli.paths import FileOptions, check_format, check_outputs, files_beside, output_file
+from gsmerge.cli.paths import FileOptions, check_format, check_outputs, output_file
 from gsmerge.errors import UsageError
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.setting import Settings, setting
@@ -45,8 +45,8 @@ def convert(args: opt.Args) -> None:
     writing, photos, cleaning, placement = args.make(FileOptions, PhotoOptions, CleanOptions, PlacementOptions)
     images = None if photos.images is None else opt.named_or_none(photos.images)
     named = [path for path in (args.cameras, images) if isinstance(path, Path)]
-    output = output_file(output, inputs[0].name, site=writing.site)
-    check_outputs((output, *files_beside(output, site=writing.site)), (*inputs, *named), overwrite=args.overwrite)
+    output = output_file(output, inputs[0].name)
+    check_outputs((output,), (*inputs, *named), overwrite=args.overwrite)
     check_format(output, writing)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.record import record_run
@@ -54,7 +54,7 @@ def convert(args: opt.Args) -> None:
     options = ConvertOptions(
         inputs, output, args.cameras, images, args.opacity, args.hints().scales, cleaning, placement,
         normals=writing.normals, full_columns=writing.columns == "full",
-        site=writing.site, overwrite=args.overwrite,
+        overwrite=args.overwrite,
     )  # fmt: skip
     with stage_progress(quiet=args.silent) as progress, record_run(progress):
         document = convert_files(options)

@@ -29,8 +29,6 @@ class FileOptions(Settings):
     columns: str = setting("needed", "Columns of a `.ply`. needed: only those that are needed; full: all 62 columns of "
         "INRIA's files, with zeros for missing harmonics up to degree 3, which Unity's importer needs.",
         choices=("needed", "full"))  # fmt: skip
-    site: bool = setting(False, "Write a web site into the folder `-o`: the same page as for `.html`, with scene "
-        "and viewer in files of their own.")  # fmt: skip
     viewer_cameras: bool = setting(True, "Write the cameras of the input views beside the result of `compact`, as "
         "`NAME.cameras.json` for viewers.")  # fmt: skip
 
@@ -40,19 +38,11 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def output_file(output: Path, name: str, *, site: bool = False) -> Path:
+def output_file(output: Path, name: str) -> Path:
     """Return the file that an output names; for a folder, return a file in it.
 
-    A name without an ending is a folder unless a file of this name exists. The file in a folder is the page of a
-    ``site``, or otherwise ``name``.
+    A name without an ending is a folder unless a file of this name exists. The file in a folder is ``name``.
     """
-    from gsmerge.io.formats.table import FORMATS, OUTPUT_FORMATS
-
-    if site:
-        page = next(row for row in FORMATS if row.site)
-        if output.suffix.lower() in OUTPUT_FORMATS:
-            raise UsageError(f"site: expected a folder to write into, got {output}")
-        return output if page.names(output) else output / page.site
     is_folder = output.is_dir() or not (output.suffix or os.path.lexists(output))
     return output / name if is_folder else output
 
@@ -69,13 +59,6 @@ def _read_start(path: Path) -> bytes:
             return file.read(MARKED_BYTES)
     except OSError:  # if it exists but cannot be read, writing fails with a reason of its own
         return b""
-
-
-def files_beside(output: Path, *, site: bool = False) -> tuple[Path, ...]:
-    """List further files that belong to an output; SceneError if files of another program have their names."""
-    from gsmerge.io.formats.table import find_format
-
-    return tuple(find_format(output).beside(output, site))
 
 
 def check_format(output: Path, options: FileOptions) -> None:

@@ -51,7 +51,6 @@ class ConvertOptions:
     placement: PlacementOptions = field(default_factory=PlacementOptions)
     normals: bool = True  # Write the three columns of zeros that some viewers expect in a ``.ply``
     full_columns: bool = False  # Pad its harmonics with zeros up to degree 3
-    site: bool = False  # Write the files of a page beside it
     overwrite: bool = False
 
 
@@ -205,7 +204,7 @@ def _write(
     out, camera_path = options.output, None
     with atomic_outputs(overwrite=options.overwrite) as add:
         title = scene_title(options.inputs[0])
-        contents = Contents([gaussians], comments, cameras, title, options.normals, options.site, extra_columns=columns)
+        contents = Contents([gaussians], comments, cameras, title, options.normals, extra_columns=columns)
         written = format_.write(add, out, add(out), contents)
         if len(cameras) and not format_.has_cameras:
             camera_path = viewer_cameras_path(out)

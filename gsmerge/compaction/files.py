@@ -42,7 +42,6 @@ class Outputs:
     overwrite: bool = False
     normals: bool = True  # Write the three columns of zeros that some viewers expect in a ``.ply``
     full_columns: bool = False  # Pad harmonics of a ``.ply`` with zeros up to degree 3
-    site: bool = False  # Write the files of a page beside it
 
 
 def compact_files(
@@ -88,7 +87,7 @@ def compact_files(
             comments.append(new_views_comment(expected))
         notes = lost_harmonics(out, result.gaussians.sh_degree) + rounding_notes(out, result.gaussians)
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
-        contents = Contents(levels, comments, cameras, scene_title(files.ply), outputs.normals, apart=outputs.site)
+        contents = Contents(levels, comments, cameras, scene_title(files.ply), outputs.normals)
         written = format_.write(add, out, temporary, contents)
         if cameras_path is not None:
             add_views(add, cameras_path, cameras, names, overwrite=outputs.overwrite)

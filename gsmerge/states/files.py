@@ -144,14 +144,13 @@ def decode_file(
     *,
     normals: bool = True,
     viewer_cameras: bool = True,
-    site: bool = False,
     overwrite: bool = False,
     dry_run: bool = False,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Decode the Feature Gaussians in a ``.gsm`` into an output, with cameras in or beside it; return the report.
 
-    ``site``: write the parts of a page beside it. ``dry_run``: write nothing. Raises SceneError if a file cannot be
+    ``dry_run``: write nothing. Raises SceneError if a file cannot be
     read or written, UsageError for a K that the networks do not make.
     """
     start, state = perf_counter(), load_state(path)
@@ -175,7 +174,7 @@ def decode_file(
             raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
         cameras = features.frame.leave_cameras(features.cameras)
         notes = [*lost_harmonics(out, gaussians.sh_degree), *rounding_notes(out, gaussians)]
-        contents = Contents([gaussians], [RESULT_COMMENT], cameras, scene_title(path), normals, apart=site)
+        contents = Contents([gaussians], [RESULT_COMMENT], cameras, scene_title(path), normals)
         (files,) = format_.write(add, out, temporary, contents).values()
         num_bytes = sum(file.stat().st_size for file in files)
         if cameras_path is not None:

@@ -37,7 +37,6 @@ class Contents:
     cameras: Cameras = NO_CAMERAS
     title: str = ""
     normals: bool = True  # of a ``.ply``, as in :func:`gsmerge.write_ply`
-    apart: bool = False  # write the parts of a page to files beside it
     extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
 
 
@@ -75,10 +74,6 @@ class Format:
     marks: Sequence[str] | None = ()  # comments of the input that it keeps; None: all of ``copied_comments``
     lost: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
 
-    # Its files besides the one that the path names
-    site: str = ""  # name of the main file if its parts are in files beside it
-    beside: Callable[[Path, bool], Sequence[Path]] = lambda path, apart: ()  # files whose names are known in advance
-
     # Bytes of a Gaussian by degree; of a .sog or .spz, as measured for results; empty if budgets cannot count them
     each: Sequence[float] = ()
     rest: Callable[[], int] = lambda: 0  # least bytes besides those of Gaussians
@@ -108,7 +103,6 @@ LEVELS = Format(
 HTML = Format(
     ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
     write=_page("site.write_output"), levels="", has_cameras=True, round_means=_lazy("sog.round_means"),
-    site="index.html", beside=_page("site.files_beside"),
     each=tuple(_IN_TEXT * sog_bytes for sog_bytes in _SOG), rest=_page("site.least_bytes"),
     measure=_page("site.measure"),
 )  # fmt: skip
