@@ -139,11 +139,11 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
     return (*files.paths, *(path for scene_files in files.more for path in input_files(scene_files)))
 
 
-def write_texts(texts: Mapping[Path, str | bytes], *, overwrite: bool) -> None:
-    """Write text files, of text or of its bytes: either all of them or none."""
+def write_texts(texts: Mapping[Path, str | bytes]) -> None:
+    """Write text files, of text or of its bytes, in place of existing ones: either all of them or none."""
     from gsmerge.io import atomic_outputs
 
-    with atomic_outputs(overwrite=overwrite) as add:
+    with atomic_outputs(overwrite=True) as add:
         for path, text in texts.items():
             add(path).write_bytes(text if isinstance(text, bytes) else text.encode(errors="replace"))
 

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.compaction.outputs import add_views
+from gsmerge.compaction.outputs import write_contents
 from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.frame import scene_frame
-from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, read_cameras, read_gaussians
+from gsmerge.io import GaussianFile, file_notes, output_format, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, upward_axis
@@ -34,7 +34,7 @@ from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, OpacityChoice, ScaleChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean, describe_counts
-from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath, make_scene
+from gsmerge.types import NO_CAMERAS, Gaussians, StrPath, make_scene
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,10 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
-    num_bytes, camera_path = _write(options, format_, gaussians, columns, moved, names, comments)
+    contents = Contents(
+        [gaussians], comments, moved, scene_title(options.inputs[0]), options.normals, extra_columns=columns
+    )
+    num_bytes, camera_path = write_contents(options.output, contents, names, overwrite=options.overwrite)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}
     inputs = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     input_cameras = None if stored is None else str(stored.path)
@@ -189,26 +192,3 @@ def _clean(
     frame = scene_frame(make_scene(gaussians, placed))
     canonical = frame.enter(replace(gaussians, means=gaussians.means.astype(np.float64)))
     return clean(canonical, options.clean, frame.enter_cameras(placed), images, frame.leave)
-
-
-def _write(
-    options: ConvertOptions,
-    format_: Format,
-    gaussians: Gaussians,
-    columns: np.ndarray,
-    cameras: Cameras,
-    names: Sequence[str],
-    comments: Sequence[str],
-) -> tuple[int, str | None]:
-    """Write the Gaussians, and the cameras beside them; return the number of bytes and the path of the cameras."""
-    out, camera_path = options.output, None
-    with atomic_outputs(overwrite=options.overwrite) as add:
-        title = scene_title(options.inputs[0])
-        contents = Contents([gaussians], comments, cameras, title, options.normals, extra_columns=columns)
-        written = format_.write(add, out, add(out), contents)
-        if len(cameras) and not format_.has_cameras:
-            camera_path = viewer_cameras_path(out)
-            add_views(add, camera_path, cameras, names, overwrite=options.overwrite)
-        num_bytes = sum(path.stat().st_size for path in written[out])
-    format_.finish(out)
-    return num_bytes, None if camera_path is None else str(camera_path)

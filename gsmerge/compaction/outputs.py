@@ -64,9 +64,23 @@ def write_result(
     comments = [RESULT_COMMENT, *([] if new_views is None else [new_views_comment(new_views)])]
     stored_levels = [level.numpy() for level in (levels if format_.levels else levels[:1])]
     contents = Contents(stored_levels, comments, cameras, out.stem)
-    with atomic_outputs(overwrite=overwrite) as add:
-        format_.write(add, out, add(out), contents)
-        if len(cameras) and not format_.has_cameras:
-            add_views(add, viewer_cameras_path(out), cameras, names, overwrite=overwrite)
-    format_.finish(out)
+    write_contents(out, contents, names, overwrite=overwrite)
     return out
+
+
+def write_contents(
+    out: Path, contents: Contents, names: Sequence[str], *, overwrite: bool, viewer_cameras: bool = True
+) -> tuple[int, str | None]:
+    """Write an output, and its cameras beside it if its format has none; return its bytes and their path.
+
+    ``names`` are those of the cameras. Without ``viewer_cameras`` no file is written beside it.
+    """
+    format_, path = output_format(out, levels=True, cameras=True), viewer_cameras_path(out)
+    is_beside = viewer_cameras and len(contents.cameras) > 0 and not format_.has_cameras
+    with atomic_outputs(overwrite=overwrite) as add:
+        written = format_.write(add, out, add(out), contents)
+        if is_beside:
+            add_views(add, path, contents.cameras, names, overwrite=overwrite)
+        num_bytes = sum(file.stat().st_size for file in written[out])
+    format_.finish(out)
+    return num_bytes, str(path) if is_beside else None

@@ -46,7 +46,6 @@ IMAGE_PLACES = (
     "keyframes/images",
 )  # fmt: skip
 MASK_PLACES = ("masks",)
-_PICTURES = ("images", "masks", "protect")  # fields of SceneFiles that are folders of pictures
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
