@@ -18,10 +18,10 @@ import typer.main
 
 import gsmerge
 from gsmerge import errors, integrations
-from gsmerge.measure import documents
 from gsmerge.cli.app import app
 from gsmerge.cli.paths import FileOptions
 from gsmerge.io.formats import gsm
+from gsmerge.measure import documents
 from gsmerge.networks import checkpoint
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
