@@ -87,7 +87,7 @@ def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
     tab.open(served)
     tab.wait(SETTLED)
     host = served.removesuffix("one.html")
-    assert [url for url in tab.requests() if not url.startswith((host, f"blob:{host}"))] == []
+    assert [url for url in tab.requests() if not url.startswith((host, "data:", f"blob:{host}"))] == []
     width, height = tab.run("[data.views[0].width, data.views[0].height]")
     tab.run(f"stage.style.right = stage.style.bottom = 'auto'; stage.style.width = '{width}px'")
     tab.run("document.querySelectorAll('header, footer').forEach((one) => one.remove())")
