@@ -388,18 +388,6 @@ def test_a_phone(opened: tuple[Browser, Any]) -> None:
     assert tab.run("document.documentElement.scrollWidth") == 844
 
 
-def test_the_narrowest_phone(opened: tuple[Browser, Any]) -> None:
-    """Nothing is wider than the screen, however the pictures are compared."""
-    tab, _ = opened
-    resize(tab, 320, 640)
-    tab.run("document.querySelectorAll('details').forEach(one => { one.open = true; })")
-    for mode in ("swipe", "side", "blink", "difference"):
-        for solid in ("''", "'1'"):
-            tab.run(f"set('mode', '{mode}'); set('solid', {solid})")
-            assert tab.run("document.documentElement.scrollWidth") == 320
-    tab.run("set('mode', 'swipe'); set('solid', '')")
-
-
 @pytest.mark.slow
 def test_the_colours_follow_the_system_and_the_switch(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
