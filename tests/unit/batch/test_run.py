@@ -280,16 +280,6 @@ make_result(*one_job(Path({str(scene)!r}), Path({str(out)!r})), wait=False)
     assert statuses(out) == {"room.ply": [DONE]}
 
 
-def test_a_record_cut_in_the_middle_is_done_again(scene: Path, out: Path, undisturbed: dict[str, str]) -> None:
-    run(scene, out)
-    path = out / "batch.jsonl"
-    kill(out)
-    path.write_bytes(path.read_bytes()[:100])
-    assert run(scene, out)["status"] == DONE
-    assert results(out) == undisturbed
-    assert len(records(out)) == 1
-
-
 @pytest.mark.parametrize(
     "name",
     ["gsmerge.batch.run.atomic_output", "gsmerge.batch.jobs.compact_files", "gsmerge.io.formats.write.write_gaussians"],

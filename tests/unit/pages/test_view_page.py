@@ -258,13 +258,6 @@ def test_one_scene_without_photos_is_compared_with_nothing(alone: ViewData) -> N
     assert page_of(alone).count('data-set="mode"') == 4
 
 
-def test_what_is_grey_says_why() -> None:
-    """Controls are disabled in one place, which gives the reason."""
-    script = files("gsmerge.pages").joinpath("templates", "view.js").read_text()
-    assert script.count(".disabled") == 1
-    assert re.search(r"control\.disabled = .*\n  control\.title = reason", script)
-
-
 def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
     assert "odd?" in page_of(replace(data, title="odd\udcff"))
 

@@ -25,7 +25,6 @@ from gsmerge.scene.read import load_scene
 SMOOTH = smooth_scene(48, 36)
 
 
-UNIT = 0.01  # of the maps in the Gaussians' world: six decimals are a ten thousandth of a depth, then
 ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
 
 
