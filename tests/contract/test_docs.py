@@ -189,21 +189,6 @@ def questions() -> dict[str, str]:
     return dict(found)
 
 
-def test_questions_are_answered_in_five_lines_with_a_command() -> None:
-    for question, answer in questions().items():
-        assert len(answer.splitlines()) <= 5, question
-        calls = re.findall(r"`(gsmerge [^`]+)`", answer)
-        assert calls or question == "Is anything sent anywhere?", question
-        for call in calls:
-            parse(call)
-
-
-def test_settings_that_many_guides_need_are_options() -> None:
-    pages = [(name, page) for page in GUIDES for name in set(re.findall(r"--set\s+(\w+)=", read(page)))]
-    named = [name for name, _ in pages]
-    assert {name for name in named if named.count(name) >= 3} == set()
-
-
 @pytest.mark.parametrize("page", [page for page in WRITTEN if "```python" in read(page)])
 def test_python_uses_public_names(page: str) -> None:
     for block in re.findall(r"```python\n(.*?)```", read(page), re.DOTALL):

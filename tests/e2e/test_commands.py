@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from batches import InlinePool
 from tiny_scene import edited_json
 
 import gsmerge
@@ -210,18 +209,3 @@ def test_notes_warnings_and_errors_are_lines_of_the_same_stream(small_scene: Pat
         (line,) = run(*words, "--progress", "json", code=code).err.splitlines()
         assert str(words[1]) in json.loads(line)["error"] or code == 2
         assert run(*words, code=code).err.startswith("gsmerge: error: ")
-
-
-def test_progress_of_a_batch_names_scenes(
-    small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
-    (tmp_path / "bad.ply").write_bytes(b"ply")
-    outcome = run("batch", small_scene, tmp_path / "bad.ply", "-o", tmp_path / "out", "--effort", "draft", "--progress",
-                  "json", code=5)  # fmt: skip
-    events = [json.loads(line) for line in outcome.err.splitlines()]
-    done = [event for event in events if "done" in event]
-    assert [next(iter(event)) for event in events if event not in done] == ["info", "error"]
-    assert [event["done"] for event in done] == [1, 2]
-    assert [event["total"] for event in done] == [2, 2]
-    assert sum(event["error"] is None for event in done) == 1

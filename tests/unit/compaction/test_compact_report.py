@@ -61,21 +61,6 @@ def test_what_the_input_covers_stands_beside_all_pixels(files: tuple[Path, Path]
     assert make_document(files)["psnr_covered"] is None
 
 
-def test_result_table(files: tuple[Path, Path]) -> None:
-    table = report.result_table(make_document(files), "gsmerge view scene small.ply")
-    assert table[0] == str(files[1])
-    assert [line.split() for line in table[1:]] == [
-        ["Gaussians", "1,000", "25", "2.50", "%"],
-        ["file", "2.5", "MB", "700", "B"],
-        ["its", "own", "photos", "20.00", "dB", "24.50", "dB", "a", "sample,", "of", "4", "of", "its", "views"],
-        ["time", "1.9", "s", "most", "in", "segment", "1.0,", "encode", "0.5"],
-        ["next", "gsmerge", "view", "scene", "small.ply"],
-    ]
-    assert max(map(len, table[1:])) <= 80
-    short = report.result_table(make_document(files, psnr_before=None, psnr_after=None))
-    assert [line.split()[0] for line in short[1:]] == ["Gaussians", "file", "time"]
-
-
 def test_new_views_come_first(files: tuple[Path, Path]) -> None:
     document = make_document(files, new_views=NewViews(17.25, 21.5, 3.0, 5.5, 3))
     assert document["new_views"] == {"before": 17.25, "after": 21.5, "low": 3.0, "high": 5.5, "views": 3}
