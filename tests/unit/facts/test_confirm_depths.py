@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scenes
 import unaligned_scenes
+from motions import with_nearer_half
 
 from gsmerge import Cameras, Scene
 from gsmerge.facts.confirm_depths import FEWEST, MOST, PIXELS, REACH, SAME, Agreement, confirm_depths
@@ -20,15 +21,6 @@ VIEWS, WIDTH, HEIGHT = 4, 48, 36
 @pytest.fixture(scope="module")
 def wall() -> Scene:
     return scenes.make_scene(scenes.wall(), scenes.arc(VIEWS, WIDTH, HEIGHT))
-
-
-def with_nearer_half(scene: Scene, views: list[int]) -> Scene:
-    """The right half of some views stands at six tenths of its depth."""
-    means = scene.gaussians.means.reshape(VIEWS, HEIGHT, WIDTH, 3).copy()
-    for view in views:
-        eye = scene.cameras.centres[view]
-        means[view, :, WIDTH // 2 :] = eye + 0.6 * (means[view, :, WIDTH // 2 :] - eye)
-    return replace(scene, gaussians=replace(scene.gaussians, means=means.reshape(-1, 3)))
 
 
 def turned_away(scene: Scene, view: int) -> Scene:

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from exports import export_rows, home, save_export, smooth_scene, turned, with_surface_rotations
-from messages import noted, refuses
+from messages import noted
 from scripts import load_script
 from sweeps import sweep
 from tiny_scene import Tiny, edited_json, rotation
 
-from gsmerge.errors import SceneError
 from gsmerge.scene.read import load_scene, read_scene
 
 
@@ -150,10 +149,3 @@ def test_views_dumped_from_a_model(tmp_path: Path, smooth: Tiny, root: Path) -> 
         assert np.allclose(scene.cameras.Ks, smooth.K)
         assert np.array_equal((scene.images * 255).round(), smooth.images)
     assert not read_scene(dump_of(smooth, tmp_path / "none", root, order="none")).has_own_pixels
-
-
-def test_a_damaged_dump(tmp_path: Path, smooth: Tiny, root: Path) -> None:
-    with refuses(SceneError, "views.npz", "'order'", "magic"):
-        read_scene(dump_of(smooth, tmp_path / "order", root, order="magic"), cameras=tmp_path / "order")
-    with refuses(SceneError, "views.npz", "[v,4,4]", (3, 4, 4)):
-        read_scene(dump_of(smooth, tmp_path / "K", root, K=smooth.K), cameras=tmp_path / "K")
