@@ -6,7 +6,6 @@ import ast
 import inspect
 import os
 import re
-import runpy
 import shlex
 import subprocess
 import sys
@@ -180,13 +179,6 @@ def test_index_links_every_page() -> None:
     assert [page for page in pages if page != "README.md" and f"]({page})" not in index] == []
 
 
-def test_readme_is_a_front_page() -> None:
-    assert len((ROOT / "README.md").read_bytes()) <= 8192
-    pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", read("README.md"))
-    (picture,) = [address for address in pictures if "badge" not in address]
-    assert (ROOT / picture).stat().st_size < 300_000
-
-
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_every_option_has_help(name: str) -> None:
     command = COMMANDS[name]
@@ -232,16 +224,6 @@ def test_every_key_of_the_report_is_described() -> None:
     keys = set(re.findall(r'^ {8}"(\w+)":', source, re.MULTILINE)) | {f.name for f in fields(gsmerge.CompactReport)}
     text = read("docs/reference/report.md")
     assert {key for key in keys if f"`{key}`" not in text} == set()
-
-
-def test_contributing_names_every_task() -> None:
-    tasks = runpy.run_path(str(ROOT / "tasks.py"))["TASKS"]
-    text = read("CONTRIBUTING.md")
-    assert [
-        name
-        for name in tasks
-        if not re.search(rf"`python3? tasks.py {name}\b|^python3 tasks.py {name}\b", text, re.MULTILINE)
-    ] == []
 
 
 def test_constraints_pin_every_dependency(root: Path) -> None:

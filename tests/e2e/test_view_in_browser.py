@@ -146,7 +146,8 @@ def test_a_gaussian_reaches_in_from_outside(opened: tuple[Browser, Any]) -> None
 @pytest.mark.slow
 def test_step_back_shows_the_side_without_photos(opened: tuple[Browser, Any]) -> None:
     tab, (scene, small, _) = opened
-    tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); jump(0); id('outside').click()")
+    tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); jump(0); zoomTo(6)")
+    tab.press("b")
     there = tab.run("[view().name, view().held_out, state.atCamera, id('scores').rows.length]")
     assert there == ["step back", False, True, 0]
     camera, _ = outside_camera(scene.cameras, scene.gaussians.means)
@@ -166,20 +167,6 @@ def test_step_back_shows_the_side_without_photos(opened: tuple[Browser, Any]) ->
     tab.run("set('left', 1)")
     tab.press("ArrowUp")
     assert tab.run("view().outside") is False
-
-
-def test_step_back_is_a_toggle(opened: tuple[Browser, Any]) -> None:
-    """By button and keys, with the whole picture on both ways."""
-    tab, _ = opened
-    state = "[state.view, state.zoom, id('outside').ariaPressed, view().outside]"
-    for solid, key in (("''", ""), ("''", "b"), ("'1'", "r"), ("'1'", "b")):
-        tab.run(f"set('solid', {solid}); jump(1); zoomTo(6); id('outside').click()")
-        assert tab.run(state)[1:] == [1, "true", True]
-        if key:
-            tab.press(key)
-        else:
-            tab.run("id('outside').click()")
-        assert tab.run(state) == [1, 1, "false", False]
 
 
 def test_what_cannot_be_seen_from_here_gives_way(opened: tuple[Browser, Any]) -> None:

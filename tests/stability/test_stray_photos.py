@@ -147,10 +147,6 @@ def test_photos_of_a_few_pixels_stay() -> None:
     assert odd_photos(scenes.make_scene(scenes.room(), scenes.arc(3, 24, 16)), np.copy) == []
 
 
-def test_a_view_given_twice_is_no_swap(room: Scene) -> None:
-    assert odd_photos(scenes.take_views(room, [0, 1, 1, 2, 3]), np.copy) == []
-
-
 @sweep("change", [one_black, one_of_noise, one_of_another_scene])
 def test_the_fit_does_without_some(room: Scene, unspoilt: CompactResult, change: Callable[[Photos], Photos]) -> None:
     """Nearly as good as with all photos, and as the input; the note and the report name them."""

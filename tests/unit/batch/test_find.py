@@ -108,12 +108,6 @@ def test_a_pattern_enters_folders_of_every_depth() -> None:
     assert actual("s/a/**") == ["s/a/b/c.ply"]
 
 
-def test_a_link_to_itself_is_passed_by() -> None:
-    touch("all/a.ply")
-    link("all/itself", "itself")
-    assert actual("all") == ["all/a.ply"]
-
-
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
 def test_a_folder_of_too_many_others_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.batch.find.MAX_FOLDERS", 3)

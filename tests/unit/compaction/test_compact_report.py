@@ -9,7 +9,7 @@ import pytest
 
 from gsmerge.compaction import report
 from gsmerge.compaction.new_views import NewViews
-from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
+from gsmerge.compaction.report import CompactReport, Covered
 from gsmerge.measure.documents import to_json
 from gsmerge.settings.compact import CompactOptions
 
@@ -69,13 +69,6 @@ def test_new_views_come_first(files: tuple[Path, Path]) -> None:
         i for i, row in enumerate(table) if row.startswith("new views 17.2 dB 21.5 dB +3.0 to +5.5 dB expected, from 3")
     )
     assert table[place + 1].startswith("its own photos")
-
-
-def test_photos_as_their_files_have_them_are_left_out_if_all_is_equal(files: tuple[Path, Path]) -> None:
-    for before, is_shown in ((20.0, False), (20.1, True)):
-        document = make_document(files, photo_files=PhotoFiles(before, 24.5001))
-        for text in ["\n".join(report.result_table(document))]:
-            assert ("photos as their files have them" in text) == is_shown
 
 
 def test_the_curve_marks_the_result(files: tuple[Path, Path]) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from messages import names, refuse_all
+from messages import refuse_all
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
@@ -259,17 +259,6 @@ def document_of(actual: Evaluation) -> dict[str, Any]:
         "a|b<i>": {"bytes": 1000, "bytes_by_attribute": {"means": 34 * len(actual.results[1].scores)}},
     }  # fmt: skip
     return evaluation_document(odd, facts, ["first <note>"])
-
-
-def test_narrow_terminals_keep_psnr_and_whole_words(actual: Evaluation) -> None:
-    wide = evaluation_lines(document_of(actual))
-    words = {word for line in wide for word in line.split()}
-    for columns in (79, 40):
-        lines = evaluation_lines(document_of(actual), columns)
-        assert max(map(len, lines)) <= columns
-        assert {word for line in lines for word in line.split()} <= words
-        assert sum(names(line, "PSNR (dB)", "SSIM") for line in lines) == 2
-        assert any("bytes each" in line for line in lines) == (columns == 79)
 
 
 def test_fog_and_holes_are_of_each_result(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
