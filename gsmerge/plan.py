@@ -22,7 +22,7 @@ from gsmerge.fit import photo_scale, start_share
 from gsmerge.photos.row_colors import RENDERS
 from gsmerge.photos.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.runtime.record import note
-from gsmerge.settings.budget import AUTO, BudgetOptions
+from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, STEPS, USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
@@ -326,12 +326,6 @@ def usual_blocks(num_gaussians: int, num_views: int) -> int:
     return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
 
 
-def note_surplus(size: SceneSize, budget: BudgetOptions) -> None:
-    """Note that a budget is larger than the number of Gaussians, if it is."""
-    if budget.number is not None and budget.number > size.num_gaussians:
-        note(f"budget {budget.budget}: the input has only {size.num_gaussians:,} Gaussians, so the result has no more")
-
-
 def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
     """List the settings and facts that prevent cutting a scene into blocks."""
     shared = [] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]
@@ -418,14 +412,14 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
             f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
             " gsmerge lab train --preset paper makes them"
         )
-    require_children("k", options.decode.max_k, checkpoint)
+    require_children(options.decode.max_k, checkpoint)
 
 
-def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> None:
-    """Raise UsageError if ``count``, the value of an option, exceeds the children that the networks make per group."""
+def require_children(count: int, checkpoint: Checkpoint | None) -> None:
+    """Raise UsageError if ``k`` exceeds the children that the networks make per group."""
     if checkpoint is not None and count > checkpoint.networks.options.max_children:
         raise UsageError(
-            f"{name}: expected at most {checkpoint.networks.options.max_children} with the absolute outputs of"
+            f"k: expected at most {checkpoint.networks.options.max_children} with the absolute outputs of"
             f" {checkpoint.path}, got {count}"
         )
 

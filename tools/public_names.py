@@ -17,10 +17,11 @@ from typing import Any
 import typer.main
 
 import gsmerge
-from gsmerge import errors, integrations, report
+from gsmerge import errors, integrations
 from gsmerge.cli.app import app
 from gsmerge.cli.paths import FileOptions
 from gsmerge.io.formats import gsm
+from gsmerge.measure import documents
 from gsmerge.networks import checkpoint
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
@@ -40,7 +41,7 @@ def public_names() -> dict[str, Any]:
     every = {name: command for name, command in commands.items() if name != "lab"}
     every |= {f"lab {name}": command for name, command in research.items()}
     return {
-        "schemas": {".gsm": gsm.SCHEMA, "checkpoint": checkpoint.SCHEMA, "document": report.SCHEMA_VERSION},
+        "schemas": {".gsm": gsm.SCHEMA, "checkpoint": checkpoint.SCHEMA, "document": documents.SCHEMA_VERSION},
         "exit codes": {
             name: kind.exit_code
             for name, kind in vars(errors).items()

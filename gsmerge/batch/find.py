@@ -162,17 +162,13 @@ def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
     """Yield the scenes that match a pattern, and those in matching folders; links are not followed into folders."""
     anchor = Path(pattern).anchor
     found = Path(anchor).glob(os.path.relpath(pattern, anchor) if anchor else pattern)
-    for name in natural_order(str(path) for path in found if not _is_hidden(path, pattern)):
+    named = Path(pattern).parts  # other parts with a dot in front are hidden
+    for name in natural_order(str(p) for p in found if all(part[:1] != "." or part in named for part in p.parts)):
         path = Path(name)
         if path.is_dir():
             yield from search.walk(path)
         elif may_hold_gaussians(path) and search.skip not in map(str, Path(os.path.realpath(path)).parents):
             yield path, None
-
-
-def _is_hidden(path: Path, pattern: str) -> bool:
-    """Return whether a part of a path that a pattern matches is hidden, and the pattern does not name it."""
-    return any(part.startswith(".") and part not in Path(pattern).parts for part in path.parts)
 
 
 def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:

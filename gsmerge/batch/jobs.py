@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from string import Formatter
-from typing import Any, Protocol
+from typing import Any
 
 from gsmerge.batch.find import find_named_scenes, main_file, scene_plys
 from gsmerge.compaction.files import Outputs, compact_files
@@ -75,16 +75,6 @@ class BatchOptions(Settings):
             raise ValueError(f"output: expected {expected} in braces, got {self.output!r}")
 
 
-class SceneCall(Protocol):
-    """A call that makes the result of a scene."""
-
-    def key(self, files: SceneFiles) -> str:
-        """Return a digest of all that the result depends on; the part after a dot depends on the settings only."""
-
-    def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
-        """Make the result; return its report and the files that were written."""
-
-
 @dataclass(frozen=True)
 class CompactCall:
     """The call that ``gsmerge compact`` makes."""
@@ -121,7 +111,7 @@ class Job:
 
     scene: str  # a file of Gaussians, or its folder
     outputs: tuple[str, ...]  # names of the result and of its coarser levels in the output folder
-    call: SceneCall
+    call: CompactCall
     num_gaussians: int  # estimated by the header or the bytes of its files; 0 if they cannot be read
     num_rest: int = 0  # columns of higher harmonics, estimated in the same way
     cameras: StrPath | None = None  # None: those beside the scene

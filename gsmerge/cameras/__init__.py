@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.cameras.layouts import ESTIMATED, TRIMS, Layout
 from gsmerge.cameras.rows_first import AlignmentResult, Recovery, align
-from gsmerge.cameras.score import Alignment, check_alignment, check_pairs, check_pixels, sample_pixels
+from gsmerge.cameras.score import Alignment, check_pairs, check_pixels, sample_pixels
 
 if TYPE_CHECKING:
     from gsmerge.cameras.estimate import estimate_cameras

@@ -82,15 +82,15 @@ def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray
 
 
 def solve_frame(
-    points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
+    points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray
 ) -> Similarity | None:
     """Solve robustly for the scale and shift that bring rotated and moved rays nearest to their points ``[t,3]``.
 
-    ``rotation`` is given. Without ``shifted`` only the scale is solved for. None if the scale is not positive.
+    ``rotation`` is given. None if the scale is not positive.
     """
     rays, centres = (matmul(vectors, rotation.T) for vectors in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    columns = [transform(across, centres)[:, :, None]] + ([across] if shifted else [])
+    columns = [transform(across, centres)[:, :, None], across]
     A, b = np.concatenate(columns, 2), transform(across, points)
     weights, solution = np.ones(len(points)), np.zeros(A.shape[2])
     for _ in range(_ROUNDS):
@@ -100,7 +100,7 @@ def solve_frame(
         solution = solve_symmetric(normal / np.outer(unit, unit), target / unit) / unit
         if not np.isfinite(solution).all() or solution[0] <= 0:
             return None
-        shift = solution[1:] if shifted else np.zeros(3)
+        shift = solution[1:]
         from_centres = points - solution[0] * centres - shift
         depth = np.abs((from_centres * rays).sum(1)) + 1e-12
         angle = np.linalg.norm(transform(across, from_centres), axis=1) / depth

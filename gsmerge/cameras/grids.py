@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.cameras.layouts import ESTIMATED
-from gsmerge.cameras.poses import Poses, describe_other_convention
+from gsmerge.cameras.poses import Poses, describe_convention
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, sizes_of, to_cameras
@@ -55,7 +55,8 @@ class PlacedGrid:
         """List notes on what was adapted; ``usual`` is the convention of the poses' format."""
         notes, convention = [*self.grid.notes], self.grid.camera_file.convention
         if convention != usual:
-            notes.append(f"{describe_other_convention(convention, usual)}: read so")
+            fits = f"the poses fit when read as {describe_convention(convention)}"
+            notes.append(f"{fits}, where this format has {usual[0]} with {usual[1]} axes: read so")
         if self.frame is not IDENTITY:
             evidence = f", as the {self.shown_by} show" if self.shown_by else ""
             notes.append(f"the cameras are {self.frame.description}{evidence}")

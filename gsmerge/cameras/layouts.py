@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -35,7 +34,8 @@ class Layout:
         if self.ids is not None:
             return self.ids
         count = self.views * self.width * self.height
-        return np.arange(count, dtype=_row_type(count))
+        # there may be hundreds of millions of rows
+        return np.arange(count, dtype=np.int32 if count <= np.iinfo(np.int32).max else np.int64)
 
     def sample(self, per_view: int) -> tuple[np.ndarray, np.ndarray]:
         """Return about ``per_view`` rows of each view, spread over its columns and lines, and their pixels."""
@@ -49,11 +49,6 @@ class Layout:
             parts.append(rows[:: spread_step(-(-len(rows) // per_view), self.width)])
         rows = np.concatenate(parts)
         return rows, self.ids[rows]
-
-
-def _row_type(count: int) -> type[np.signedinteger[Any]]:
-    """Return the smaller integer type that can number ``count`` rows; there may be hundreds of millions."""
-    return np.int32 if count <= np.iinfo(np.int32).max else np.int64
 
 
 def spread_step(step: int, width: int) -> int:

@@ -56,12 +56,6 @@ def describe_convention(convention: Convention) -> str:
     return f"{convention[0]} matrices with {convention[1]} axes"
 
 
-def describe_other_convention(convention: Convention, usual: Convention) -> str:
-    """Describe in words that poses fit in a ``convention`` other than ``usual``, the convention of the format."""
-    words = describe_convention(convention)
-    return f"the poses fit when read as {words}, where this format has {usual[0]} with {usual[1]} axes"
-
-
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
     """List the poses ``viewmats [c,4,4]`` as they are in each other convention, without duplicates."""
     stored, all_poses = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]

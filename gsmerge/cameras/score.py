@@ -111,18 +111,12 @@ def photo_colors(images: np.ndarray, views: np.ndarray, y: np.ndarray, x: np.nda
     return gather(images, views, y, x) if len(images) else np.full((len(x), 3), np.nan, np.float32)
 
 
-def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Alignment:
-    """Measure how far a sample of Gaussians in every view projects from their own pixels.
+def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Correspondences:
+    """Return the sample of Gaussians and pixels that :func:`check_pairs` measures.
 
     ``gaussians`` are V·H·W rows, view by view and line by line. Rows that are False in ``valid [V·H·W]`` (or
     ``[V,H,W]``) are left out. Raises ValueError for another number of rows.
     """
-    free_pages(vars(gaussians).values())
-    return check_pairs(sample_pixels(gaussians, cameras, valid), cameras)
-
-
-def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Correspondences:
-    """Return the sample of Gaussians and pixels that :func:`check_alignment` measures."""
     layout = Layout(len(cameras), cameras.width, cameras.height)
     if len(gaussians) != len(cameras) * cameras.height * cameras.width:
         raise ValueError(f"expected {layout.views} x {layout.height} x {layout.width} Gaussians, got {len(gaussians)}")

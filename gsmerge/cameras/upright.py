@@ -213,7 +213,7 @@ def _solve_agreed_frame(
     def solve(some_stretches: np.ndarray) -> Similarity | None:
         selected = pairs.select(np.isin(parts, some_stretches))
         rays = ray_directions(selected, inputs.cameras)
-        return solve_frame(selected.points, rays, rotation.rotation, shifted=True)
+        return solve_frame(selected.points, rays, rotation.rotation)
 
     def find_agreeing(frame: Similarity | None, limit: float) -> np.ndarray:
         if frame is None:

@@ -94,7 +94,7 @@ def batch(args: opt.Args) -> None:
         require_ray()
     jobs = find_jobs(args.scenes, out, options, set(RecordIndex(out).read_on().paths()))
     if args.dry_run:
-        print_plan(args, jobs, options)
+        _print_plan(args, jobs, options)
     else:
         _run(args, jobs, options)
 
@@ -113,7 +113,7 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
 
     interrupted = False
     try:
-        run_jobs(args, jobs, options, add)
+        _run_jobs(args, jobs, options, add)
     except KeyboardInterrupt:
         interrupted = True
         raise
@@ -138,14 +138,10 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
         raise TargetError("; ".join(doubts))
 
 
-def run_jobs(
-    args: opt.Args,
-    jobs: Sequence[Job],
-    options: BatchOptions,
-    add: Callable[[dict[str, Any]], None],
-    name: str = "scene",
+def _run_jobs(
+    args: opt.Args, jobs: Sequence[Job], options: BatchOptions, add: Callable[[dict[str, Any]], None]
 ) -> None:
-    """Run jobs, show progress, and pass each record to ``add``; ``name`` is the key of the job's name in a record."""
+    """Run jobs, show progress, and pass each record to ``add``."""
     from gsmerge.batch import run_batch
     from gsmerge.batch.records import FAILED, SKIPPED
 
@@ -165,7 +161,7 @@ def run_jobs(
             worse = report.get("worse")
             doubts = report.get("doubts", [doubt for doubt in (worse, report.get("left_out")) if doubt])
             notes = report.get("notes", doubts)
-            end = record[name], record["status"], num_ended, failure, num_failed, share, worse, notes, doubts
+            end = record["scene"], record["status"], num_ended, failure, num_failed, share, worse, notes, doubts
             progress(RunEnd(*end))
 
 
@@ -273,10 +269,8 @@ def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
     return output, *counts, human_share(report["ratio"]), gain, *quality, f"{report['total_seconds']:.1f}"
 
 
-def print_plan(
-    args: opt.Args, jobs: Sequence[Job], options: BatchOptions, unit: str = "scenes", notes: Sequence[str] = ()
-) -> None:
-    """Print which jobs a run would do; ``unit`` is the word for them."""
+def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
+    """Print which scenes a run would do."""
     from gsmerge.batch.run import choose_concurrency, pending_jobs
     from gsmerge.measure.documents import document_head
 
@@ -289,11 +283,11 @@ def print_plan(
         **document_head(),
         "dry_run": True,
         "output": str(out),
-        f"num_{unit}": len(jobs),
+        "num_scenes": len(jobs),
         "num_pending": num_pending,
         "jobs": concurrency.jobs,
         "threads": concurrency.threads,
-        unit: [
+        "scenes": [
             {
                 "scene": job.scene,
                 "output": job.output,
@@ -303,10 +297,9 @@ def print_plan(
             for job in jobs
         ],
         "options": options.settings.to_dict(),
-        "notes": list(notes),
+        "notes": [],
     }
     lines = [f"{job.scene} -> {f'refused: {refusal}' if refusal else out / job.output}" for job, refusal in pending]
-    lines += [f"note: {note}" for note in notes]
     refused = f", {num_refused:,} refused" if num_refused else ""
-    lines.append(f"would write {out}: {num_pending:,} of {len(jobs):,} {unit} to do{refused}, {concurrency}")
+    lines.append(f"would write {out}: {num_pending:,} of {len(jobs):,} scenes to do{refused}, {concurrency}")
     print_document(document, lines, as_json=args.json)

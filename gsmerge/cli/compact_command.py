@@ -13,15 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
-from gsmerge.cli.paths import (
-    FileOptions,
-    check_format,
-    check_outputs,
-    default_output,
-    files_beside,
-    input_files,
-    output_file,
-)
+from gsmerge.cli.paths import FileOptions, check_format, check_outputs, default_output, input_files, output_file
 from gsmerge.errors import TargetError, UsageError
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.reading import NONE
@@ -45,7 +37,7 @@ PARAMETERS = (
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
     opt.output(f"{opt.COMPACT_SCENE} .html: one page with a viewer, to send. lod-meta.json: levels for streaming. "
-               "colmap: a COLMAP model. Any other folder gets SCENE.compact.ply.", "SCENE.compact.ply"),
+               "A folder gets SCENE.compact.ply.", "SCENE.compact.ply"),
     "overwrite strict dry_run seed threads",
 )  # fmt: skip
 
@@ -63,8 +55,7 @@ def look(args: opt.Args) -> None:
     if not features:
         _check_scenes(args)  # before the output has a name, so that a remedy names -o
     default = default_output(scene if features else args.files(*args.scenes).base)
-    writing: FileOptions = args.make(CompactOptions, FileOptions, Engine)[1]
-    args.output = output_file(args.output or default, default.name, site=writing.site)
+    args.output = output_file(args.output or default, default.name)
     # The page cannot show joined files or Feature Gaussians, so it shows the result alone
     shown = [args.output] if features or len(args.scenes) > 1 else [scene, args.output]
     if os.path.lexists(args.output) and not (args.overwrite or args.dry_run):
@@ -105,9 +96,9 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     _check_scenes(args)
     files = args.files(*args.scenes)
     default = default_output(files.base)
-    out = output_file(args.output or default, default.name, site=writing.site)
+    out = output_file(args.output or default, default.name)
     settings = _fit_format(args, settings, out)
-    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not find_format(out).cameras else None
+    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not find_format(out).has_cameras else None
     _check_outputs(args, files, settings, writing, out, cameras)
     if args.dry_run:
         print_plan(args, files, settings, out, hints)
@@ -117,7 +108,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
 
     outputs = Outputs(
         out, viewer_cameras=cameras, overwrite=args.overwrite, normals=writing.normals,
-        full_columns=writing.columns == "full", site=writing.site,
+        full_columns=writing.columns == "full",
     )  # fmt: skip
     seconds_before = {"import": perf_counter() - start}
     with separate_stdout(engine.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
@@ -155,7 +146,7 @@ def _check_outputs(
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
     # Without --overwrite the camera file may exist, from a result in another format
     replaced_cameras = cameras if args.overwrite else None
-    outputs = (out, *files_beside(out, site=writing.site), *levels, replaced_cameras)
+    outputs = (out, *levels, replaced_cameras)
     check_outputs(outputs, (*input_files(files), *networks), overwrite=args.overwrite or args.dry_run)
     check_format(out, writing)
     if writing.columns == "full" and settings.budget.in_bytes:
@@ -165,7 +156,7 @@ def _check_outputs(
 def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
     """Print the report of a run, and how to view it unless a page is ``shown``; TargetError if a target is missed."""
     from gsmerge.compaction.report import result_table
-    from gsmerge.io.formats.table import VIEWED, find_format
+    from gsmerge.io.formats.table import VIEWED
 
     doubts = [document["worse"], document["input"]["left_out"] if args.strict else None]
     notes = [note for note in document["notes"] if note not in doubts]
@@ -173,7 +164,6 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     columns, next_step = terminal_columns(sys.stdout), None
     if columns is not None:
         words = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
-        words = ["python", "-m", "http.server", "-d", str(out.parent)] if out.name == find_format(out).site else words
         # A file name that begins with a dash would be taken for an option
         next_step = shlex.join([f"./{word}" if word.endswith(out.name) and word[0] == "-" else word for word in words])
     lines = result_table(document, next_step or None, columns=columns)
@@ -199,13 +189,13 @@ def _decode(args: opt.Args, path: Path, start: float) -> None:
     from gsmerge.states.files import decode_file, decoding_line
 
     decoding, writing = args.make(DecodeOptions, FileOptions, columns="needed")
-    out = output_file(args.output or default_output(path), default_output(path).name, site=writing.site)
-    check_outputs((out, *files_beside(out, site=writing.site)), (path,), overwrite=args.overwrite or args.dry_run)
+    out = output_file(args.output or default_output(path), default_output(path).name)
+    check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
     check_format(out, writing)
     before = {"import": perf_counter() - start}
     document = decode_file(
         path, out, decoding, normals=writing.normals, viewer_cameras=writing.viewer_cameras,
-        site=writing.site, overwrite=args.overwrite, dry_run=args.dry_run, seconds_before=before,
+        overwrite=args.overwrite, dry_run=args.dry_run, seconds_before=before,
     )  # fmt: skip
     say_notes(document["notes"], quiet=args.silent)
     print_document(document, decoding_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
-from gsmerge.cli.paths import FileOptions, check_format, check_outputs, files_beside, output_file
+from gsmerge.cli.paths import FileOptions, check_format, check_outputs, output_file
 from gsmerge.errors import UsageError
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.setting import Settings, setting
@@ -18,15 +18,14 @@ from gsmerge.settings.stages import CleanOptions
 class PhotoOptions(Settings):
     """Photos that a conversion reads."""
 
-    images: str | None = setting(None, "Folder of the photos of the cameras. `--drop sky` needs it, and a COLMAP model "
-        "links it. For a model, a folder `images` beside the cameras is found without this setting.")  # fmt: skip
+    images: str | None = setting(None, "Folder of the photos of the cameras, which `--drop sky` needs.")
 
 
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
                  "Files or folders of Gaussians, such as a .ply, .spz or .sog. Several files in one coordinate frame "
                  "are joined. The last path is the output, and its name sets the format, also .html (a page to send), "
-                 "lod-meta.json, a folder, or a folder named colmap."),
+                 "lod-meta.json, or a folder."),
     opt.changed("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
     opt.changed("hint", help="How the files store opacity and scales, if it is not recognised: opacity=logit or "
@@ -46,8 +45,8 @@ def convert(args: opt.Args) -> None:
     writing, photos, cleaning, placement = args.make(FileOptions, PhotoOptions, CleanOptions, PlacementOptions)
     images = None if photos.images is None else opt.named_or_none(photos.images)
     named = [path for path in (args.cameras, images) if isinstance(path, Path)]
-    output = output_file(output, inputs[0].name, site=writing.site)
-    check_outputs((output, *files_beside(output, site=writing.site)), (*inputs, *named), overwrite=args.overwrite)
+    output = output_file(output, inputs[0].name)
+    check_outputs((output,), (*inputs, *named), overwrite=args.overwrite)
     check_format(output, writing)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.record import record_run
@@ -55,7 +54,7 @@ def convert(args: opt.Args) -> None:
     options = ConvertOptions(
         inputs, output, args.cameras, images, args.opacity, args.hints().scales, cleaning, placement,
         normals=writing.normals, full_columns=writing.columns == "full",
-        site=writing.site, overwrite=args.overwrite,
+        overwrite=args.overwrite,
     )  # fmt: skip
     with stage_progress(quiet=args.silent) as progress, record_run(progress):
         document = convert_files(options)

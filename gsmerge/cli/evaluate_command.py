@@ -123,4 +123,4 @@ def _write(
             pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, evaluation, stills, cameras=pair.cameras
         )
         texts |= {path: view_page(data) for path in outputs if path not in texts}
-    write_texts(texts, overwrite=True)
+    write_texts(texts)

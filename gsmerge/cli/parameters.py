@@ -336,8 +336,7 @@ def call(function: Callable[..., None], **values: Any) -> None:
     function.__wrapped__(Args(**{name: one.default for name, one in parameters} | values))  # type: ignore[attr-defined]
 
 
-def settings_option(*kinds: type | LazyFunction, help: str = "Any other setting, such as {}; may be repeated. --set "
-                    "help lists all.", example: str = "match=aabb") -> Declared:  # fmt: skip
+def settings_option(*kinds: type | LazyFunction, example: str = "match=aabb") -> Declared:
     """Declare ``--set`` for the settings of ``kinds``; a class that takes long to import is given as a LazyFunction."""
 
     def show(values: list[str] | None) -> list[str] | None:
@@ -346,7 +345,13 @@ def settings_option(*kinds: type | LazyFunction, help: str = "Any other setting,
         print("\n".join(_settings_lines(listed_settings(kinds))))
         raise typer.Exit
 
-    return changed("set", help=help.format(example), callback=show, is_eager=True, kinds=kinds)
+    return changed(
+        "set",
+        help=f"Any other setting, such as {example}; may be repeated. --set help lists all.",
+        callback=show,
+        is_eager=True,
+        kinds=kinds,
+    )
 
 
 def listed_settings(kinds: Iterable[type | LazyFunction]) -> dict[str, Setting]:

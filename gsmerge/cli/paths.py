@@ -29,8 +29,6 @@ class FileOptions(Settings):
     columns: str = setting("needed", "Columns of a `.ply`. needed: only those that are needed; full: all 62 columns of "
         "INRIA's files, with zeros for missing harmonics up to degree 3, which Unity's importer needs.",
         choices=("needed", "full"))  # fmt: skip
-    site: bool = setting(False, "Write a web site into the folder `-o`: the same page as for `.html`, with scene "
-        "and viewer in files of their own.")  # fmt: skip
     viewer_cameras: bool = setting(True, "Write the cameras of the input views beside the result of `compact`, as "
         "`NAME.cameras.json` for viewers.")  # fmt: skip
 
@@ -40,21 +38,11 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def output_file(output: Path, name: str, *, site: bool = False) -> Path:
+def output_file(output: Path, name: str) -> Path:
     """Return the file that an output names; for a folder, return a file in it.
 
-    A name without an ending is a folder unless a file of this name exists. The file in a folder is the page of a
-    ``site``, or the main file of a format if the folder has the name of the format, or otherwise ``name``.
+    A name without an ending is a folder unless a file of this name exists. The file in a folder is ``name``.
     """
-    from gsmerge.io.formats.table import FOLDERS, FORMATS, OUTPUT_FORMATS
-
-    if site:
-        page = next(row for row in FORMATS if row.site)
-        if output.suffix.lower() in OUTPUT_FORMATS:
-            raise UsageError(f"site: expected a folder to write into, got {output}")
-        return output if page.names(output) else output / page.site
-    if output.name in FOLDERS:
-        return output / FOLDERS[output.name].place / FOLDERS[output.name].ending
     is_folder = output.is_dir() or not (output.suffix or os.path.lexists(output))
     return output / name if is_folder else output
 
@@ -73,13 +61,6 @@ def _read_start(path: Path) -> bytes:
         return b""
 
 
-def files_beside(output: Path, *, site: bool = False) -> tuple[Path, ...]:
-    """List further files that belong to an output; SceneError if files of another program have their names."""
-    from gsmerge.io.formats.table import find_format
-
-    return tuple(find_format(output).beside(output, site))
-
-
 def check_format(output: Path, options: FileOptions) -> None:
     """Raise UsageError if an output's ending is unknown, needs a missing package, or does not fit the options."""
     from gsmerge.io import output_format
@@ -92,7 +73,7 @@ def check_format(output: Path, options: FileOptions) -> None:
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Raise UsageError for an output that is an input, exists without ``overwrite``, or is given twice.
 
-    ``inputs`` are the files that are read, and folders of photos or COLMAP models; no file in them is replaced.
+    ``inputs`` are the files that are read, and folders of photos or cameras; no file in them is replaced.
     SceneError if the output cannot be written. Missing folders are made together with their first file, so a run that
     fails earlier makes no folders.
     """
@@ -112,7 +93,6 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     """Check one output as :func:`check_outputs` does; ``inputs``: real paths."""
-    from gsmerge.io.formats.table import MODEL_NAMES
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:
@@ -125,7 +105,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     if output.is_dir():
         raise UsageError(f"{output}: expected a file to write, found a folder; name a file in it")
     target = Path(os.path.realpath(output))
-    is_read = (target.suffix.lower() in IMAGE_SUFFIXES or target.name in MODEL_NAMES) and target.exists()
+    is_read = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
     if str(target) in inputs or (is_read and str(target.parent) in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another output")
     if os.path.lexists(output) and not overwrite:
@@ -159,11 +139,11 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
     return (*files.paths, *(path for scene_files in files.more for path in input_files(scene_files)))
 
 
-def write_texts(texts: Mapping[Path, str | bytes], *, overwrite: bool) -> None:
-    """Write text files, of text or of its bytes: either all of them or none."""
+def write_texts(texts: Mapping[Path, str | bytes]) -> None:
+    """Write text files, of text or of its bytes, in place of existing ones: either all of them or none."""
     from gsmerge.io import atomic_outputs
 
-    with atomic_outputs(overwrite=overwrite) as add:
+    with atomic_outputs(overwrite=True) as add:
         for path, text in texts.items():
             add(path).write_bytes(text if isinstance(text, bytes) else text.encode(errors="replace"))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from gsmerge.cli import parameters as opt
@@ -35,6 +36,14 @@ def parse_views(text: str) -> int | str:
     return count
 
 
+def parse_level(text: str) -> float:
+    """Parse ``--background``."""
+    with suppress(ValueError):
+        if 0 <= float(text) <= 1:
+            return float(text)
+    raise ValueError(f"expected a grey level, 0 to 1, got {text!r}")
+
+
 @opt.command(
     opt.argument("scenes", list[Path], "SCENES...", "Files of Gaussians: before, after, ... The first may be a "
                  "folder."),
@@ -56,8 +65,8 @@ def parse_views(text: str) -> int | str:
         opt.option("views", str, "Largest number of views, at equal intervals; or the name of one view, such as "
                    "00006 or 6.jpg (6 would be a number).", metavar="NUMBER|NAME", parser=parse_views,
                    wording="4 on a panel, else all"),
-        opt.option("background", float, "Grey level behind the scene, 0 to 1.", wording="0", metavar="LEVEL", min=0,
-                   max=1),
+        opt.option("background", float, "Grey level behind the scene, 0 to 1.", wording="0", metavar="LEVEL",
+                   parser=parse_level),
     ),
     "overwrite",
 )  # fmt: skip

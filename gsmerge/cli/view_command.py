@@ -60,7 +60,7 @@ def view(args: opt.Args) -> None:
             progress=progress,
         )  # fmt: skip
     page = view_page(data)
-    write_texts({output: page}, overwrite=True)
+    write_texts({output: page})
     say_notes(data.notes, data.doubts, quiet=args.silent)
     summary = headline(data) + speed_words(speed(data)).replace("\u00a0", " ")
     notes = [*pair.notes, *data.notes]

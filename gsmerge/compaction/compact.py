@@ -31,7 +31,7 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.photos.row_colors import RENDERS
 from gsmerge.pipeline import Build
-from gsmerge.plan import Plan, choose_for_scene, note_surplus
+from gsmerge.plan import Plan, choose_for_scene
 from gsmerge.runtime.record import (
     Progress,
     Record,
@@ -96,7 +96,9 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
     """Compact a scene: in blocks if its views are cut into several, otherwise in one piece."""
     size = measure_size(scene)
     choices = choose_for_scene(size, options)  # the decisions that need no computation
-    note_surplus(size, options.budget)
+    budget = options.budget
+    if budget.number is not None and budget.number > size.num_gaussians:
+        note(f"budget {budget.budget}: the input has only {size.num_gaussians:,} Gaussians, so the result has no more")
     if choices.blocks > 1:
         from gsmerge.compaction.blocks import compact_in_blocks, cut_views
 

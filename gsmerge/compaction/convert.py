@@ -10,20 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.compaction.outputs import add_views, name_photos
+from gsmerge.compaction.outputs import write_contents
 from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.frame import scene_frame
-from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, read_cameras, read_gaussians
+from gsmerge.io import GaussianFile, file_notes, output_format, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT, is_of_frame, upward_axis
 from gsmerge.io.formats.extra_columns import describe_extra_columns, join_extra_columns, read_extra_columns
 from gsmerge.io.formats.read import FileInfo, kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
-from gsmerge.io.formats.table import Contents, Format, NamedPhotos
-from gsmerge.io.formats.write import output_notes
+from gsmerge.io.formats.table import Contents, Format
+from gsmerge.io.formats.write import lost_harmonics
 from gsmerge.io.photo_files import read_images
 from gsmerge.io.scene_files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.measure.documents import document_head
@@ -34,7 +34,7 @@ from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, OpacityChoice, ScaleChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean, describe_counts
-from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath, make_scene
+from gsmerge.types import NO_CAMERAS, Gaussians, StrPath, make_scene
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,6 @@ class ConvertOptions:
     placement: PlacementOptions = field(default_factory=PlacementOptions)
     normals: bool = True  # Write the three columns of zeros that some viewers expect in a ``.ply``
     full_columns: bool = False  # Pad its harmonics with zeros up to degree 3
-    site: bool = False  # Write the files of a page beside it
     overwrite: bool = False
 
 
@@ -70,8 +69,6 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         gaussians = join_gaussians([file.gaussians[file.valid] for file in files])
         stored, unread = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
-        if cameras is None and format_.cameras == "needed":
-            raise _cameras_missing(options, format_)
         count = len(gaussians)
         rows, left_out = _clean(gaussians, options, stored)
         gaussians = gaussians[rows]
@@ -94,30 +91,24 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, left_out["unseen"], count, None if stored is None else stored.path)
     names = () if stored is None else stored.names
-    photos = name_photos(_photo_folder(options, stored), names)
-    notes += output_notes(options.output, gaussians.sh_degree, photos) + rounding_notes(options.output, gaussians)
+    notes += lost_harmonics(options.output, gaussians.sh_degree) + rounding_notes(options.output, gaussians)
     comments, comment_notes = _join_comments(infos, format_, moves=options.placement.moves)
     notes += comment_notes
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
-    num_bytes, camera_path = _write(options, format_, gaussians, columns, moved, photos, names, comments)
+    contents = Contents(
+        [gaussians], comments, moved, scene_title(options.inputs[0]), options.normals, extra_columns=columns
+    )
+    num_bytes, camera_path = write_contents(options.output, contents, names, overwrite=options.overwrite)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": format_.ending}
     inputs = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     input_cameras = None if stored is None else str(stored.path)
     old = viewer_cameras_path(options.output)
-    if camera_path is None and not format_.cameras and old.is_file():
+    if camera_path is None and not format_.has_cameras and old.is_file():
         notes.append(f"{old} is of an earlier file of that name, not of this one: delete it")
     document = document_head() | {"inputs": inputs, "cameras": input_cameras, "left_out": left_out, "output": facts}
     return document | {"viewer_cameras": camera_path, "notes": notes}
-
-
-def _cameras_missing(options: ConvertOptions, format_: Format) -> SceneError:
-    """Return the error for an output format that needs cameras, if none are known."""
-    title = format_.about.partition(":")[0]
-    problem = f"expected a result's cameras inside or beside it for {title}, found none"
-    camera_file = find_scene_files(options.inputs[0]).cameras if options.cameras != NONE else None
-    return SceneError(options.inputs[0], problem, f"name them with --cameras {camera_file or 'FILE'}")
 
 
 def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -> tuple[list[str], list[str]]:
@@ -181,13 +172,6 @@ def _read_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]
         return None, [f"{path} is left out: {error.problem}; name other cameras with --cameras, or pass none"]
 
 
-def _photo_folder(options: ConvertOptions, stored: CameraFile | None) -> Path | None:
-    """Return the folder of the cameras' photos: the given folder, or ``images`` beside the camera file."""
-    if stored is None or options.images is not None:
-        return named_path(options.images)
-    return Path(stored.path).parent / "images"
-
-
 def _clean(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
 ) -> tuple[np.ndarray, dict[str, int]]:
@@ -208,29 +192,3 @@ def _clean(
     frame = scene_frame(make_scene(gaussians, placed))
     canonical = frame.enter(replace(gaussians, means=gaussians.means.astype(np.float64)))
     return clean(canonical, options.clean, frame.enter_cameras(placed), images, frame.leave)
-
-
-def _write(
-    options: ConvertOptions,
-    format_: Format,
-    gaussians: Gaussians,
-    columns: np.ndarray,
-    cameras: Cameras,
-    photos: NamedPhotos,
-    names: Sequence[str],
-    comments: Sequence[str],
-) -> tuple[int, str | None]:
-    """Write the Gaussians, and the cameras beside them; return the number of bytes and the path of the cameras."""
-    out, camera_path = options.output, None
-    with atomic_outputs(overwrite=options.overwrite) as add:
-        title = scene_title(options.inputs[0])
-        contents = Contents(
-            [gaussians], comments, cameras, photos, title, options.normals, options.site, extra_columns=columns
-        )
-        written = format_.write(add, out, add(out), contents)
-        if len(cameras) and not format_.cameras:
-            camera_path = viewer_cameras_path(out)
-            add_views(add, camera_path, cameras, names, overwrite=options.overwrite)
-        num_bytes = sum(path.stat().st_size for path in written[out])
-    format_.finish(out)
-    return num_bytes, None if camera_path is None else str(camera_path)

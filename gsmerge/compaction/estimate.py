@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gsmerge.compaction.costs import RunCosts, expected_parts, mean_inside
-from gsmerge.compaction.files import Outputs, check_cameras, sized
+from gsmerge.compaction.files import Outputs, sized
 from gsmerge.compaction.make_plan import load_networks
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.partition import gaussians_at_once
@@ -119,7 +119,6 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Describe in a document what :func:`gsmerge.compaction.files.compact_files` would make of a scene."""
     scene, out, settings = load.scene, outputs.result, sized(settings, outputs)
-    check_cameras(scene, out)
     _, unused = check_method(settings, scene)
     notes = [*load.notes, *unused, *views_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:

@@ -10,17 +10,17 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.outputs import add_views, name_photos
+from gsmerge.compaction.outputs import add_views
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
-from gsmerge.errors import DoubtWarning, SceneError, UsageError
+from gsmerge.errors import DoubtWarning, SceneError
 from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
 from gsmerge.io.formats.columns import UNUSED, list_names
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rounding import rounding_notes
-from gsmerge.io.formats.table import Contents, find_format
-from gsmerge.io.formats.write import output_notes
+from gsmerge.io.formats.table import Contents
+from gsmerge.io.formats.write import lost_harmonics
 from gsmerge.io.scene_files import SceneFiles, result_cameras, scene_title
 from gsmerge.photos.compare import STRAY_PHOTOS
 from gsmerge.runtime.memory import release_memory
@@ -42,7 +42,6 @@ class Outputs:
     overwrite: bool = False
     normals: bool = True  # Write the three columns of zeros that some viewers expect in a ``.ply``
     full_columns: bool = False  # Pad harmonics of a ``.ply`` with zeros up to degree 3
-    site: bool = False  # Write the files of a page beside it
 
 
 def compact_files(
@@ -71,7 +70,6 @@ def compact_files(
         temporary = add(out)
         load = read_input(files, opacity=opacity, hints=hints)
         on_read(load)
-        check_cameras(load.scene, out)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras if len(load.scene) else None
@@ -87,10 +85,9 @@ def compact_files(
         comments, expected = [RESULT_COMMENT, *load.comments], result.report.new_views
         if expected is not None:
             comments.append(new_views_comment(expected))
-        photos, title = name_photos(load.files.images, names), scene_title(files.ply)
-        notes = output_notes(out, result.gaussians.sh_degree, photos) + rounding_notes(out, result.gaussians)
+        notes = lost_harmonics(out, result.gaussians.sh_degree) + rounding_notes(out, result.gaussians)
         levels, cameras = [level.gaussians for level in results], result.cameras[views]
-        contents = Contents(levels, comments, cameras, photos, title, normals=outputs.normals, apart=outputs.site)
+        contents = Contents(levels, comments, cameras, scene_title(files.ply), outputs.normals)
         written = format_.write(add, out, temporary, contents)
         if cameras_path is not None:
             add_views(add, cameras_path, cameras, names, overwrite=outputs.overwrite)
@@ -134,12 +131,6 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     loaded = load_files(files, opacity=opacity, hints=hints).without_photos()
     release_memory()
     return replace(loaded, notes=(*loaded.notes, *_compact_notes(loaded)))
-
-
-def check_cameras(scene: Scene, out: Path) -> None:
-    """Raise UsageError if the output needs cameras and the scene has none."""
-    if len(scene) == 0 and find_format(out).cameras == "needed":
-        raise UsageError(f"{out}: expected a scene with cameras, got none")
 
 
 def _compact_notes(loaded: Loaded) -> list[str]:

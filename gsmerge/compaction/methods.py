@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare, prepare_alone
@@ -21,7 +20,6 @@ from gsmerge.settings.setting import flat_settings
 from gsmerge.settings.stages import DecodeOptions, MatchOptions, PrepareOptions, SegmentOptions
 from gsmerge.types import Gaussians, Scene
 
-Need = Literal["photos", "pixels"]
 COMMON = ("method", "seed", "threads", "crop", "drop")  # settings that all methods use
 
 
@@ -33,7 +31,7 @@ class Method:
         name: The name on the command line.
         run: Prepared scene, plan and a number of Gaussians -> canonical Gaussians, at most that number unless the
             method keeps those of the input. It times itself by stages of the record.
-        needs: What the scene must have: ``"photos"``, or ``"pixels"``, which means one Gaussian per pixel.
+        needs_photos: The scene must have photos.
         uses: Flat names of the settings that it uses, in addition to those that all methods use.
         check: Raises a UsageError if a program that the method runs is missing.
         prepare: Scene and options -> the prepared scene that ``run`` gets.
@@ -41,7 +39,7 @@ class Method:
 
     name: str
     run: Callable[[Prepared, Plan, int], Gaussians]
-    needs: tuple[Need, ...] = ()
+    needs_photos: bool = False
     uses: tuple[str, ...] = COUNTS
     check: Callable[[], object] = lambda: None
     prepare: Callable[[Scene, PrepareOptions], Prepared] = prepare
@@ -87,10 +85,8 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
     if method is SUPERPIXELS:
         return method, []
     place = f"method {method.name}"
-    if "photos" in method.needs and not scene.is_shown:
+    if method.needs_photos and not scene.is_shown:
         raise UsageError(f"{place}: expected photos, found none; give --images, or another method")
-    if "pixels" in method.needs and not scene.has_own_pixels:
-        raise UsageError(f"{place}: expected one Gaussian per pixel of every view; give another method")
     unused = options.changed(name for name in options.to_dict() if name not in (*COMMON, *method.uses))
     return method, [f"{place} does not use {', '.join(unused)}"] if unused else []
 

@@ -87,11 +87,6 @@ def can_try(prepared: Prepared, count: int = 0) -> bool:
     return prepared.agreement is not None and can_leave_out(prepared) and count <= MOST_SHARE * pixels
 
 
-def _reduction(scene: PicturedScene) -> int:
-    """Return the factor by which the sides of the trial's pictures are shorter."""
-    return max(1, max(scene.cameras.width, scene.cameras.height) // SIDE)
-
-
 def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> Trial | None:
     """Measure in a trial the PSNR of views that are left out of a fit, for a result of ``count`` Gaussians.
 
@@ -124,7 +119,7 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Bu
     """
     around = views_around(prepared.scene.cameras, views, MOST_VIEWS)
     scene = prepared.scene if len(around) == len(prepared.scene) else subset(prepared.scene, around)
-    small = shrink_scene(scene, _reduction(scene))
+    small = shrink_scene(scene, max(1, max(scene.cameras.width, scene.cameras.height) // SIDE))
     left_out = leave_out(small, [around.index(view) for view in views], prepared)
     if left_out is None:
         return None

@@ -15,8 +15,7 @@ from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT, ExpectedScores, new_views_comment
-from gsmerge.io.formats.table import FOLDERS, Contents, NamedPhotos
-from gsmerge.io.image_names import match_images
+from gsmerge.io.formats.table import Contents
 from gsmerge.types import Cameras, Gaussians
 
 # Cameras are the same up to this difference of their viewmats, relative to the largest translation. Their Ks may differ
@@ -48,20 +47,8 @@ def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> bool:
     return False
 
 
-def name_photos(photos: Path | None, names: Sequence[str]) -> NamedPhotos:
-    """Name views by their files in a folder of photos, as COLMAP does; without it, by their names in the camera file.
-
-    Returns each name with the path of its photo, or None if no folder has it.
-    """
-    if photos is not None and photos.is_dir():
-        with suppress(SceneError):
-            return [(file.relative_to(photos).as_posix(), file) for file in match_images(photos, names)]
-    # a transforms.json names photos with their folder
-    return [(name.removeprefix("./").removeprefix("images/"), None) for name in names]
-
-
 def write_result(
-    path: Path,
+    out: Path,
     levels: Sequence[Gaussians],
     cameras: Cameras,
     names: Sequence[str],
@@ -69,22 +56,31 @@ def write_result(
     *,
     overwrite: bool,
 ) -> Path:
-    """Write the levels of a result, the finest first, with its cameras; return the path of the main file.
+    """Write the levels of a result, the finest first, with its cameras; return its path.
 
-    The name chooses the format. Raises UsageError if no format has this ending, or if the format needs cameras and
-    there are none.
+    The name chooses the format. Raises UsageError if no format has this ending.
     """
-    row = FOLDERS.get(path.name)
-    out = path if row is None else path / row.place / row.ending
     format_ = output_format(out, levels=True, cameras=True)
-    if not len(cameras) and format_.cameras == "needed":
-        raise UsageError(f"{out}: expected a scene with cameras, got none")
     comments = [RESULT_COMMENT, *([] if new_views is None else [new_views_comment(new_views)])]
     stored_levels = [level.numpy() for level in (levels if format_.levels else levels[:1])]
-    contents = Contents(stored_levels, comments, cameras, name_photos(None, names), out.stem)
-    with atomic_outputs(overwrite=overwrite) as add:
-        format_.write(add, out, add(out), contents)
-        if len(cameras) and not format_.cameras:
-            add_views(add, viewer_cameras_path(out), cameras, names, overwrite=overwrite)
-    format_.finish(out)
+    contents = Contents(stored_levels, comments, cameras, out.stem)
+    write_contents(out, contents, names, overwrite=overwrite)
     return out
+
+
+def write_contents(
+    out: Path, contents: Contents, names: Sequence[str], *, overwrite: bool, viewer_cameras: bool = True
+) -> tuple[int, str | None]:
+    """Write an output, and its cameras beside it if its format has none; return its bytes and their path.
+
+    ``names`` are those of the cameras. Without ``viewer_cameras`` no file is written beside it.
+    """
+    format_, path = output_format(out, levels=True, cameras=True), viewer_cameras_path(out)
+    is_beside = viewer_cameras and len(contents.cameras) > 0 and not format_.has_cameras
+    with atomic_outputs(overwrite=overwrite) as add:
+        written = format_.write(add, out, add(out), contents)
+        if is_beside:
+            add_views(add, path, contents.cameras, names, overwrite=overwrite)
+        num_bytes = sum(file.stat().st_size for file in written[out])
+    format_.finish(out)
+    return num_bytes, str(path) if is_beside else None

@@ -66,18 +66,18 @@ class CompactResult:
         """Write the result with its levels and cameras, as ``-o`` of the command does: all files or none.
 
         The name chooses the format: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.glb``, ``.html`` for a
-        page, ``lod-meta.json`` for levels that stream, or a folder ``colmap``. A format without cameras gets
+        page, or ``lod-meta.json`` for levels that stream. A format without cameras gets
         ``NAME.cameras.json`` beside its file.
 
         Args:
-            path: The file, or a folder named ``colmap``.
+            path: The file.
             overwrite: Replace existing files.
 
         Returns:
-            The path of the main file.
+            The path.
 
         Raises:
-            UsageError: If the name has another ending, or the format needs cameras and there are none.
+            UsageError: If the name has another ending.
             SceneError: If a file exists or cannot be written.
 
         Example:

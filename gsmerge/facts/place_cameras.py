@@ -20,8 +20,6 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 NUM_VIEWS = 24  # most cameras that are placed
 MAX_SCORED, SCORED_SIZE = 8, 512  # most views for scores, and their most pixels per side
-FITTED = 16  # views of each kind for a fit without cameras, and half as many on a walk
-FITTED_LONG, LONG = 48, 600  # views of each kind for a long fit; a fit is long from LONG steps on
 FEWER = 3  # for views that are used only for scores, every third candidate is tried
 SAMPLE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most this many Gaussians
 EXTENT = (0.05, 0.95)  # quantiles of the positions along each axis between which the scene is assumed to lie
@@ -98,11 +96,6 @@ def keep_finite(scene: Scene) -> Scene:
 def _with_cameras(scene: Scene, cameras: Cameras) -> Scene:
     """Return a scene of the same Gaussians with placed cameras, without pictures."""
     return Scene(scene.gaussians, cameras, None, None, tuple(f"placed {view}" for view in range(len(cameras))))
-
-
-def placed_views(steps: int) -> int:
-    """Return how many views of each of three kinds are placed for a fit of ``steps`` steps."""
-    return FITTED_LONG if steps >= LONG else FITTED
 
 
 def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:

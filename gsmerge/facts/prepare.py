@@ -239,12 +239,8 @@ def views_notes(scene: Scene) -> list[str]:
     """Return the notes of a run about repeated views and about missing views or photos, without comparing colours."""
     if len(scene) == 0:
         return [NO_VIEWS]
-    return [*without_repeats(scene)[2], *([NO_PHOTOS] if _lacks_photos(scene) else [])]
-
-
-def _lacks_photos(scene: Scene) -> bool:
-    """Return whether the rows' own colours are used instead of photos."""
-    return scene.images is None and scene.is_shown and len(scene) > 0
+    shows_rows = scene.images is None and scene.is_shown and len(scene) > 0  # the rows' own colours replace photos
+    return [*without_repeats(scene)[2], *([NO_PHOTOS] if shows_rows else [])]
 
 
 def scored_pictures(scene: Scene) -> tuple[Scene, bool]:

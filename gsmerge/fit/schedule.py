@@ -230,11 +230,6 @@ class Schedule:
         return Step(number, progress, mode, view, background, mask, sample)
 
 
-def loss_weights(rates: Tuning, progress: float) -> tuple[float, float]:
-    """Return the loss weights of structural similarity and of edges at a point of the run."""
-    return rates.ssim_lambda, rates.edge_weight * progress
-
-
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     """Return the step size of each of the fourteen parameters; it decays geometrically, and further in longer runs."""
     decay = rates.decay * min(1.0, LONG_RUN / steps)

@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.fit.fit_state import FitState
 from gsmerge.fit.outside import veil_gradients
 from gsmerge.fit.poses import PoseState, start_poses
-from gsmerge.fit.schedule import GROWTH, FitRun, Step, first_decay, loss_weights, step_sizes
+from gsmerge.fit.schedule import GROWTH, FitRun, Step, first_decay, step_sizes
 from gsmerge.fit.step_buffers import StepBuffers
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.kernels.elementary import log
@@ -47,7 +47,7 @@ class Optimiser:
             "camera": camera_numbers(**camera),
             "eye": camera_centres(camera["viewmat"].astype(np.float64)),
             "background": step.background,
-            "loss_weights": np.array(loss_weights(rates, step.progress), np.float32),
+            "loss_weights": np.array([rates.ssim_lambda, rates.edge_weight * step.progress], np.float32),
         }
         with use_threads() as threads:
             buffers = self._buffers_of(state, threads)

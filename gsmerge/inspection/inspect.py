@@ -32,11 +32,12 @@ from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_part, report_progress
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints
+from gsmerge.scene.exporters import ReadHints, make_hints
 from gsmerge.scene.read import Loaded, align_scene, read_gaussian_file
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
+from gsmerge.settings.setting import join_words
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import PicturedScene, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
@@ -211,7 +212,8 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         facts["num_unseen"] = int((count_views_in_world(scene.gaussians, scene.cameras) == 0).sum())
     if not is_result:
         is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)
-        facts["exporter"] = (is_known and exporter_names(load.exporters)) or f"not known: {load.info.layout}"
+        titles = join_words(model.title for exporter in load.exporters for model in exporter.models)
+        facts["exporter"] = (is_known and titles) or f"not known: {load.info.layout}"
     return facts
 
 

@@ -11,7 +11,6 @@ import errno
 import os
 import re
 import secrets
-import shutil
 import stat
 import sys
 import time
@@ -129,18 +128,6 @@ class _Outputs:
             with suppress(OSError):  # a folder with files is not removed
                 os.rmdir(folder)
         _written.difference_update(self.paths)
-
-
-def link_file(source: Path, target: Path) -> None:
-    """Replace the file ``target`` by a hard link to ``source``, else by a symbolic link, else by a copy."""
-    os.unlink(target)
-    real = os.path.realpath(source)
-    # Windows allows symbolic links to few users
-    for link in (os.link,) if sys.platform == "win32" else (os.link, os.symlink):
-        with suppress(OSError, NotImplementedError):
-            link(real, target)
-            return
-    shutil.copyfile(real, target)
 
 
 def _make_folder(folder: Path) -> Iterator[Path]:

@@ -124,9 +124,9 @@ def walk_files(folder: Path) -> list[Path]:
     return files
 
 
-def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
-    """Read a UTF-8 text file; SceneError if it is not text or has more than ``limit`` bytes."""
-    with _text_file(path, limit) as file:
+def read_text(path: Path) -> str:
+    """Read a UTF-8 text file; SceneError if it is not text or is too large."""
+    with _text_file(path, MAX_TEXT_BYTES) as file:
         return file.read()
 
 

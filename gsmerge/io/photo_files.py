@@ -512,12 +512,8 @@ def resize_to(size: Size, to: Size) -> PhotoTransform:
     return PhotoTransform(*to, to[0] / size[0], to[1] / size[1])
 
 
-def resize_and_crop(size: Size, to: Size, scale: float | None = None) -> PhotoTransform:
-    """Make the transform that resizes photos in proportion and crops them at the centre to the size ``to``.
-
-    ``scale``: scale of both sides; None: the smallest scale at which the photo covers ``to``.
-    """
-    if scale is None:
-        scale = max(to[0] / size[0], to[1] / size[1])
+def resize_and_crop(size: Size, to: Size) -> PhotoTransform:
+    """Make the transform that resizes photos in proportion until they cover ``to``, and crops them at the centre."""
+    scale = max(to[0] / size[0], to[1] / size[1])
     width, height = (max(side, round(whole * scale)) for side, whole in zip(to, size, strict=True))
     return PhotoTransform(*to, width / size[0], height / size[1], (width - to[0]) // 2, (height - to[1]) // 2)

@@ -20,7 +20,6 @@ from gsmerge.io.cameras.table import CHUNK
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.ply import header_content, header_counts, is_file_from_gsmerge
 from gsmerge.io.formats.table import (
-    HTML,
     META,
     OUTPUT_FORMATS,
     SCENE_SUFFIXES,
@@ -47,7 +46,6 @@ IMAGE_PLACES = (
     "keyframes/images",
 )  # fmt: skip
 MASK_PLACES = ("masks",)
-_PICTURES = ("images", "masks", "protect")  # fields of SceneFiles that are folders of pictures
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
@@ -455,11 +453,11 @@ def named_ply(folder: Path) -> Path | None:
 def other_plys(folder: Path) -> list[Path]:
     """List the ``.ply`` files directly in a folder that may be scenes: no results of gsmerge, no point clouds.
 
-    If there are none, list the only file of another format. The exception is a web site, whose scene is a result.
+    If there are none, list the only file of another format.
     """
     plys = natural_order(folder.glob("[!.]*.ply"))
     scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
-    packed = [] if scenes or (folder / HTML.site).exists() else [p for p in folder.glob("[!.]*") if p.suffix in _PACKED]
+    packed = [] if scenes else [p for p in folder.glob("[!.]*") if p.suffix in _PACKED]
     return packed if len(packed) == 1 and may_hold_gaussians(packed[0]) else scenes
 
 

@@ -231,7 +231,9 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
     assert options.path is not None
     path = parse_path(options.path)
     file = None if path else Path(options.path)
-    is_only_source = file is not None and _lacks_cameras(options.framing)  # the path is also the scene's camera file
+    framing = options.framing
+    has_own = framing.cameras is not None or framing.images is not None or read_sharp_camera(framing.ply) is not None
+    is_only_source = file is not None and not has_own  # the path is also the scene's camera file
     if is_only_source:
         options = replace(options, framing=replace(options.framing, cameras=file))
     group = _read(options, photos=False)
@@ -259,11 +261,6 @@ def _place_file(file: Path, load: Loaded) -> Cameras:
 
 
 DRAWINGS = {"panel": prepare_panel, "views": prepare_pictures, "path": prepare_clip}
-
-
-def _lacks_cameras(files: SceneFiles) -> bool:
-    """Return whether a scene has neither cameras nor photos from which cameras can be estimated."""
-    return files.cameras is None and files.images is None and read_sharp_camera(files.ply) is None
 
 
 def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:

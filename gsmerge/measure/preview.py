@@ -1,4 +1,4 @@
-"""Draw pictures for people: scenes from the same cameras side by side, mean colours, heat maps."""
+"""Draw pictures for people: scenes from the same cameras side by side."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def to_picture(image: np.ndarray) -> Picture:
     return (image.clip(0, 1) * 255).round().astype(np.uint8)
 
 
-def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool = True) -> None:
-    """Write a picture ``[h,w,3]`` in the format of the file name; ``settings`` go to :func:`cv2.imencode`."""
+def save_picture(path: Path, picture: Picture, *, overwrite: bool = True) -> None:
+    """Write a picture ``[h,w,3]`` in the format of the file name."""
     max_side, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
     if max(height, width) > max_side:
         problem = f"expected at most {max_side:,} pixels per side of a {path.suffix}, got {width} x {height}"
         raise SceneError(path, problem, "name a .png, or lower --size")
-    _, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[..., ::-1]), settings)
+    _, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[..., ::-1]))
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(data.tobytes())
 
@@ -130,9 +130,3 @@ def _join(pictures: Sequence[Picture], axis: int) -> Picture:
     gap = np.full(shape, 255, np.uint8)
     with_gaps = [array for picture in pictures for array in (gap, picture)][1:]
     return np.concatenate(with_gaps, axis)
-
-
-def heat_map(levels: np.ndarray) -> Picture:
-    """Colour levels ``[h,w]`` in [0, 1] from black through red to yellow."""
-    colored = cv2.applyColorMap((levels * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)
-    return np.ascontiguousarray(colored[..., ::-1], np.uint8)

@@ -17,8 +17,6 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 Points = NDArray[np.float64]  # [n,3]
 _OPAQUE = 0.5  # least alpha of a pixel whose rendered depth is that of a surface
-_NEAR = 0.01  # near plane, as a share of the median depth of a view
-_BEHIND = 1.05  # a surface hides a centre whose depth exceeds the surface's by this factor
 MAX_SAMPLE_GAUSSIANS = 200_000  # largest sample on which a share is measured
 _CHUNK = 1 << 16  # points processed at a time; the first ones often show all pixels
 _DILATION = 3  # side of the square that a point marks, pixels of the input views
@@ -80,22 +78,6 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
         return _DILATION
     focals = [np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64))]  # pixels
     return max(_DILATION, 2 * round((_DILATION * float(focals[0] / median(focals[1])) - 1) / 2) + 1)
-
-
-def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
-    """Return for each view the rows whose centres are inside its picture and not hidden by a surface."""
-    rows = []
-    for view in range(len(cameras)):
-        (pixels,), (depths,) = project(gaussians.means, cameras[[view]])
-        inside = (depths > 0) & is_inside(pixels, cameras)
-        near = _NEAR * median(depths[inside]) if inside.any() else 1.0
-        drawn = render(gaussians, cameras[[view]], near=near, with_depths=True)
-        assert drawn.depths is not None
-        candidates = np.flatnonzero(inside)
-        x, y = pixels[candidates].astype(np.int64).T
-        surface = np.where(drawn.alphas[0, y, x, 0] > _OPAQUE, drawn.depths[0, y, x, 0], np.inf)
-        rows.append(candidates[depths[candidates] <= _BEHIND * surface])
-    return rows
 
 
 def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:

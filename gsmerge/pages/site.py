@@ -1,4 +1,4 @@
-"""Write a page with a viewer and a ``.sog`` in it or beside it; the camera stays near the viewpoints of photos."""
+"""Write a page with a viewer and a ``.sog`` in it; the camera stays near the viewpoints of photos."""
 
 from __future__ import annotations
 
@@ -20,32 +20,22 @@ from gsmerge.photos.views import even_views
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 
-# Only its own files and scripts; Spark has data: addresses and a worker in its text
+# Only its own scripts; Spark has data: addresses and a worker in its text
 POLICY = (
-    "default-src 'none'; img-src 'self' data:; style-src {style}; script-src {script} blob: 'wasm-unsafe-eval';"
-    " worker-src data: blob:; connect-src 'self' data: blob:"
+    "default-src 'none'; img-src data:; style-src {style}; script-src {script} blob: 'wasm-unsafe-eval';"
+    " worker-src data: blob:; connect-src data: blob:"
 )
-NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "poster": "poster.webp", "licences": "LICENSES.txt"}
+NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "licences": "LICENSES.txt"}
 MAX_VIEWS = 64  # largest number of viewpoints in the page
 REST = 43_000  # least bytes of a page without viewer: scripts, licences, and picture and textures of one Gaussian
 LONGEST_TITLE = 255  # bytes; a title is a file name
 LICENSED = ("spark", "three", "fflate")
 
 
-def files_beside(page: Path, apart: bool) -> tuple[Path, ...]:
-    """Return the paths of the files beside a page that is ``apart`` from its scene; none if the page contains all."""
-    return tuple(page.with_name(name) for name in NAMES.values() if apart)
-
-
 def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write a page and the files beside it, if any, as a :data:`gsmerge.io.formats.table.WriteOutput`."""
-    text, beside = site_contents(
-        contents.levels[0], contents.cameras, contents.title, contents.comments, apart=contents.apart
-    )
-    files = {page: text.encode(), **{add(page.with_name(name)): content for name, content in beside.items()}}
-    for file, content in files.items():
-        file.write_bytes(content)
-    return {path: list(files)}
+    """Write a page as a :data:`gsmerge.io.formats.table.WriteOutput`."""
+    page.write_bytes(make_page(contents.levels[0], contents.cameras, contents.title, contents.comments).encode())
+    return {path: [page]}
 
 
 def least_bytes() -> int:
@@ -55,7 +45,7 @@ def least_bytes() -> int:
 
 def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
     """Return the largest number of bytes that a page takes with any title."""
-    return len(site_contents(gaussians, cameras, "x" * LONGEST_TITLE, comments, apart=False)[0].encode())
+    return len(make_page(gaussians, cameras, "x" * LONGEST_TITLE, comments).encode())
 
 
 def _read_licences() -> bytes:
@@ -65,27 +55,19 @@ def _read_licences() -> bytes:
     return "\n\n".join(texts).encode()
 
 
-def site_contents(
-    gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str], *, apart: bool
-) -> tuple[str, dict[str, bytes]]:
-    """Make a page, and the files beside it by name; there are none unless the page is ``apart`` from its scene.
-
-    Without cameras viewpoints are placed, and the user may look from any side.
-    """
+def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str]) -> str:
+    """Make a page. Without cameras viewpoints are placed, and the user may look from any side."""
     expected = read_new_views(comments)
     is_free = len(cameras) == 0
     viewpoints = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
     start = 0 if is_free else median_camera(viewpoints)  # the first placed viewpoint is outside
     poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]]).images[0]))
     views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWS)), start})
-    licences = _read_licences()
-    files = (sog_bytes(gaussians, comments), VIEWER.read_bytes(), poster, licences)
-    contents = dict(zip(NAMES.values(), files, strict=True))
-    page = render_template(
-        "site.html", policy=POLICY, title=title, count=len(gaussians), names=NAMES, apart=apart,
-        poster=NAMES["poster"] if apart else data_uri(poster, "image/webp"),
-        licences=NAMES["licences"] if apart else data_uri(licences, "text/plain"),
-        inside={} if apart else {NAMES[name]: base64_text(contents[NAMES[name]]) for name in ("engine", "scene")},
+    inside = {"engine": VIEWER.read_bytes(), "scene": sog_bytes(gaussians, comments)}
+    return render_template(
+        "site.html", policy=POLICY, title=title, count=len(gaussians), names=NAMES,
+        poster=data_uri(poster, "image/webp"), licences=data_uri(_read_licences(), "text/plain"),
+        inside={NAMES[name]: base64_text(content) for name, content in inside.items()},
         gain=None if expected is None else describe_gain(*expected.bounds),
         download=f"{title}.sog",
         json_data={
@@ -95,4 +77,3 @@ def site_contents(
             ],
         },
     )  # fmt: skip
-    return page, contents if apart else {}

@@ -98,17 +98,15 @@ def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
     return Pairs(photos_of(photos, scene.cameras, reduction).images, shown)
 
 
-def show_views(
-    scene: Scene, side: int | None = None, samples: int = SAMPLE_GAUSSIANS, frame: Frame | None = None
-) -> ViewPictures:
+def show_views(scene: Scene, side: int | None = None, frame: Frame | None = None) -> ViewPictures:
     """Make small pictures of what a scene's Gaussians show in its views.
 
     Where each view has Gaussians of its own, a picture has the colours of a sample of them. Otherwise it is a render of
-    ``samples`` Gaussians of the scene. ``frame`` is the canonical frame of the scene, if known.
+    a sample of the Gaussians. ``frame`` is the canonical frame of the scene, if known.
     """
     if scene.has_own_pixels:
         return _show_rows(scene, SIDE) if side is None else _show_rows(scene, 2 * side).shrink(side)
-    sampled = Scene(thin_out(scene.gaussians, samples), scene.cameras, None, None, scene.names)
+    sampled = Scene(thin_out(scene.gaussians, SAMPLE_GAUSSIANS), scene.cameras, None, None, scene.names)
     canonical, _ = canonicalise(sampled, frame)
     shown = draw_views(canonical.gaussians, canonical.cameras, side or SIDE)
     inside = pixel_weights(scene.masks, *shown.weights.shape[2:0:-1])

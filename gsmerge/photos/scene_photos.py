@@ -257,9 +257,7 @@ def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
     return stored
 
 
-def read_photos(
-    proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile, notes: Sequence[str] = ()
-) -> ScenePhotos:
+def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile) -> ScenePhotos:
     """Read the chosen photo of each camera, turned, and resized to the size of most photos.
 
     Photos of SHARP are resized to the size of their camera. SceneError if a photo cannot be read, or if its aspect
@@ -277,7 +275,7 @@ def read_photos(
             width, height = _turned_size(path, turn)
             problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
             raise SceneError(proposal.folder, problem)
-    return ScenePhotos(decode_views(paths, turns, size), paths, turns, tuple(notes))
+    return ScenePhotos(decode_views(paths, turns, size), paths, turns)
 
 
 def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:

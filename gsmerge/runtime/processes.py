@@ -39,11 +39,11 @@ class ProcessPool(WorkerPool):
         ended = []
         for future in wait(self.calls, return_when=FIRST_COMPLETED).done:
             key, executor = self.calls.pop(future)
-            try:
-                ended.append((key, future.result()))
-                self.idle.append(executor)
-            except BrokenProcessPool:
+            if isinstance(future.exception(), BrokenProcessPool):
                 ended.append((key, LostProcess(LOST)))
+            else:
+                self.idle.append(executor)  # first, since the call may have failed, and all executors are closed
+                ended.append((key, future.result()))
         return ended
 
     def close(self) -> None:

@@ -60,10 +60,10 @@ def list_photos(cameras: Path) -> list[Path]:
     return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
 
 
-def try_cameras(path: Path, scene: str | None = None) -> CameraFile | None:
+def try_cameras(path: Path) -> CameraFile | None:
     """Read the cameras of a file; None if that fails, since the reader of the scene reports the reason."""
     try:
-        return read_cameras(path, scene=scene)
+        return read_cameras(path)
     except SceneError:
         return None
 

@@ -6,7 +6,6 @@ To add a model, add a :class:`Model` to the exporter whose columns, order and en
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -415,8 +414,3 @@ def find_cameras_of_model(info: FileInfo) -> str:
     matching = [model for model, is_marked in models if (path.match(model.place) if model.place else is_marked)]
     advice = {model.camera_advice for model in matching}
     return f"{' or '.join(model.title for model in matching)}: {advice.pop()}" if len(advice) == 1 else ""
-
-
-def exporter_names(exporters: Sequence[Exporter]) -> str:
-    """Join the titles of exporters for a message; empty without any."""
-    return join_words(model.title for exporter in exporters for model in exporter.models)

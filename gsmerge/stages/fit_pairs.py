@@ -7,13 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.facts.place_cameras import placed_views
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.raster.photos import scene_photos, score_photos
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians
+
+FITTED = 16  # views of each kind for a fit without cameras, and half as many on a walk
+FITTED_LONG, LONG = 48, 600  # views of each kind for a long fit; a fit is long from LONG steps on
 
 # PSNR (dB) that a fit may lose in a view that it was not trained on, for each of the powers of masses in
 # :data:`gsmerge.stages.pair_merge.POWERS`. It is larger for objects, because few people view them from inside
@@ -63,7 +65,7 @@ def fit_to_placed(starts: Sequence[Decoded], best: int, prepared: Prepared, opti
     accepted, or if the best fit does not gain on average or lowers the score of a held-out view by more than the
     tolerance.
     """
-    scene = prepared.scene_placed(placed_views(options.steps))
+    scene = prepared.scene_placed(FITTED_LONG if options.steps >= LONG else FITTED)
     placed = range(len(prepared.scene), len(scene))
     fits = [fit_scene(start, scene, placed, options, seed, num_scored=len(placed)) for start in starts]
     accepted = [fit.report is not None and fit.report.accepted for fit in fits]

@@ -157,28 +157,19 @@ def _as_pixels(array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array, np.float32)
 
 
-def _every_pixel(height: int, width: int) -> np.ndarray:
-    """Return padded labels in which every pixel is its own region."""
-    return pad_labels(np.arange(height * width, dtype=np.int32).reshape(height, width))
-
-
 def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int, compactness: float) -> np.ndarray:
     """Cut into rectangles, merge them to the exact number, move border pixels; return padded labels."""
     height, width, _ = pixels.shape
     spread = np.float32(compactness**0.5)
     num_rectangles = int(rectangles * count)
     if num_rectangles > PIXEL_START * height * width:
-        labels, num_regions = _every_pixel(height, width), height * width
+        num_regions = height * width  # every pixel is its own region
+        labels = pad_labels(np.arange(num_regions, dtype=np.int32).reshape(height, width))
     else:
         labels, num_regions = split_rectangles(pixels, num_rectangles, BLOCK, float(compactness))
         labels = refine(labels, pixels, num_regions, early_sweeps, spread)
     labels = merge_regions(labels, pixels, num_regions, count, spread)
     return refine(labels, pixels, count, NUM_SWEEPS, spread)
-
-
-def _lab_colours(pixels: np.ndarray) -> np.ndarray:
-    """Return CIELAB / 100; OpenCV computes it by tables, with the same bits on every processor."""
-    return np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
 
 
 def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:
@@ -190,6 +181,7 @@ def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:
         seeds = hexagonal_seeds(height, width, count)
     else:
         seeds = seeds_from_density(seed_density(corner_response(pixels), count), count)
-    colours = _lab_colours(pixels)
+    # CIELAB / 100; OpenCV computes it by tables, with the same bits on every processor
+    colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
     labels = pad_labels(voronoi(seeds, height, width))
     return infer_labels(labels, colours, count)

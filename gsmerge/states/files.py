@@ -11,14 +11,12 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.files import read_input
-from gsmerge.compaction.outputs import add_views, name_photos
+from gsmerge.compaction.outputs import write_contents
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import atomic_outputs, output_format
-from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents
-from gsmerge.io.formats.write import output_notes
+from gsmerge.io.formats.write import lost_harmonics
 from gsmerge.io.locks import lock_file
 from gsmerge.io.scene_files import SceneFiles, scene_title
 from gsmerge.measure.documents import document_head, seconds_document, seconds_line
@@ -64,8 +62,9 @@ def extend_file(
         start = perf_counter()
         state, sha256 = tried or (load_state(path) if os.path.exists(path) else None), content_hash(list_files(files))
         document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}, "dry_run": dry_run}
-        number = None if state is None else _find_batch(state, sha256)
-        if state is not None and number is not None:
+        hashes = [] if state is None else [batch.get("sha256") for batch in state.about["batches"]]
+        if state is not None and sha256 in hashes:
+            number = hashes.index(sha256) + 1
             note = f"{files.ply}: left out, since the same files are batch {number} of {path.name} already"
             return document | {"left_out": True, "state": _describe_file(path, state), "notes": [note]}, state
         load_end = perf_counter()
@@ -103,12 +102,6 @@ def lock_state(path: Path) -> AbstractContextManager[bool]:
     return lock_file(path.with_name(f".gsmerge-{digest({'name': path.name})[:16]}.lock"))
 
 
-def _find_batch(state: State, sha256: str) -> int | None:
-    """Return the number, from 1, of the batch with this hash of its files; None if there is none."""
-    hashes = [batch.get("sha256") for batch in state.about["batches"]]
-    return hashes.index(sha256) + 1 if sha256 in hashes else None
-
-
 def _note_source(state: State, sha256: str, comments: Sequence[str]) -> State:
     """Return a state that records the hash of its last batch's files, and the comments that results copy."""
     *earlier, last = state.about["batches"]
@@ -144,15 +137,14 @@ def decode_file(
     *,
     normals: bool = True,
     viewer_cameras: bool = True,
-    site: bool = False,
     overwrite: bool = False,
     dry_run: bool = False,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Decode the Feature Gaussians in a ``.gsm`` into an output, with cameras in or beside it; return the report.
 
-    ``site``: write the parts of a page beside it. ``dry_run``: write nothing. Raises SceneError if a file cannot be
-    read or written, UsageError for a K that the networks do not make.
+    ``dry_run``: write nothing. Raises SceneError if a file cannot be read or written, UsageError for a K that the
+    networks do not make.
     """
     start, state = perf_counter(), load_state(path)
     features, batches = state.features, state.about["batches"]
@@ -166,23 +158,13 @@ def decode_file(
         output = {"path": str(out), "num_gaussians_at_most": max_count}
         return document | {"dry_run": True, "output": output, "notes": []}
     read_end = perf_counter()
-    format_, names = output_format(out, levels=True, cameras=True), features.names
-    cameras_path = viewer_cameras_path(out) if viewer_cameras and not format_.cameras else None
-    with atomic_outputs(overwrite=overwrite) as add:
-        temporary = add(out)
-        gaussians, decode_end = decode_features(features, options), perf_counter()
-        if len(gaussians) == 0:
-            raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
-        cameras, photos = features.frame.leave_cameras(features.cameras), name_photos(None, names)
-        notes = [*output_notes(out, gaussians.sh_degree, photos), *rounding_notes(out, gaussians)]
-        contents = Contents(
-            [gaussians], [RESULT_COMMENT], cameras, photos, scene_title(path), normals=normals, apart=site
-        )
-        (files,) = format_.write(add, out, temporary, contents).values()
-        num_bytes = sum(file.stat().st_size for file in files)
-        if cameras_path is not None:
-            add_views(add, cameras_path, cameras, names, overwrite=overwrite)
-    format_.finish(out)
+    gaussians, decode_end = decode_features(features, options), perf_counter()
+    if len(gaussians) == 0:
+        raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
+    cameras = features.frame.leave_cameras(features.cameras)
+    notes = [*lost_harmonics(out, gaussians.sh_degree), *rounding_notes(out, gaussians)]
+    contents = Contents([gaussians], [RESULT_COMMENT], cameras, scene_title(path), normals)
+    num_bytes, _ = write_contents(out, contents, features.names, overwrite=overwrite, viewer_cameras=viewer_cameras)
     seconds = {**(seconds_before or {}), "read": read_end - start, "decode": decode_end - read_end}
     seconds["write"] = perf_counter() - decode_end
     return document | {

@@ -89,9 +89,9 @@ def test_every_file_of_stages_is_an_arrow_or_said_to_be_none() -> None:
     assert set(re.findall(r"`(stages/\w+)`", section("Arrows"))) == files
 
 
-def test_each_file_of_alignment_says_what_it_serves() -> None:
-    cells = "".join(line.split("|")[1] for line in section("Alignment").splitlines() if line.startswith("| `"))
-    files = [path for path in (PACKAGE / "alignment").iterdir() if not path.name.startswith("_")]
+def test_each_file_of_cameras_says_what_it_serves() -> None:
+    cells = "".join(line.split("|")[1] for line in section("Cameras").splitlines() if line.startswith("| `"))
+    files = [path for path in (PACKAGE / "cameras").iterdir() if not path.name.startswith("_")]
     names = {path.stem if path.is_file() else f"{path.name}/" for path in files}
     assert set(re.findall(r"`([\w/]+)`", cells)) == names
 

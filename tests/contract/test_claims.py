@@ -16,7 +16,7 @@ from scripts import load_script
 
 import gsmerge
 from gsmerge import plan, types
-from gsmerge.cameras import cameras as cameras_off
+from gsmerge.cameras import poses as cameras_off
 from gsmerge.cameras import rows_first, score
 from gsmerge.cameras.registration import register
 from gsmerge.compaction import blocks, curve, left_out, new_views, partition, seams, search

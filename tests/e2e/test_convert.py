@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,9 +19,7 @@ from gsmerge.compaction.convert import ConvertOptions, convert_files, join_gauss
 from gsmerge.compaction.placement import find_placement, rotation_between
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry.transforms import covariances
-from gsmerge.io import CameraFile
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.cameras.colmap_model import model_files
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path
 from gsmerge.io.formats import table as formats
 from gsmerge.io.formats.table import Contents, Format
@@ -72,70 +69,6 @@ def test_every_format_is_written_with_the_cameras(
     assert gsmerge.read_cameras(beside[0]).names == gsmerge.read_cameras(tmp_path / "in.cameras.json").names
     again = convert_files(ConvertOptions([tmp_path / "new" / name], tmp_path / "again.ply"))
     assert again["output"]["num_gaussians"] == 400
-
-
-def read_model(folder: Path) -> tuple[CameraFile, int]:
-    """Read the cameras of a COLMAP model, and the number of its points."""
-    (count,) = struct.unpack("<Q", (folder / "points3D.bin").read_bytes()[:8])
-    return gsmerge.read_cameras(folder), count
-
-
-def test_a_folder_named_colmap_is_a_model(result: Path, tmp_path: Path, small_scene: Path, run: Run) -> None:
-    """Its views have the names of their photos below images/, where trainers look for them."""
-    model, before = tmp_path / "colmap" / "sparse" / "0", gsmerge.read_cameras(tmp_path / "in.cameras.json")
-    done = run("convert", result, f"{tmp_path / 'colmap'}/", code=0)
-    assert noted([done.err], tmp_path / "colmap" / "images")
-    cameras, count = read_model(model)
-    assert (count, cameras.names) == (400, tuple(name.removeprefix("images/") for name in before.names))
-    np.testing.assert_allclose(cameras.viewmats, before.viewmats, atol=1e-6)
-    assert {path.name for path in tmp_path.iterdir()} == {"in.ply", "in.cameras.json", "colmap"}
-    assert run("convert", result, tmp_path / "colmap").code == 2
-    quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q", "--overwrite")
-    run("compact", small_scene, "-o", tmp_path / "colmap", *quick, code=0)
-    cameras, count = read_model(model)
-    assert (count, len(cameras)) == (200, len(before))
-    assert sorted(path.name for path in model.iterdir()) == ["cameras.bin", "images.bin", "points3D.bin"]
-    linked = tmp_path / "colmap" / "images"
-    assert sorted(path.name for path in linked.iterdir()) == sorted(cameras.names)
-    assert all((small_scene / "images" / name).samefile(linked / name) for name in cameras.names)
-
-
-def test_photos_that_are_there_stay_as_they_are(result: Path, tmp_path: Path, small_scene: Path, run: Run) -> None:
-    """A conversion finds photos beside the cameras; a folder for them that exists is nobody else's to change."""
-    shutil.copytree(small_scene / "images", tmp_path / "images")
-    linked = tmp_path / "colmap" / "images"
-    run("convert", result, tmp_path / "colmap", code=0)
-    first, *others = sorted(linked.iterdir())
-    assert first.samefile(tmp_path / "images" / first.name)
-    first.unlink()
-    first.write_text("mine")
-    others[0].unlink()
-    done = run("convert", result, tmp_path / "colmap", "--overwrite", code=0)
-    assert noted([done.err], linked, "copy or link the 1")
-    assert (first.read_text(), sorted(linked.iterdir())) == ("mine", [first, *others[1:]])
-
-
-def test_a_model_needs_cameras_is_one_level_and_replaces_no_input(
-    result: Path, tmp_path: Path, small_scene: Path, run: Run
-) -> None:
-    (tmp_path / "in.cameras.json").unlink()
-    with refuses(SceneError, "in.ply", "cameras", "--cameras"):
-        convert_files(ConvertOptions([result], tmp_path / "points3D.bin"))
-    for option, said in (("--levels", 2), "COLMAP"), (("--budget", "1MB"), "1MB"):
-        assert_refused(run("compact", small_scene, "-o", tmp_path / "colmap", *option), 2, "points3D.bin", said)
-    model = tmp_path / "own" / "colmap" / "sparse" / "0"
-    scene = gsmerge.read_scene(small_scene)
-    gsmerge.write_ply(tmp_path / "own" / "scene.ply", scene.gaussians)
-    model.mkdir(parents=True)
-    seen = [np.zeros(0, np.int64)] * len(scene)
-    for name, data in model_files(scene.gaussians, scene.cameras, scene.names, seen).items():
-        (model / name).write_bytes(data)
-    done = run("compact", tmp_path / "own", "-o", tmp_path / "own" / "colmap", "--overwrite", "-q")
-    assert_refused(done, 2, "points3D.bin", "input")
-    gsmerge.write_ply(tmp_path / "lone" / "scene.ply", read(result))
-    done = run("compact", tmp_path / "lone" / "scene.ply", "-o", tmp_path / "colmap", "-q")
-    assert_refused(done, 2, "points3D.bin", "cameras")
-    assert not (tmp_path / "colmap").exists()
 
 
 @sweep(
@@ -303,19 +236,15 @@ def test_all_columns_of_a_ply(small_scene: Path, tmp_path: Path, run: Run) -> No
 
 
 def _write_parts(add: AddOutput, path: Path, first: Path, contents: Contents) -> dict[Path, list[Path]]:
-    files = [first, *map(add, _name_parts(path, False))]
+    files = [first, *(add(path.with_suffix(ending)) for ending in (".views", ".rows"))]
     for file, part in zip(files, (contents.title, len(contents.cameras), len(contents.levels[0])), strict=True):
         file.write_text(str(part))
     return {path: files}
 
 
-def _name_parts(path: Path, apart: bool) -> tuple[Path, ...]:
-    return path.with_suffix(".views"), path.with_suffix(".rows")
-
-
 PARTS = Format(
-    ".parts", "a format of three files", None, None, 0, write=_write_parts, beside=_name_parts, levels="",
-    cameras="inside", lost="no harmonics in {ending}",
+    ".parts", "a format of three files", None, None, 0, write=_write_parts, levels="",
+    has_cameras=True, lost="no harmonics in {ending}",
 )  # fmt: skip
 
 
@@ -330,8 +259,6 @@ def test_a_new_format_of_several_files_with_cameras_is_one_row(
     assert document["output"]["bytes"] == sum(path.stat().st_size for path in tmp_path.glob("out.*"))
     assert (tmp_path / "out.rows").read_text() == "400"
     assert_refused(run("convert", result, out), 2, "out.parts", "--overwrite")
-    out.unlink()
-    assert_refused(run("convert", result, out), 2, "out.views", "--overwrite")  # its other files, too
     quick = ("--effort", "draft", "--budget", "50", "-o", small)
     assert_refused(run("compact", small_scene, *quick, "--levels", "2"), 2, "small.parts", "--levels")
     run("compact", small_scene, *quick, code=0)

@@ -47,7 +47,7 @@ def test_a_scene_alone_is_compacted_and_shown(
 
 def test_a_plan_and_what_no_page_shows_open_none(smallest_copy: Path, run: Run, opened: list[str]) -> None:
     assert "would write" in run(smallest_copy, *FAST, "--dry-run", code=0).out
-    run(smallest_copy, *FAST, "-o", smallest_copy / "colmap", code=0)
+    run(smallest_copy, *FAST, "-o", smallest_copy.parent / "page.html", code=0)
     assert (pages_in(smallest_copy), opened) == ([], [])
 
 

@@ -1,4 +1,4 @@
-"""``-o small.html``: one file that opens from disk; ``--set site=true``: a folder that any web server publishes."""
+"""``-o small.html``: one file that opens from disk, and from any web server."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from gsmerge.raster.metrics import psnr
 
 from .conftest import Run, assert_refused
 
-FILES = ["LICENSES.txt", "index.html", "poster.webp", "scene.sog", "spark-three.bin"]
 SETTLED = "typeof site !== 'undefined' && site !== null && stage.getAttribute('aria-busy') === 'false'"
 PLACE = "column(site.camera.matrix, 3).toArray()"
 
@@ -29,22 +28,6 @@ def names(folder: Path) -> list[str]:
 
 
 QUICK = ("--effort", "draft", "--fit", "none")
-SITE = ("--set", "site=true")
-
-
-def test_compact_writes_a_site_where_one_is_asked_for(run: Run, smallest_copy: Path) -> None:
-    site = smallest_copy / "site"
-    site.mkdir()
-    (site / ".gsmerge-00000000-999999999-00000000.html").touch()  # the rest of a killed run
-    document = json.loads(run("compact", smallest_copy, "-o", f"{site}/", *QUICK, *SITE, "--json", code=0).out)
-    assert [name for name in names(site) if name[0] != "."] == FILES
-    assert document["output"]["path"] == str(site / "index.html")
-    assert document["output"]["bytes"] == sum((site / name).stat().st_size for name in FILES)
-    assert_refused(run("compact", smallest_copy, "-o", site, "--budget", "50", *SITE), 2, site / "index.html")
-    for words in ((), ("-o", smallest_copy / "a.sog")):
-        assert_refused(run("compact", smallest_copy, *words, *SITE), 2, "site", "folder")
-    run("compact", smallest_copy, "-o", site, *QUICK, code=0)
-    assert "scene.compact.ply" in names(site)
 
 
 def test_compact_writes_one_file_to_send(run: Run, smallest_copy: Path) -> None:
@@ -65,18 +48,6 @@ def test_a_size_counts_the_viewer_of_a_page(run: Run, smallest_copy: Path) -> No
     assert_refused(run(*words, "892KB", "--overwrite"), 2, "", ".html with one Gaussian", "892.0 kB")
 
 
-def test_convert_writes_a_site_and_replaces_it_when_asked(run: Run, smallest_copy: Path) -> None:
-    small, site = smallest_copy / "scene.ply", smallest_copy / "site"
-    run("convert", small, site, *SITE, code=0)
-    assert names(site) == FILES
-    before = (site / "index.html").read_bytes()
-    run("convert", small, site, *SITE, "--scale", "2", "--overwrite", code=0)
-    assert names(site) == FILES
-    assert (site / "index.html").read_bytes() != before
-    run("convert", small, smallest_copy / "new", code=0)
-    assert "scene.ply" in names(smallest_copy / "new")
-
-
 class Quiet(SimpleHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
         pass
@@ -86,9 +57,9 @@ class Quiet(SimpleHTTPRequestHandler):
 def site(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from gsmerge.cli import main
 
-    folder = tmp_path_factory.mktemp("made") / "site"
-    assert main(["compact", str(small_scene), "-o", str(folder), "--effort", "draft", "-q", *SITE]) == 0
-    assert main(["convert", str(folder / "scene.sog"), str(folder.parent / "one.html"), "-q"]) == 0
+    folder = tmp_path_factory.mktemp("made")
+    assert main(["compact", str(small_scene), "-o", str(folder / "scene.sog"), "--effort", "draft", "-q"]) == 0
+    assert main(["convert", str(folder / "scene.sog"), str(folder / "one.html"), "-q"]) == 0
     return folder
 
 
@@ -96,7 +67,7 @@ def site(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def served(site: Path) -> Iterator[str]:
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}/index.html"
+    yield f"http://127.0.0.1:{server.server_port}/one.html"
     server.shutdown()
     server.server_close()
 
@@ -115,7 +86,7 @@ def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
 ) -> None:
     tab.open(served)
     tab.wait(SETTLED)
-    host = served.removesuffix("index.html")
+    host = served.removesuffix("one.html")
     assert [url for url in tab.requests() if not url.startswith((host, f"blob:{host}"))] == []
     width, height = tab.run("[data.views[0].width, data.views[0].height]")
     tab.run(f"stage.style.right = stage.style.bottom = 'auto'; stage.style.width = '{width}px'")
@@ -180,20 +151,13 @@ def test_on_a_phone_one_finger_turns_and_two_come_nearer(tab: Browser, served: s
 @needs_browser()
 def test_one_file_opens_from_disk(tab: Browser, site: Path) -> None:
     before = len(tab.requests())
-    tab.open(site.parent / "one.html")
+    tab.open(site / "one.html")
     assert tab.run("[id('canvas').hidden, id('poster').naturalWidth > 0]") == [True, True]
     tab.wait(SETTLED)
     assert tab.run("[id('canvas').hidden, id('poster').hidden, id('save').hidden]") == [False, True, False]
     assert [url for url in tab.requests()[before:] if not url.startswith(("file:", "data:", "blob:"))] == []
     saved = tab.run("fetch(id('save').href).then((answer) => answer.arrayBuffer()).then((bytes) => bytes.byteLength)")
     assert 5_000 < saved < 100_000
-
-
-@needs_browser()
-def test_a_site_from_disk_shows_a_picture_and_says_what_to_do(tab: Browser, site: Path) -> None:
-    tab.open(site / "index.html")
-    tab.wait("id('status').textContent.includes('NAME.html')")
-    assert tab.run("[id('canvas').hidden, id('poster').naturalWidth > 0]") == [True, True]
 
 
 @pytest.mark.slow
@@ -207,7 +171,7 @@ def test_vr_is_offered_where_the_browser_has_it(supported: bool, tab: Browser, s
     script = f"Object.defineProperty(navigator, 'xr', {{ value: {{ {xr} }} }});"
     tab.call("Page.enable")
     tab.call("Page.addScriptToEvaluateOnNewDocument", source=script)
-    tab.call("Page.navigate", url=(site.parent / "one.html").as_uri())
+    tab.call("Page.navigate", url=(site / "one.html").as_uri())
     tab.wait("location.protocol === 'file:' && document.readyState === 'complete'")
     tab.wait(SETTLED)
     assert tab.run("new Promise((end) => setTimeout(() => end(id('headset').hidden)))") is not supported

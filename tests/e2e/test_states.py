@@ -158,7 +158,6 @@ def test_a_state_is_a_scene(states: list[Path], walks: list[Path], tmp_path: Pat
     assert len(gsmerge.read_cameras(tmp_path / "out.cameras.json")) == 7
     for words in (
         ("compact", alone, *few, "-o", tmp_path / "small.spz"),
-        ("compact", alone, *few, "-o", tmp_path / "colmap"),
         ("compact", alone, *few, "-o", tmp_path / "small.html"),
         ("inspect", alone),
         ("render", alone, "-o", tmp_path / "a.png"),
@@ -224,14 +223,7 @@ def test_feature_gaussians_are_decoded(k: str, features: Path, tmp_path: Path, r
     assert "Feature Gaussians ->" in run("compact", features, *words, "--overwrite", code=0).out
 
 
-@pytest.mark.parametrize(
-    ("out", "files"),
-    [
-        ("a.sog", {"a.sog", "a.cameras.json"}),
-        ("a.html", {"a.html"}),
-        ("colmap", {f"colmap/sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")}),
-    ],
-)
+@pytest.mark.parametrize(("out", "files"), [("a.sog", {"a.sog", "a.cameras.json"}), ("a.html", {"a.html"})])
 def test_feature_gaussians_in_every_kind_of_output(
     out: str, files: set[str], features: Path, tmp_path: Path, run: Run
 ) -> None:

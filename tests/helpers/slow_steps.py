@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.fit.fit_state import FitState
-from gsmerge.fit.schedule import Step, loss_weights
+from gsmerge.fit.schedule import Step
 from gsmerge.fit.steps import Optimiser
 from gsmerge.kernels.gaussians.optimise import adam
 from gsmerge.kernels.raster import image_loss
@@ -22,7 +22,7 @@ def step_slowly(optimiser: Optimiser, state: FitState, step: Step) -> float:
     colors = view_colors(tiled) if state.splats.shN.shape[1] else state.colors[tiled.ids]
     image, transmittance = blend(tiled, colors, step.background)
     rates, weight = optimiser.run.job.options.tuning, optimiser.run.weight(step)
-    gradient, error = image_gradient(image, photo, weight, *loss_weights(rates, step.progress))
+    gradient, error = image_gradient(image, photo, weight, rates.ssim_lambda, rates.edge_weight * step.progress)
     moves_camera = optimiser.poses is not None
     g = gradients_of(tiled, colors, image, transmittance, gradient, None, with_viewmat=moves_camera)
     move_slowly(optimiser, state, g[~state.fixed[g.ids]], step)

@@ -39,7 +39,8 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     """
     _check(scenes, paths)
     registration = register(scenes)
-    names = _names(paths)
+    with_folder = len({path.name for path in paths}) < len(paths)
+    names = [os.path.join(path.parent.name, path.name) if with_folder else path.name for path in paths]
     used = [i for i, similarity in enumerate(registration.similarities) if similarity is not None]
     if len(used) < 2:
         problem = f"expected files that show one place, found no two of {len(paths)}"
@@ -56,12 +57,6 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
         notes.append("some files have no photos, so none are used; name the folder of all with --images")
     facts = [_facts(*entry) for entry in zip(paths, registration.similarities, registration.matches, strict=True)]
     return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    """Return the names of the files, with their folders if any two names are equal."""
-    with_folder = len({path.name for path in paths}) < len(paths)
-    return [os.path.join(path.parent.name, path.name) if with_folder else path.name for path in paths]
 
 
 def _check(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:

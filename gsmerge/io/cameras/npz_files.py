@@ -187,15 +187,6 @@ def array_names(path: Path) -> frozenset[str]:
         return frozenset()
 
 
-def array_shape(path: Path, name: str) -> tuple[int, ...]:
-    """Read the shape of an array in an ``.npz`` from its header; empty if it is missing or cannot be read."""
-    try:
-        with open_archive(path) as archive:
-            return _read_header(archive.open(_members(archive)[name]))[0]
-    except Exception:  # whatever a damaged archive makes the libraries raise
-        return ()
-
-
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read arrays from an ``.npz`` by name; names that it lacks are left out.
 

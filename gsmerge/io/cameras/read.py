@@ -12,7 +12,6 @@ from gsmerge.io.cameras.camera_source import CameraSource, check_objects
 from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program
 from gsmerge.io.cameras.table import CAMERA_ENDINGS, CAMERA_FORMATS, CHUNK, KEYFRAME, SHARP_PLY, is_colmap, is_keyframes
 from gsmerge.io.cameras.viewer_cameras import ENDING
-from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.types import StrPath
 from gsmerge.values.arguments import check_arguments
@@ -116,7 +115,7 @@ def _folder_of(path: Path) -> Path | None:
     if path.suffix == ".json":
         is_keyframe = is_keyframes(path.parent) and KEYFRAME in CameraSource(path).object
         return path.parent if is_keyframe else None
-    if path.suffix not in (".bin", ".txt") or path.with_suffix(".bin").name not in MODEL_NAMES:
+    if path.suffix not in (".bin", ".txt") or path.stem not in ("cameras", "images", "points3D"):
         return None
     if not is_colmap(path.parent):
         raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")

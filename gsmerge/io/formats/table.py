@@ -22,12 +22,10 @@ from gsmerge.values.arrays import to_float32
 
 STATE_ENDING = ".gsm"  # of states, as gsmerge extend writes them
 INDEX = "lod-meta.json"  # name of a Streamed SOG, by which viewers recognise it
-MODEL_NAMES = POINTS, CAMERAS, IMAGES = "points3D.bin", "cameras.bin", "images.bin"
 
 
 _lazy = lazy_functions(__package__)
 WRITE_APART = _lazy("write.write_apart")
-NamedPhotos = Sequence[tuple[str, Path | None]]  # names in a model's folder of photos, with their files if known
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +35,8 @@ class Contents:
     levels: Sequence[Gaussians]  # the finest first
     comments: Sequence[str] = ()  # lines for the header
     cameras: Cameras = NO_CAMERAS
-    photos: NamedPhotos = ()  # of the cameras
     title: str = ""
     normals: bool = True  # of a ``.ply``, as in :func:`gsmerge.write_ply`
-    apart: bool = False  # write the parts of a page to files beside it
     extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
 
 
@@ -72,19 +68,11 @@ class Format:
     # Content of its files
     # Levels of detail: a single one, one file for each, or all in one output
     levels: Literal["", "apart", "inside"] = "apart"
-    # Cameras of views: in a file beside it, inside it, or inside it and required
-    cameras: Literal["", "inside", "needed"] = ""
+    has_cameras: bool = False  # Cameras of views are inside it, not in a file beside it
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as the format does
     columns: bool = False  # whether the user can choose which of INRIA's columns it has
     marks: Sequence[str] | None = ()  # comments of the input that it keeps; None: all of ``copied_comments``
     lost: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
-
-    # Its files besides the one that the path names
-    folder: str = ""  # name of an output folder that chooses this format
-    place: str = ""  # of the main file in this folder
-    site: str = ""  # name of the main file if its parts are in files beside it
-    beside: Callable[[Path, bool], Sequence[Path]] = lambda path, apart: ()  # files whose names are known in advance
-    notes: Callable[[Path, NamedPhotos], list[str]] = lambda path, photos: []  # on files that programs need beside it
 
     # Bytes of a Gaussian by degree; of a .sog or .spz, as measured for results; empty if budgets cannot count them
     each: Sequence[float] = ()
@@ -98,7 +86,7 @@ class Format:
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
 
-_page, _model = lazy_functions("gsmerge.pages"), lazy_functions("gsmerge.compaction")
+_page = lazy_functions("gsmerge.pages")
 _SOG = 13.0, 22.0, 36.5, 56.5
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
 PLY = Format(
@@ -112,17 +100,9 @@ LEVELS = Format(
     write=_lazy("streamed.write_output"), finish=_lazy("streamed.remove_unused_chunks"), levels="inside",
     round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
 )  # fmt: skip
-COLMAP = Format(
-    POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0,
-    write=_model("colmap_output.write_output"), levels="", cameras="needed", round_means=lambda means: means,
-    lost="harmonics, sizes and opacities are left out, since points of COLMAP have only colours",
-    folder="colmap", place="sparse/0",  # where trainers expect it
-    beside=_model("colmap_output.files_beside"), notes=_model("colmap_output.note_photos"),
-)  # fmt: skip
 HTML = Format(
     ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
-    write=_page("site.write_output"), levels="", cameras="inside", round_means=_lazy("sog.round_means"),
-    site="index.html", beside=_page("site.files_beside"),
+    write=_page("site.write_output"), levels="", has_cameras=True, round_means=_lazy("sog.round_means"),
     each=tuple(_IN_TEXT * sog_bytes for sog_bytes in _SOG), rest=_page("site.least_bytes"),
     measure=_page("site.measure"),
 )  # fmt: skip
@@ -152,12 +132,11 @@ META = "meta.json"  # of a .sog that is a folder
 SOG_FOLDER = Format(
     META, "a .sog without its zip", _lazy("sog.read_folder"), None, -1, holds=_lazy("sog.is_folder"),
 )  # fmt: skip
-FORMATS = (*FILES, HTML, LEVELS, COLMAP, STATE, SOG_FOLDER)
+FORMATS = (*FILES, HTML, LEVELS, STATE, SOG_FOLDER)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # results that a page shows
 # Endings of files that may hold no Gaussians; models write cameras and depth maps into .npz
 SEVERAL_USES = (".npz", *(row.ending for row in FORMATS if row.holds))
-FOLDERS = {row.folder: row for row in FORMATS if row.folder}  # by the name of an output folder
 READ_ENDINGS = tuple(row.ending for row in FORMATS if row.read is not None)
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FILES if row.read is not None))
 
@@ -209,21 +188,17 @@ def may_hold_gaussians(path: Path) -> bool:
 def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``levels``: allow an index of levels of detail. ``cameras``: allow a COLMAP model or a page, which have cameras.
+    ``levels``: allow an index of levels of detail. ``cameras``: allow a page, which has cameras.
     """
     by_name = next((row for row in FORMATS if row.names(path)), None)
-    by_folder = FOLDERS.get(Path(path).name, by_name)
-    if by_folder is not None and by_folder.cameras == "needed" and not cameras:
-        problem = f"expected a format without cameras, got {by_folder.about.partition(':')[0]}"
-        raise UsageError(f"{path}: {problem}; write a .ply, and convert that with --cameras")
-    if by_name is not None and ((by_name.levels == "inside" and not levels) or (by_name.cameras and not cameras)):
+    if by_name is not None and ((by_name.levels == "inside" and not levels) or (by_name.has_cameras and not cameras)):
         by_name = None
     if by_name is None or by_name.max_degree < 0:
         read_only = "" if by_name is None else f"{by_name.ending} can be read but not written; "
-        inside = [row.ending for row in FORMATS if row.cameras == "inside" and row.ending[0] == "."]
+        inside = [row.ending for row in FORMATS if row.has_cameras and row.ending[0] == "."]
         endings = join_words((*OUTPUT_FORMATS, *(inside if cameras else [])))
         index = f", or the name {INDEX}" if levels else ""
-        folder = f", or a folder; one named {' or '.join(FOLDERS)} gets that kind of model" if cameras else ""
+        folder = ", or a folder" if cameras else ""
         raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{index}{folder}")
     by_name.require()
     return by_name

@@ -10,23 +10,17 @@ import numpy as np
 
 from gsmerge.io.atomic import AddOutput, atomic_output
 from gsmerge.io.formats import ply
-from gsmerge.io.formats.table import OUTPUT_FORMATS, PLY, Contents, NamedPhotos, find_format, output_format
+from gsmerge.io.formats.table import OUTPUT_FORMATS, PLY, Contents, output_format
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arguments import check_arguments
 
 
-def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:
-    """Describe which harmonics a format leaves out; None if it stores all. UsageError for an unknown ending."""
+def lost_harmonics(path: StrPath, sh_degree: int) -> list[str]:
+    """Note which harmonics a format leaves out; no note if it stores all. UsageError for an unknown ending."""
     format_ = output_format(path, levels=True, cameras=True)
     if sh_degree <= format_.max_degree:
-        return None
-    return format_.lost.format(ending=format_.ending, degree=format_.max_degree)
-
-
-def output_notes(out: Path, sh_degree: int, photos: NamedPhotos) -> list[str]:
-    """Note which harmonics an output lacks, and which files programs need beside it."""
-    lost = lost_harmonics(out, sh_degree)
-    return [*([lost] if lost else []), *find_format(out).notes(out, photos)]
+        return []
+    return [format_.lost.format(ending=format_.ending, degree=format_.max_degree)]
 
 
 def level_output(output: Path, level: int) -> Path:

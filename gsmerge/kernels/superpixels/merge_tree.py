@@ -12,7 +12,6 @@ import numpy as np
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, u1
 
 NUM_PIXELS, PLANE_ERROR, ROW = 5, 15, 20  # columns of a row after the mean, and its length
-SLOPE_RIDGE = 1e-3  # square pixels; it determines the slopes of planes through fewer than three points
 OVERSIZE = 1e9  # added to the cost of a merge beyond the largest extent, so that such merges come last
 
 

@@ -145,23 +145,14 @@ function frame() {
 
 const say = (words) => { id("status").textContent = words; };
 
-// Bytes of a file of the page, which is in it or beside it.
-async function read(name) {
-  if (id(name)) return takeBytes(name);
-  if (location.protocol === "file:") throw new Error("a browser lets a page from disk read none of the files beside it; publish its folder, or write one file: -o NAME.html");
-  const answer = await fetch(name);
-  if (!answer.ok) throw new Error(`${name} is missing beside this page`);
-  return new Uint8Array(await answer.arrayBuffer());
-}
-
 async function start() {
   listen();
   id("full").hidden = !document.fullscreenEnabled;
   try {
-    const scene = await read(data.names.scene);
+    const scene = takeBytes(data.names.scene);
     [id("save").href, id("save").hidden] = [URL.createObjectURL(new Blob([scene])), false];
     if (!window.DecompressionStream || !document.createElement("canvas").getContext("webgl2")) throw new Error("this browser has no WebGL 2");
-    await loadVendor(await read(data.names.engine));
+    await loadVendor(takeBytes(data.names.engine));
     const settle = (settled) => stage.setAttribute("aria-busy", String(!settled));
     const made = new SiteView(id("canvas"), data.views, frame, settle);
     await made.add(SCENE, scene, data.names.scene);

@@ -16,7 +16,7 @@ FULL_FIT_SETTINGS = ("effort", "poses", *(name for name in flat_settings(FitOpti
 _baseline = partial(Method, prepare=partial(prepare, fill=False))  # with only the Gaussians of the file
 
 UNMERGED = _baseline("unmerged", simple.unmerged, uses=())
-UNMERGED_FIT = _baseline("unmerged-fit", simple.unmerged_fit, needs=("photos",), uses=FULL_FIT_SETTINGS)
+UNMERGED_FIT = _baseline("unmerged-fit", simple.unmerged_fit, needs_photos=True, uses=FULL_FIT_SETTINGS)
 MOMENT_MATCHING = _baseline("moment-matching", simple.match_moments)
 OPACITY = _baseline("opacity", simple.prune_faintest)
 RANDOM = _baseline("random", simple.prune_at_random)

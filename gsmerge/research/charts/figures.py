@@ -176,15 +176,10 @@ def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.9g}"))
         axes.xaxis.set_minor_locator(NullLocator())
     drawing.legend(
-        [Line2D([], [], markersize=4, **styles[name]) for name in names], [_plain(name) for name in names],
+        [Line2D([], [], markersize=4, **styles[name]) for name in names], [name.replace("$", r"\$") for name in names],
         loc="outside right center", handlelength=2.6, labelspacing=0.15, borderpad=0,
     )  # fmt: skip
     return drawing
-
-
-def _plain(name: str) -> str:
-    """Escape a name so that matplotlib does not read it as a formula."""
-    return name.replace("$", r"\$")
 
 
 def _draw_line(axes: Axes, line: Line, style: Style) -> None:

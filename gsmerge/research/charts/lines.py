@@ -133,11 +133,6 @@ def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
     return names
 
 
-def own_first(records: Iterable[RunRecord]) -> list[RunRecord]:
-    """Sort runs: gsmerge's own first, then baselines, each by number of settings."""
-    return sorted(records, key=lambda record: (record.method != OURS, len(line_key(record)[1])))
-
-
 class Results:
     """Successful runs, with values that tables and figures share.
 
@@ -151,7 +146,9 @@ class Results:
 
     def __init__(self, records: Iterable[RunRecord]) -> None:
         self.runs = [record for record in records if record.error is None]
-        keys = dict.fromkeys(map(line_key, own_first(self.runs)))
+        # gsmerge's own first, then baselines, each by number of settings
+        own_first = sorted(self.runs, key=lambda record: (record.method != OURS, len(line_key(record)[1])))
+        keys = dict.fromkeys(map(line_key, own_first))
         self.names = line_names(list(keys))
         counts = {part: sum(r.value(f"psnr_{part}") is not None for r in self.runs) for part in PARTS}
         self.part = next((p for p in counts if self.runs and counts[p] >= 0.9 * len(self.runs)), "context")

@@ -131,7 +131,7 @@ def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
         for element in value if isinstance(value, list) else [value]:
             words += [f"--{name}", element]
     page = make_page(records, figures, drawings, shlex.join(words))
-    write_texts({out / PAGE: page, out / TABLE: make_table(records)}, overwrite=True)
+    write_texts({out / PAGE: page, out / TABLE: make_table(records)})
     failed = sum(record.error is not None for record in records)
     document = {
         **document_head(),

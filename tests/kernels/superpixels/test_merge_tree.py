@@ -12,6 +12,8 @@ from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, voronoi
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 
+SLOPE_RIDGE = 1e-3  # square pixels, as in merge_tree.c
+
 HEIGHT, WIDTH, COUNT = 14, 19, 24
 DEPTH_WEIGHT, COMPACTNESS = 3.0, 1e-4
 
@@ -38,7 +40,7 @@ class View:
             return 0.0
         z = self.depths[mask].astype(float)
         x, y = (np.append(c[mask] - np.average(c[mask], weights=z**2), 0) for c in (self.x, self.y))
-        ridge = np.sqrt(kernels.SLOPE_RIDGE * (z**2).sum())
+        ridge = np.sqrt(SLOPE_RIDGE * (z**2).sum())
         rows = np.append(z, 0)[:, None] * np.stack([x, y, np.ones_like(x)], 1)
         system = np.concatenate([rows[:-1], [[ridge, 0, 0], [0, ridge, 0]]])
         expected = np.append(np.ones(len(z)), [0, 0])

@@ -29,7 +29,6 @@ def result(scene: Scene) -> gsmerge.CompactResult:
         ("a.ply", {"a.ply", "a.level1.ply", "a.cameras.json"}),
         ("a.sog", {"a.sog", "a.level1.sog", "a.cameras.json"}),
         ("a.html", {"a.html"}),
-        ("colmap", {f"colmap/sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")}),
     ],
 )
 def test_a_result_saves_itself(name: str, files: set[str], result: gsmerge.CompactResult, tmp_path: Path) -> None:

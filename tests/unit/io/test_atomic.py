@@ -16,7 +16,7 @@ from messages import NO_FOLDER, refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic, atomic_output, atomic_outputs
-from gsmerge.io.atomic import link_file, remove_stale, temporary_path
+from gsmerge.io.atomic import remove_stale, temporary_path
 
 
 def write_half_and_fail(path: Path, error: BaseException) -> None:
@@ -286,24 +286,3 @@ def test_files_get_the_usual_permissions(tmp_path: Path) -> None:
     with atomic_output(tmp_path / "atomic"):
         pass
     assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
-WAYS = [((), "hard"), (("link",), "symbolic"), (("link", "symlink"), "copy")]
-
-
-@pytest.mark.parametrize(("broken", "kind"), WAYS[:: 2 if os.name == "nt" else 1])  # which has no symbolic ones
-def test_files_are_linked_or_else_copied(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: tuple[str, ...], kind: str
-) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError("no links here")
-
-    for name in broken:
-        monkeypatch.setattr(os, name, refuse)
-    (tmp_path / "photo.jpg").write_text("photo")
-    with atomic_outputs() as add:
-        link_file(tmp_path / "photo.jpg", add(tmp_path / "images" / "a.jpg"))
-    made = tmp_path / "images" / "a.jpg"
-    assert [path.name for path in made.parent.iterdir()] == ["a.jpg"]
-    assert made.read_text() == "photo"
-    assert (made.is_symlink(), made.samefile(tmp_path / "photo.jpg")) == (kind == "symbolic", kind != "copy")

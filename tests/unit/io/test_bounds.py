@@ -37,9 +37,8 @@ def test_only_files_are_read(tmp_path: Path) -> None:
     assert check_file(tmp_path / "a") == 5
     assert read_text(tmp_path / "a") == "ab"
     assert list(read_lines(tmp_path / "a")) == ["ab"]
-    for read in (read_text, lambda *arguments: list(read_lines(*arguments))):
-        with refuses(SceneError, "a", "0 MiB"):
-            read(tmp_path / "a", 4)
+    with refuses(SceneError, "a", "0 MiB"):
+        list(read_lines(tmp_path / "a", 4))
     (tmp_path / "a").write_bytes(b"a\n\xff")
     for read in (read_text, lambda path: list(read_lines(path))):
         with refuses(SceneError, "a", "text"):

@@ -16,7 +16,7 @@ from gsmerge.cli import main
 from gsmerge.errors import SceneError
 from gsmerge.io import write_gaussians
 from gsmerge.io.no_gaussians import POINTS_ONLY
-from gsmerge.io.scene_files import find_scene_files, list_plys
+from gsmerge.io.scene_files import find_scene_files
 
 
 def write_points(path: Path) -> None:
@@ -102,9 +102,6 @@ def test_the_only_file_of_another_format_is_the_scene(tmp_path: Path, tiny: Tiny
     write_gaussians(path, tiny.gaussians)
     assert find_scene_files(tmp_path).ply == find_scene_files(path).ply == path
     assert list(find_scenes([str(tmp_path)], tmp_path / "out")) == [path]
-    (tmp_path / "index.html").touch()  # a web site, whose file is a result
-    assert not list_plys(tmp_path)
-    (tmp_path / "index.html").unlink()
     write_gaussians(tmp_path / f"other{ending}", tiny.gaussians)
     with refuses(SceneError, tmp_path, f"other{ending}", "name"):
         find_scene_files(tmp_path)

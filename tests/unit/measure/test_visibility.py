@@ -7,9 +7,9 @@ import pytest
 import scenes
 
 from gsmerge.measure import visibility
-from gsmerge.measure.visibility import context_points, front_rows, visible_pixels
+from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.photos.views import resize_cameras, subset
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Scene
 
 
 def slow_mask(points: np.ndarray, cameras: Cameras, view: int) -> np.ndarray:
@@ -81,21 +81,3 @@ def test_far_scenes_are_seen_as_well() -> None:
     masks = [visible_pixels(context_points(subset(s, [0]), 0.01), s.cameras, 0.01) for s in (here, there)]
     assert (masks[0] == masks[1]).mean() > 0.999
     assert 0.2 < masks[0][2].mean() < 0.98
-
-
-def test_rows_in_front_are_those_of_the_nearer_wall() -> None:
-    """What lies behind a wall, outside of the picture or behind the camera is seen by no view."""
-    y, x = np.mgrid[-1:1:21j, -1:1:21j]
-    wall = np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], 1)
-    means = np.concatenate([wall, 2 * wall, [[0, 0, -2], [9, 0, 2]]]).astype(np.float32)
-    n = len(means)
-    gaussians = Gaussians(
-        means, np.tile(np.float32([1, 0, 0, 0]), (n, 1)), np.full((n, 3), 0.08, np.float32),
-        np.full(n, 0.99, np.float32), np.zeros((n, 1, 3), np.float32), np.zeros((n, 0, 3), np.float32),
-    )  # fmt: skip
-    K = np.array([[20.0, 0, 16], [0, 20, 16], [0, 0, 1]])
-    turned = np.diag([-1.0, 1, -1, 1])  # looks away
-    cameras = Cameras(np.stack([np.eye(4), turned]), np.stack([K, K]), 32, 32)
-    front, away = front_rows(gaussians, cameras)
-    assert front.tolist() == list(range(len(wall)))
-    assert away.tolist() == [2 * len(wall)]

@@ -1,4 +1,4 @@
-"""A page with a scene, in one file or a few, that needs no other host, and a camera that it may not leave."""
+"""A page with a scene, that needs no other host, and a camera that it may not leave."""
 
 from __future__ import annotations
 
@@ -17,24 +17,27 @@ from page_policy import check_policy
 
 from gsmerge.cli.paths import is_page, output_file
 from gsmerge.io import read_gaussians
-from gsmerge.pages.site import MAX_VIEWS, NAMES, site_contents
+from gsmerge.pages.site import MAX_VIEWS, NAMES, make_page
 from gsmerge.types import Cameras
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
 NONE = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
-Contents = tuple[str, dict[str, bytes]]
-
-
-def contents_of(*, apart: bool) -> Contents:
+def page_of_room() -> str:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3))
-    return site_contents(scene.gaussians, scene.cameras, EVIL, (), apart=apart)
+    return make_page(scene.gaussians, scene.cameras, EVIL, ())
 
 
 @pytest.fixture(scope="module")
-def site() -> Contents:
-    return contents_of(apart=True)
+def page() -> str:
+    return page_of_room()
+
+
+def part_of(page: str, name: str) -> bytes:
+    found = re.search(f'<script type="text/plain" id="{re.escape(NAMES[name])}">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return base64.b64decode(found[1])
 
 
 def data_of(page: str) -> dict[str, Any]:
@@ -43,47 +46,33 @@ def data_of(page: str) -> dict[str, Any]:
     return dict(json.loads(found[1]))
 
 
-@pytest.mark.parametrize("apart", [True, False])
-def test_a_page_needs_no_other_host(apart: bool) -> None:
-    page, files = contents_of(apart=apart)
+def test_a_page_needs_no_other_host(page: str) -> None:
     check_policy(page)
     bare = re.sub(r"[A-Za-z0-9+/=]{1000,}", "", page)
     assert re.findall(r"https?:|[\"']//", bare) == []
     addresses = set(re.findall(r"""(?:src|href)=["']([^"']+)["']""", bare))
-    beside = {NAMES["poster"], NAMES["licences"]} if apart else set()
-    assert {one for one in addresses if not one.startswith("data:")} == beside
+    assert [one for one in addresses if not one.startswith("data:")] == []
     assert "<b onload" not in page
     assert f'<meta property="og:title" content="{html.escape(EVIL)}">' in page.replace("&#34;", "&quot;")
-    assert set(files) == (set(NAMES.values()) if apart else set())
+    assert len(page) < 1_000_000
 
 
-def test_one_file_holds_what_is_beside_a_site(site: Contents) -> None:
-    page, _ = contents_of(apart=False)
-    for content in site[1].values():
-        assert base64.b64encode(content).decode() in page
-
-
-def test_all_but_the_scene_takes_little(site: Contents) -> None:
-    page, files = site
-    assert len(page) + sum(len(content) for name, content in files.items() if name != NAMES["scene"]) < 700_000
-    assert len(contents_of(apart=False)[0]) < 1_000_000
-
-
-def test_its_scene_is_a_sog_of_all_gaussians(site: Contents, tmp_path: Path) -> None:
-    (tmp_path / "a.sog").write_bytes(site[1][NAMES["scene"]])
+def test_its_scene_is_a_sog_of_all_gaussians(page: str, tmp_path: Path) -> None:
+    (tmp_path / "a.sog").write_bytes(part_of(page, "scene"))
     assert len(read_gaussians(tmp_path / "a.sog").gaussians) == len(
         scenes.make_scene(scenes.room(), scenes.arc(3)).gaussians
     )
 
 
-def test_the_licences_of_the_viewer_are_beside_it(site: Contents) -> None:
-    assert site[1]["LICENSES.txt"].count(b"Permission is hereby granted") == 3
+def test_the_licences_of_the_viewer_are_in_it(page: str) -> None:
+    texts = [base64.b64decode(one) for one in re.findall("data:text/plain;base64,([A-Za-z0-9+/=]+)", page)]
+    assert [text.count(b"Permission is hereby granted") for text in texts] == [3]
 
 
 def test_of_many_views_the_page_knows_some_and_the_middle_one() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3))
     many = scene.cameras[np.repeat(np.arange(3), 50)]
-    data = data_of(site_contents(scene.gaussians, many, "a", (), apart=False)[0])
+    data = data_of(make_page(scene.gaussians, many, "a", ()))
     assert len(data["views"]) in (MAX_VIEWS, MAX_VIEWS + 1)
     assert data["free"] is False
     np.testing.assert_allclose(data["views"][data["start"]]["viewmat"], scene.cameras.viewmats[1].reshape(-1))
@@ -91,43 +80,38 @@ def test_of_many_views_the_page_knows_some_and_the_middle_one() -> None:
 
 def test_without_cameras_one_may_look_from_any_side() -> None:
     gaussians = scenes.make_scene(scenes.room(), scenes.arc(3)).gaussians
-    page, files = site_contents(gaussians, NONE, "a", (), apart=True)
+    page = make_page(gaussians, NONE, "a", ())
     data = data_of(page)
     assert data["free"] is True
     assert data["start"] == 0
-    poster = cv2.imdecode(np.frombuffer(files["poster.webp"], np.uint8), cv2.IMREAD_COLOR)
+    (picture,) = re.findall("data:image/webp;base64,([A-Za-z0-9+/=]+)", page)
+    poster = cv2.imdecode(np.frombuffer(base64.b64decode(picture), np.uint8), cv2.IMREAD_COLOR)
     assert poster is not None
     assert (poster > 20).any(2).mean() > 0.3  # it shows the scene
 
 
 @pytest.mark.parametrize(
-    ("output", "site", "expected"),
+    ("output", "expected"),
     [
-        ("new", False, "new/a.ply"),
-        ("empty", False, "empty/a.ply"),
-        ("full.dir", False, "full.dir/a.ply"),  # whatever it holds: a page, or the rest of a killed run
-        ("file", False, "file"),  # which no format names
-        ("new.html", False, "new.html"),
-        ("b.ply", False, "b.ply"),
-        ("colmap", False, "colmap/sparse/0/points3D.bin"),
-        ("new", True, "new/index.html"),
-        ("full.dir", True, "full.dir/index.html"),
-        ("full.dir/page.html", True, "full.dir/page.html"),
+        ("new", "new/a.ply"),
+        ("empty", "empty/a.ply"),
+        ("full.dir", "full.dir/a.ply"),  # whatever it holds: a page, or the rest of a killed run
+        ("file", "file"),  # which no format names
+        ("new.html", "new.html"),
+        ("b.ply", "b.ply"),
     ],
 )
-def test_a_folder_gets_the_result_and_a_site_where_one_is_asked_for(
-    output: str, site: bool, expected: str, tmp_path: Path
-) -> None:
+def test_a_folder_gets_the_result(output: str, expected: str, tmp_path: Path) -> None:
     for name in ("empty", "full.dir"):
         (tmp_path / name).mkdir()
-    (tmp_path / "full.dir" / "index.html").write_text(contents_of(apart=True)[0])
+    (tmp_path / "full.dir" / "index.html").write_text(page_of_room())
     (tmp_path / "full.dir" / ".gsmerge-00000000-1-00000000.html").touch()
     (tmp_path / "file").touch()
-    assert output_file(tmp_path / output, "a.ply", site=site) == tmp_path / expected
+    assert output_file(tmp_path / output, "a.ply") == tmp_path / expected
 
 
 def test_a_page_with_a_scene_is_a_result_that_no_report_replaces(tmp_path: Path) -> None:
-    (tmp_path / "scene.html").write_text(contents_of(apart=False)[0])
+    (tmp_path / "scene.html").write_text(page_of_room())
     (tmp_path / "mine.html").write_text("<!DOCTYPE html><title>mine</title>")
     (tmp_path / "report.html").write_text('<meta name="generator" content="gsmerge 0.3.0">')
     names = ("scene.html", "mine.html", "report.html")

@@ -11,7 +11,7 @@ from messages import noted
 
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.splat_transform import VARIABLE
-from gsmerge.io.formats.table import COLMAP, INDEX, OUTPUT_FORMATS
+from gsmerge.io.formats.table import INDEX, OUTPUT_FORMATS
 from gsmerge.types import Gaussians
 
 NAMES = ("lod-meta.json", "a.html", *(f"a{ending}" for ending in OUTPUT_FORMATS))
@@ -43,10 +43,6 @@ def test_far_from_the_origin_digits_are_lost(near: Gaussians, name: str) -> None
     assert rounding_notes(name, near) == []
     far = replace(near, means=near.means + 3e6 * np.array([1, -1, 1]))
     assert noted(rounding_notes(name, far), "--translate=-3000000,3000000,-3000000")
-
-
-def test_colmap_keeps_float64(near: Gaussians) -> None:
-    assert rounding_notes(COLMAP.ending, replace(near, means=near.means + 1e9)) == []
 
 
 def test_what_is_far_apart_takes_digits_of_a_spz_alone(near: Gaussians) -> None:
