@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -108,32 +107,10 @@ def test_ci_runs_that_block() -> None:
     assert "run: .ci/run" in (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
 
 
-def test_badges_say_what_the_project_says() -> None:
-    badges = dict(re.findall(r"^\[!\[([^\]]+)\]\(\S+\)\]\((\S+)\)$", README, re.MULTILINE))
-    first, end = re.findall(r'^requires-python = ">=3\.(\d+),<3\.(\d+)"$', PROJECT, re.MULTILINE)[0]
-    (name,) = re.findall(r'^license = "(.+)"$', PROJECT, re.MULTILINE)
-    assert list(badges) == ["CI", f"License: {name}", f"Python 3.{first} to 3.{int(end) - 1}"]
-    assert (ROOT / badges["CI"].replace("../../actions", ".github")).exists()
-    assert f"license-{name.replace('-', '--')}-" in README
-    assert f"python-3.{first}%20to%203.{int(end) - 1}-" in README
-
-
 def test_every_version_of_python_at_the_ends_is_tested() -> None:
     text = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
     first, end = re.findall(r'^requires-python = ">=3\.(\d+),<3\.(\d+)"$', PROJECT, re.MULTILINE)[0]
     assert {f"3.{first}", f"3.{int(end) - 1}"} <= set(re.findall(r'python: "([\d.]+)"', text))
-
-
-@pytest.mark.parametrize(
-    "form", sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("[!c]*.yml")), ids=lambda path: path.stem
-)
-def test_templates_ask_for_calls_that_are_there(form: Path) -> None:
-    calls = re.findall(r"`gsmerge ([^`]+)`", form.read_text(encoding="utf-8"))
-    assert calls
-    for call in calls:
-        name, *arguments = shlex.split(call)
-        if name not in ("--version", "--debug"):
-            COMMANDS[name].make_context(name, arguments)  # raises where an argument is wrong
 
 
 def test_wheels_are_built_for_the_platforms_that_the_guide_names_and_tried_there() -> None:

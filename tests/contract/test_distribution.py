@@ -130,11 +130,3 @@ def test_the_image_has_the_pinned_versions(root: Path) -> None:
     assert copied >= {*SOURCES, "constraints.txt"}
     assert [name for name in copied if not (root / name).exists()] == []
     assert copied & set((root / ".dockerignore").read_text().split()) == set()
-
-
-def test_what_the_image_runs(root: Path, project: dict[str, Any]) -> None:
-    steps = (root / "Dockerfile").read_text()
-    (entry,) = re.findall(r'^ENTRYPOINT \["(.+)"\]$', steps, re.MULTILINE)
-    assert entry in project["scripts"]
-    (user,) = re.findall(r"^USER (.+)$", steps, re.MULTILINE)
-    assert user not in ("0", "root")

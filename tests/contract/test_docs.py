@@ -6,14 +6,12 @@ import ast
 import inspect
 import os
 import re
-import runpy
 import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import fields
 from importlib import import_module
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -63,18 +61,6 @@ def blocks_in(page: str) -> list[list[str]]:
 def calls_in(page: str) -> list[str]:
     """Every ``gsmerge ...`` call in a page's shell blocks."""
     return [call for calls in blocks_in(page) for call in calls]
-
-
-def written_by(call: str) -> list[str]:
-    """The files that a call writes and does not replace; of ``compact`` also the cameras beside its result."""
-    command, *rest = [word for word in shlex.split(call, comments=True)[1:] if word != "compact"]
-    outputs = [value for name, value in pairwise(rest) if name in ("-o", "--output")]
-    if command == "convert":
-        return [next(word for word in reversed(rest) if "--" not in word and rest[rest.index(word) - 1][:2] != "--")]
-    if command in TOP:
-        return outputs if command == "render" else []
-    result = Path((outputs or [Path(command).with_suffix(".compact.ply")])[0])
-    return [] if "--dry-run" in rest else [str(result), str(result.with_suffix(".cameras.json"))]
 
 
 def parse(call: str) -> None:
@@ -132,22 +118,6 @@ def test_calls_parse(page: str) -> None:
         parse(call)
 
 
-@pytest.mark.parametrize("page", [page for page in WRITTEN if calls_in(page)])
-def test_calls_of_a_block_write_different_files(page: str) -> None:
-    """So that a block can be pasted as a whole."""
-    for calls in blocks_in(page):
-        paths = [path for call in calls for path in written_by(call)]
-        assert len(paths) == len(set(paths)), calls
-
-
-GUIDES = [page for page in PAGES if page.startswith("docs/guide/")]
-
-
-@pytest.mark.parametrize("page", GUIDES)
-def test_guides_are_read_in_five_minutes(page: str) -> None:
-    assert len(read(page).split()) < 1000
-
-
 @pytest.mark.parametrize("page", [page for page in WRITTEN if "python benchmarks/" in read(page)])
 def test_benchmarks_in_pages_are_there(page: str) -> None:
     """Their scripts, and their options."""
@@ -155,53 +125,6 @@ def test_benchmarks_in_pages_are_there(page: str) -> None:
     for name, words in re.findall(r"python (benchmarks/\w+\.py)([^`\n]*)", text):
         source = (ROOT / name).read_text()
         assert [option for option in re.findall(r"--[a-z-]+", words) if f'"{option}"' not in source] == [], name
-
-
-def benchmark_calls() -> list[str]:
-    """Every call of a benchmark inside the text of a page."""
-    texts = [re.sub(r"```.*?```", "", read(page), flags=re.DOTALL).replace("\n", " ") for page in WRITTEN]
-    calls = {call for text in texts for call in re.findall(r"`python (benchmarks/[^`]+)`", text)}
-    return sorted(calls - {"benchmarks/cost.py --growth"})  # which needs no captures
-
-
-@pytest.mark.parametrize("call", benchmark_calls())
-def test_benchmarks_say_which_captures_they_need(
-    call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    script, *words = shlex.split(call)
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    monkeypatch.setattr(sys, "argv", [script, *words])
-    monkeypatch.setenv("GSMERGE_DATA", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as raised:
-        runpy.run_path(str(ROOT / script), run_name="__main__")
-    said = capsys.readouterr().err or str(raised.value)
-    assert "docs/internals/captures.md" in said.splitlines()[-1]
-    assert "Traceback" not in said
-    for name, module in list(sys.modules.items()):  # others may have such names too
-        if Path(getattr(module, "__file__", None) or ".").parent == ROOT / "benchmarks":
-            del sys.modules[name]
-
-
-def questions() -> dict[str, str]:
-    """The questions of users, each with its answer."""
-    found = re.findall(r"^\*\*(.+?\?)\*\* (.+?)\n(?:\n|\Z)", read("docs/guide/faq.md") + "\n", re.MULTILINE | re.DOTALL)
-    return dict(found)
-
-
-def test_questions_are_answered_in_five_lines_with_a_command() -> None:
-    for question, answer in questions().items():
-        assert len(answer.splitlines()) <= 5, question
-        calls = re.findall(r"`(gsmerge [^`]+)`", answer)
-        assert calls or question == "Is anything sent anywhere?", question
-        for call in calls:
-            parse(call)
-
-
-def test_settings_that_many_guides_need_are_options() -> None:
-    pages = [(name, page) for page in GUIDES for name in set(re.findall(r"--set\s+(\w+)=", read(page)))]
-    named = [name for name, _ in pages]
-    assert {name for name in named if named.count(name) >= 3} == set()
 
 
 @pytest.mark.parametrize("page", [page for page in WRITTEN if "```python" in read(page)])
@@ -256,13 +179,6 @@ def test_index_links_every_page() -> None:
     assert [page for page in pages if page != "README.md" and f"]({page})" not in index] == []
 
 
-def test_readme_is_a_front_page() -> None:
-    assert len((ROOT / "README.md").read_bytes()) <= 8192
-    pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", read("README.md"))
-    (picture,) = [address for address in pictures if "badge" not in address]
-    assert (ROOT / picture).stat().st_size < 300_000
-
-
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_every_option_has_help(name: str) -> None:
     command = COMMANDS[name]
@@ -308,21 +224,6 @@ def test_every_key_of_the_report_is_described() -> None:
     keys = set(re.findall(r'^ {8}"(\w+)":', source, re.MULTILINE)) | {f.name for f in fields(gsmerge.CompactReport)}
     text = read("docs/reference/report.md")
     assert {key for key in keys if f"`{key}`" not in text} == set()
-
-
-def test_contributing_names_every_task() -> None:
-    tasks = runpy.run_path(str(ROOT / "tasks.py"))["TASKS"]
-    text = read("CONTRIBUTING.md")
-    assert [
-        name
-        for name in tasks
-        if not re.search(rf"`python3? tasks.py {name}\b|^python3 tasks.py {name}\b", text, re.MULTILINE)
-    ] == []
-
-
-def test_changelog_starts_with_unreleased(root: Path) -> None:
-    sections = re.findall(r"^## (.+)$", (root / "CHANGELOG.md").read_text(), re.MULTILINE)
-    assert sections[0] == "Unreleased"
 
 
 def test_constraints_pin_every_dependency(root: Path) -> None:

@@ -18,14 +18,6 @@ from scripts import load_script
 from gsmerge.cli import main
 
 
-def test_examples_are_numbered_without_gaps(root: Path) -> None:
-    names = sorted(path.name for path in (root / "examples").glob("*.py"))
-    assert [int(name[:2]) for name in names] == list(range(1, len(names) + 1))
-    for name in names:
-        first_lines = (root / "examples" / name).read_text()[:600]
-        assert f"python examples/{name} " in first_lines
-
-
 def test_examples_run_one_after_the_other(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -116,14 +116,3 @@ def test_help_fits_a_terminal(
     assert usage[-1] == "[OPTIONS]"
     assert "{" not in " ".join(usage)
     assert re.findall(r"<\w[^>]*>?", text.partition("─ Options ─")[2].replace("<=x<=", "")) == ["<bool>"]  # of --help
-
-
-def test_help_prints_brackets(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "160")
-    assert "gsmerge[ray]" in help_of(capsys, "batch", "--help")
-
-
-def test_commands_are_grouped(capsys: pytest.CaptureFixture[str]) -> None:
-    text = help_of(capsys, "--help")
-    titles = ("Compact", "Many scenes, and views in batches", "Look and measure", "Research")
-    assert [text.index(f"─ {title} ─") for title in titles] == sorted(text.index(f"─ {title} ─") for title in titles)

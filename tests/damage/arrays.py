@@ -128,7 +128,12 @@ def relabel(**said: Any) -> Callable[[bytes], bytes]:
 
 
 DAMAGES = {
-    "views.npz": of_cameras("c2w", "K", "images") | {"an order of objects": refuse(put_objects("order"))},
+    "views.npz": {
+        **of_cameras("c2w", "K", "images"),
+        "an order of objects": refuse(put_objects("order")),
+        "another order": refuse(put_array("order", np.array("magic")), "'order'", "magic"),
+        "intrinsics of another shape": refuse(put_array("K", np.ones((4, 3, 3, 1))), "(4, 3, 3, 1)"),
+    },
     "results.npz": {
         **of_cameras("extrinsics", "intrinsics", "image"),
         "intrinsics of zeros": refuse(edit_array("intrinsics", np.zeros_like), "focal"),

@@ -25,7 +25,6 @@ from .changes import (
     write_file,
 )
 
-LOSSLESS = (cv2.IMWRITE_WEBP_QUALITY, 101)
 BOX = {"min": [-9, -9, -9], "max": [9, 9, 9]}
 HUGE = 10**400
 

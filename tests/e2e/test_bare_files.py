@@ -81,16 +81,6 @@ def test_counts_are_judged_by_views_that_nothing_was_fitted_to(bare: Path, tmp_p
         assert kept["choices"]["fidelity"]["psnr"] >= 32.5
 
 
-def test_settings_of_stages_that_are_left_out_are_named(bare: Path, tmp_path: Path, run: Any) -> None:
-    words = ("--set", "fit_steps=50", "--set", "unseen=keep", "--levels", "3", "--set", "drop=floaters", "--k", "2")
-    report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", *words)
-    assert noted(report["notes"], "no effect", "unseen")
-    assert not noted(report["notes"], "no effect", "fit_steps")
-    assert not noted(report["notes"], "no effect", "k")
-    assert len(report["levels"]) == 2
-    assert all(level["choices"]["fidelity"]["psnr"] > 5 for level in report["levels"])
-
-
 @pytest.mark.slow
 def test_photos_without_cameras_change_nothing(bare: Path, smallest_scene: Path, tmp_path: Path, run: Any) -> None:
     """Neither those that are named nor those that lie beside the scene."""

@@ -136,19 +136,6 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
     counts = "1,000 scenes: 301 done, 300 skipped, 300 failed, 99 left; 30,100 -> 1,204 Gaussians (4.00 %)"
     assert last == f"{counts}; 1 missed the target"
     assert Totals(0).lines() == ["0 scenes: 0 done"]
-    new = Totals(1)
-    new.add(record("done", "z", "z.ply", report={**report, "new_views": {"low": 2.9, "high": 5.4}}))
-    assert new.lines()[1].split()[-6:] == ["+2.9", "to", "+5.4", "dB", "20.00", "1.5"]
-    alone = Totals(1)
-    alone.add(record("done", "y", "y.ply", report={**report, "choices": {"fidelity": {"psnr": 32.8}}}))
-    assert alone.lines()[1].split()[-4:] == ["the", "input", "32.80", "1.5"]
-
-
-def test_equal_reasons_are_listed_once() -> None:
-    totals = Totals(4)
-    for name, error in (("a", "no"), ("b", "no"), ("c", "c/x.ply: no"), ("d", "no")):
-        totals.add(record("failed", name, f"{name}.ply", error=error))
-    assert totals.lines()[:-1] == ["failed: a and 2 others: no", "failed: c/x.ply: no"]
 
 
 def test_what_a_scene_lacks_is_said(rooms: Path, tmp_path: Path, run: Run) -> None:

@@ -9,13 +9,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from scripts import load_script
 
 import gsmerge
-from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene
 
 ROOT = Path(__file__).parents[2]
@@ -85,20 +83,6 @@ def test_a_capture_is_read_by_its_export(
     loaded = load_scene(script("captures").write_export(capture, tmp_path / "plain"))
     assert loaded.alignment.ok
     assert loaded.scene.num_gaussians == 3 * 128 * 64
-
-
-def test_a_view_without_points_is_named(script: Callable[[str], ModuleType], photos: Path, tmp_path: Path) -> None:
-    first = min((photos / "images").iterdir())
-    cv2.imwrite(str(first), np.full((96, 144, 3), 128, np.uint8))
-    with pytest.raises(SystemExit, match="00000: expected 10 points in common with others, found 0"):
-        script("make_capture").make_capture(photos, tmp_path / "out", flat, 3)
-
-
-def test_a_frame_without_its_photo_is_left_out(script: Callable[[str], ModuleType], photos: Path) -> None:
-    first, *others = sorted((photos / "images").iterdir())
-    first.unlink()
-    cameras = read_cameras(photos / "transforms.json")
-    assert [path for _, path in script("make_capture").find_photos(photos, cameras)] == others
 
 
 @pytest.mark.parametrize("style", ["da3", "depthsplat", "anysplat"])

@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from batches import InlinePool
 from tiny_scene import edited_json
 
 import gsmerge
@@ -102,12 +101,6 @@ def test_inspect(small_scene: Path, run: Run) -> None:
     assert document["compact"] == planned["compact"]
 
 
-def test_inspect_of_an_unaligned_file_is_no_error(smallest_copy: Path, run: Run) -> None:
-    some = gsmerge.read_ply(smallest_copy / "scene.ply").gaussians[::9]
-    gsmerge.write_ply(smallest_copy / "scene.ply", some, overwrite=True)
-    assert "pixel" in run("inspect", smallest_copy, code=0).out
-
-
 def test_views(made_scene: Path, tmp_path: Path, run: Run) -> None:
     cameras = made_scene / "transforms.json"
     run("render", made_scene / "scene.ply", "--cameras", cameras, "-o", tmp_path / "frames", code=0)
@@ -155,14 +148,6 @@ def test_panel(small_copy: Path, run: Run) -> None:
     assert 2 * WIDTH <= cv2.imread(str(alone)).shape[1] < sheet.shape[1]
 
 
-def test_a_panel_beside_the_scene_is_replaced_and_photos_are_not(smallest_copy: Path, run: Run) -> None:
-    call = ("render", smallest_copy, "--views", 1, "--overwrite")
-    for _ in range(2):
-        run(*call, "-o", smallest_copy / "p.png", code=0)
-    run(*call, "-o", smallest_copy / "images" / "view_000.png", code=2)
-    run(*call, "--images", smallest_copy, "-o", smallest_copy / "p.png", code=2)
-
-
 def test_a_panel_of_a_size_cuts_photos_as_it_cuts_views(small_copy: Path, run: Run) -> None:
     out, call = small_copy / "wide.jpg", ("render", small_copy, "--views", 1, "--size", "480x160")
     run(*call, "-o", out, code=0)
@@ -175,18 +160,6 @@ def test_a_panel_of_a_size_cuts_photos_as_it_cuts_views(small_copy: Path, run: R
     run(*call, "-o", small_copy / "views", code=0)
     alone = cv2.imread(str(small_copy / "views" / "view_002.png"))
     assert [np.abs(photo - whole[80:240]).mean() < 4, np.abs(view - alone).mean() < 4] == [True, True]
-
-
-@pytest.mark.slow
-def test_a_view_of_one_scene(smallest_copy: Path, run: Run) -> None:
-    """Of a folder, and of a compact scene beside its cameras: two pages, each with what it takes to show it."""
-    outcome = run("view", smallest_copy, "--no-open", code=0)
-    page = smallest_copy / "scene.view.html"
-    assert outcome.out.startswith(f"{page}: 1,152 Gaussians, ")
-    assert "note" not in outcome.err
-    run("compact", smallest_copy, *QUICK, "--quiet", code=0)
-    run("view", smallest_copy / "scene.compact.ply", "--no-open", code=0)
-    assert f"<title>{smallest_copy.name}</title>" in (smallest_copy / "scene.compact.view.html").read_text()
 
 
 def test_version(run: Run) -> None:
@@ -236,18 +209,3 @@ def test_notes_warnings_and_errors_are_lines_of_the_same_stream(small_scene: Pat
         (line,) = run(*words, "--progress", "json", code=code).err.splitlines()
         assert str(words[1]) in json.loads(line)["error"] or code == 2
         assert run(*words, code=code).err.startswith("gsmerge: error: ")
-
-
-def test_progress_of_a_batch_names_scenes(
-    small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
-    (tmp_path / "bad.ply").write_bytes(b"ply")
-    outcome = run("batch", small_scene, tmp_path / "bad.ply", "-o", tmp_path / "out", "--effort", "draft", "--progress",
-                  "json", code=5)  # fmt: skip
-    events = [json.loads(line) for line in outcome.err.splitlines()]
-    done = [event for event in events if "done" in event]
-    assert [next(iter(event)) for event in events if event not in done] == ["info", "error"]
-    assert [event["done"] for event in done] == [1, 2]
-    assert [event["total"] for event in done] == [2, 2]
-    assert sum(event["error"] is None for event in done) == 1

@@ -22,9 +22,8 @@ from gsmerge.geometry.transforms import covariances
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path
 from gsmerge.io.formats import table as formats
-from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import Contents, Format
-from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
+from gsmerge.settings.placement import AXES, PlacementOptions
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians
 
@@ -198,13 +197,6 @@ def test_what_no_view_shows_is_left_out(result: Path, tmp_path: Path) -> None:
     assert noted(again["notes"], "a.cameras.json", "of an earlier file")
 
 
-def test_harmonics_are_left_out_and_results_stay_results(result: Path, tmp_path: Path) -> None:
-    convert_files(ConvertOptions([result], tmp_path / "out.ply", placement=PlacementOptions(sh_degree=1)))
-    assert read(tmp_path / "out.ply").sh_degree == 1
-    np.testing.assert_allclose(read(tmp_path / "out.ply").shN, read(result).shN[:, :3], atol=1e-6)
-    assert header_content(tmp_path / "out.ply") == "result"
-
-
 def test_scales_and_shapes_stay_exact(result: Path, tmp_path: Path) -> None:
     convert_files(ConvertOptions([result], tmp_path / "out.ply", placement=PlacementOptions(scale=2, rotate="0,0,90")))
     before, after = read(result), read(tmp_path / "out.ply")
@@ -212,13 +204,6 @@ def test_scales_and_shapes_stay_exact(result: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(after.means, 2 * before.means @ turn.T, atol=1e-5)
     expected = 4 * turn @ covariances(before.quats, before.scales) @ turn.T
     np.testing.assert_allclose(covariances(after.quats, after.scales), expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,nan", ""])
-def test_triples_are_three_numbers(text: str) -> None:
-    assert parse_triple("rotate", "1, -2,.5") == (1.0, -2.0, 0.5)
-    with refuses(ValueError, "translate", repr(text)):
-        PlacementOptions(translate=text)
 
 
 def test_the_command(small_scene: Path, tmp_path: Path, result: Path, run: Run) -> None:

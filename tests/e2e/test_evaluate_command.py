@@ -86,29 +86,6 @@ def test_a_page_shows_what_was_measured(setting: str, scene: Path, small: Path, 
     assert text.count('"held_out":') == shown + 1  # and the view from outside
 
 
-@pytest.mark.slow
-def test_a_trajectory_with_both_kinds_of_views(scene: Path, run: Run) -> None:
-    context = json.loads((scene / "transforms.json").read_text())
-    targets = json.loads((scene / "targets" / "transforms.json").read_text())
-    frames = []
-    for i, frame in enumerate(context["frames"]):
-        frames.append(frame)
-        if i < len(targets["frames"]):
-            own = targets["frames"][i]
-            frames.append(own | {"file_path": "targets/" + own["file_path"]})
-    for frame in frames[1::2]:  # names of their own
-        new = frame["file_path"].replace("view", "held")
-        (scene / frame["file_path"]).rename(scene / new)
-        frame["file_path"] = new
-    trajectory = scene / "all.json"
-    trajectory.write_text(json.dumps(context | {"frames": frames}))
-    outcome = run("evaluate", scene, "--targets", trajectory, "--set", "views=3", "--lpips", "none", "--json")
-    document = json.loads(outcome.out)
-    assert document["num_views"] == {"context": 3, "target": 2}
-    held = [view["view"] for view in document["results"][0]["views"] if view["split"] == "target"]
-    assert [Path(name).stem for name in held] == [Path(frames[i]["file_path"]).stem for i in (1, 5)]
-
-
 def test_lpips_is_measured_with_alexnet_on_four_views(scene: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     looked = []
     monkeypatch.setattr("gsmerge.measure.lpips.lpips_available", lambda net: True)

@@ -15,7 +15,6 @@ import gsmerge
 from gsmerge.cli import main
 from gsmerge.kernels import elementary
 from gsmerge.measure.drawings import picture_stems
-from gsmerge.scene.read import load_scene
 
 from .conftest import Run, assert_refused, listing
 
@@ -152,15 +151,6 @@ def test_every_command_notes_odd_rows(command: str, small_copy: Path, run: Run) 
     notes = [line for line in said.splitlines() if line.startswith("note")]
     assert len(notes) == 3
     assert names(said, "opacities lie in [0, 1]", "1 row with", "NaN", "1 Gaussian with", "scales")
-
-
-def test_odd_rows_reach_the_scene_s_notes_and_the_report(small_copy: Path, run: Run) -> None:
-    spoil_rows(small_copy / "scene.ply")
-    notes = load_scene(small_copy).notes
-    assert len(notes) == 3
-    assert json.loads(run(*call("compact", small_copy), "--json").out)["notes"] == list(notes)
-    named = load_scene(small_copy, opacity="raw").notes
-    assert len(named) == 2  # who names the encoding need not be told
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 from messages import says
 
 import gsmerge
-from gsmerge.cli import main
 from gsmerge.compaction import files
 
 from .conftest import Run, assert_refused, listing
@@ -47,17 +45,6 @@ def test_a_scene_alone_is_compacted_and_shown(
     assert listing(smallest_copy) == before
 
 
-@pytest.mark.slow
-def test_json_and_quiet(smallest_copy: Path, run: Run, opened: list[str]) -> None:
-    said = run(smallest_copy, *FAST, "--json", code=0)
-    assert json.loads(said.out)["output"]["num_gaussians"] > 0
-    assert (said.err, opened) == ("", [])
-    assert len(pages_in(smallest_copy)) == 1
-    pages_in(smallest_copy)[0].unlink()
-    said = run(smallest_copy, *FAST, "--overwrite", "--quiet", code=0)
-    assert (said.out, said.err, len(opened)) == ("", "", 1)
-
-
 def test_a_plan_and_what_no_page_shows_open_none(smallest_copy: Path, run: Run, opened: list[str]) -> None:
     assert "would write" in run(smallest_copy, *FAST, "--dry-run", code=0).out
     run(smallest_copy, *FAST, "-o", smallest_copy.parent / "page.html", code=0)
@@ -85,11 +72,3 @@ def test_threads_of_the_environment(smallest_copy: Path, monkeypatch: pytest.Mon
         assert available_threads() == count == 3
     monkeypatch.setenv("GSMERGE_THREADS", "0")
     assert_refused(run("inspect", smallest_copy), 2, "GSMERGE_THREADS", "'0'")
-
-
-def test_a_state_has_a_page_as_a_scene_has(smallest_scene: Path, tmp_path: Path, opened: list[str]) -> None:
-    state = tmp_path / "room.gsm"
-    assert main(["extend", str(state), str(smallest_scene), "--set", "superpixels=60", "-q"]) == 0
-    assert main([str(state), "-q"]) == 0
-    assert [page.parent for page in pages_in(tmp_path)] == [tmp_path]
-    assert len(opened) == 1

@@ -8,11 +8,10 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
-from messages import names
 
 from gsmerge.cli import main
 
-from .conftest import Run, assert_refused, listing
+from .conftest import Run
 
 SMALL = ("--scenes", 1, "--views", "3", "--size", "24x16")  # a scene takes half a second, however small it is
 
@@ -43,19 +42,3 @@ def test_other_commands_read_the_scenes(made: Path, run: Run) -> None:
     run("compact", made / "scene_0000", "--set", "superpixels=5%", "--fit", "none", code=0)
     targets = made / "scene_0000" / "targets"
     run("evaluate", made / "scene_0000", "--targets", targets, "--lpips", "none", "--json", code=0)
-
-
-@pytest.mark.slow
-def test_a_second_call_keeps_and_adds(made: Path, run: Run) -> None:
-    before = listing(made)
-    assert names(run("lab", "generate", "-o", made, *SMALL).out, "0 scenes", 1)
-    assert listing(made) == before
-    more = json.loads(run("lab", "generate", "-o", made, *SMALL[2:], "--scenes", 2, "--json").out)
-    assert [scene["kept"] for scene in more["scenes"]] == [True, False]
-    assert more["options"]["views"] == 3
-
-
-def test_scenes_of_other_settings_are_not_replaced(made: Path, run: Run) -> None:
-    before = listing(made)
-    assert_refused(run("lab", "generate", "-o", made, *SMALL, "--set", "seed=1"), 2, made / "scene_0000", "remove it")
-    assert listing(made) == before

@@ -55,19 +55,6 @@ def test_the_program_may_be_on_the_path(
     assert len(read_ply(tmp_path / "a.ply").gaussians) == 50
 
 
-@pytest.mark.parametrize("named", [None, "no/such/program"])
-def test_a_missing_program_is_one_line(
-    named: str | None, smallest_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", named or "")
-    before = listing(smallest_copy)
-    said = run("compact", smallest_copy, "--set", "method=splat-transform")
-    found = f"GSMERGE_SPLAT_TRANSFORM={named}" if named else "GSMERGE_SPLAT_TRANSFORM"
-    assert_refused(said, 2, "splat-transform", found, "npm install -g @playcanvas/splat-transform")
-    assert listing(smallest_copy) == before
-
-
 def test_a_failing_program_is_one_line(
     smallest_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

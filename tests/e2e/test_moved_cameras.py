@@ -84,14 +84,3 @@ def test_preview_and_render_agree_with_photos_that_are_broken(
     broken, sheet = moved_scene / "images", ("render", moved_scene / "scene.ply", "-o", tmp_path / "sheet.png")
     assert names(run(*sheet, code=0).err, f"the photos in {broken} are left out", "cannot be decoded")
     assert_refused(run(*sheet, "--overwrite", "--images", broken), 3, broken / "view_000.png", "cannot be decoded")
-
-
-@pytest.mark.slow
-def test_cameras_that_do_not_fit_are_said(scene_copy: Path, tmp_path: Path, run: Run) -> None:
-    with edited_json(scene_copy / "transforms.json") as data:
-        turn = np.eye(4)
-        turn[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.2, 0.0]))[0]
-        for frame in data["frames"]:
-            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
-    outcome = run("render", scene_copy, "-o", tmp_path / "out", code=0)
-    assert names(outcome.err, "cameras", "stay")

@@ -36,19 +36,6 @@ def sharp(make_scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
-def test_one_file_with_its_photo(run: Run, sharp: Path, tmp_path: Path) -> None:
-    out = tmp_path / "small.ply"
-    done = run(
-        "compact", sharp / "out/IMG_0001.ply", "--images", sharp / "photos", "-o", out, *FIT, "--json", code=0
-    )  # fmt: skip
-    report = json.loads(done.out)
-    assert report["input"]["exporters"] == ["sharp"]
-    assert report["input"]["num_gaussians"] == 2 * SIDE * SIDE
-    assert report["output"]["num_gaussians"] == 700
-    assert report["psnr_input_views"]["after"] > report["psnr_input_views"]["before"]
-
-
 def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -> None:
     """Three photos are matched and joined, and the result is fitted, which takes two seconds."""
     out, photos = tmp_path / "place.ply", sharp / "photos"

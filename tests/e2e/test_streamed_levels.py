@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 from splat_transform_programs import needs_program, put_stand_in, run_here
 
-import gsmerge
 from gsmerge.io import read_gaussians
 from gsmerge.io.formats.splat_transform import VARIABLE
 from gsmerge.io.formats.streamed import read_index
@@ -85,19 +83,6 @@ def test_what_takes_a_scene_takes_its_finest_level(small_scene: Path, index: Pat
     picture = index.parent / "a.png"
     run("render", small_scene, index, "-o", picture, code=0)
     assert picture.stat().st_size > 1000
-
-
-@pytest.mark.slow
-def test_a_run_that_fails_leaves_no_folder(
-    small_scene: Path, index: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> Any:
-        raise gsmerge.errors.SceneError(small_scene, "expected luck, found none")
-
-    monkeypatch.setattr("gsmerge.compaction.outputs.viewer_cameras", fail)  # when all chunks are written
-    assert run("compact", small_scene, "-o", index, *QUICK).code == 3
-    assert not index.parent.exists()
-    assert run("compact", small_scene, "-o", index.parent / "deep" / "lod-meta.json", *QUICK).code == 3
 
 
 def test_a_batch_writes_no_levels(small_scene: Path, tmp_path: Path, run: Run) -> None:

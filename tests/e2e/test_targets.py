@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import scenes
-import unaligned_scenes
 from messages import noted
 
 from gsmerge import Scene, compact, read_ply
@@ -150,12 +149,3 @@ def test_quality_without_photos_and_pixels_is_that_from_the_input(scene: Scene) 
     assert low.num_output < high.num_output
     with pytest.raises(UsageError, match=r"35dB.*photos"):
         compact(rows, quality="-0.2dB")
-
-
-def test_a_search_keeps_what_reading_had_to_say(scene: Scene) -> None:
-    whole = unaligned_scenes.without_order(scene)
-    means = whole.gaussians.means.copy()
-    means[0] = float("nan")
-    spoilt = replace(whole, gaussians=replace(whole.gaussians, means=means))
-    actual = compact(spoilt, fit_steps=8, quality="10dB")
-    assert noted(actual.report.notes, "finite")

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import select
-import shutil
 import struct
 import sys
 from pathlib import Path
@@ -20,15 +18,6 @@ from .conftest import Run
 
 pty = pytest.importorskip("pty")
 COLUMNS, ROWS = 80, 50
-NEXT = "the next command"
-EACH = f"""
-import json, os, sys
-from gsmerge.cli import main
-for columns, words in json.loads(sys.argv[1]):
-    print("{NEXT}", end="", flush=True)
-    os.environ["COLUMNS"] = str(columns)
-    main(words)
-"""
 
 
 def screen(data: bytes) -> list[str]:
@@ -110,35 +99,6 @@ def test_ctrl_c_leaves_no_bar(small_copy: Path, tmp_path: Path) -> None:
     assert list(tmp_path.glob("small*")) == []
 
 
-@pytest.mark.slow
-def test_no_command_breaks_a_word_or_a_row_of_figures(
-    smallest_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
-) -> None:
-    """Only paths, and commands to copy, are as long as they are."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(smallest_scene, "s")
-    quick = ("--fit", "none", "--budget", "100")
-    commands = [
-        ("inspect", "s"), ("compact", "s", "-o", "a.ply", *quick, "--overwrite"), ("compact", "s", "-o", "a.ply"),
-        ("convert", "a.ply", "a.sog", "--overwrite"), ("extend", "a.gsm", "s", *quick[:2]),
-    ]  # fmt: skip
-    calls = [(COLUMNS, words) for words in commands]
-    calls += [(COLUMNS // 2, words) for words in (*commands, ("batch", "s", "-o", "b", *quick))]
-    whole = run("inspect", "s").out.splitlines()
-    assert any(len(line) > COLUMNS for line in whole)
-    _, output = in_terminal("-c", EACH, json.dumps(calls))
-    _, *parts = output.decode().split(NEXT)
-    for (columns, _), part in zip(calls, parts, strict=True):
-        *_, text = re.split(r"\r\x1b\[\d*A|\x1b\[\d?K", part)  # after the last bar is erased
-        text = re.sub(r"\x1b[^A-Za-z]*[A-Za-z]", "", text).replace("\r\n", "\n")
-        lines = [line.rpartition("\r")[2] for line in text.split("\n")]
-        assert max(map(len, lines)) > 20
-        long = [line for line in lines if len(line) > columns and not line.startswith("  next ")]
-        assert [line for line in long if " " in line.strip()] == []
-        if part == parts[0]:
-            assert " ".join(text.split()) == " ".join(" ".join(whole).split())
-
-
 def test_lines_are_wrapped_between_words() -> None:
     assert wrap_line("note: one two three", 14) == ["note: one two", "  three"]
     assert wrap_line("a/path/longer/than/the/line", 10) == ["a/path/longer/than/the/line"]
@@ -147,14 +107,6 @@ def test_lines_are_wrapped_between_words() -> None:
         "  PSNR  20.0 dB  in four of",
         "              them",
     ]
-
-
-def test_a_dry_run_replaces_nothing_and_refuses_nothing(small_scene: Path, tmp_path: Path, run: Run) -> None:
-    out, call = tmp_path / "small.ply", ("compact", small_scene, "--dry-run", "-o", tmp_path / "small.ply")
-    out.write_text("mine")
-    assert f"note       {out} exists" in run(*call, code=0).out
-    assert "exists" not in run(*call, "--overwrite").out
-    assert out.read_text() == "mine"
 
 
 @pytest.mark.slow

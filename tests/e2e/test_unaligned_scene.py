@@ -12,7 +12,6 @@ import pytest
 import unaligned_scenes
 from messages import names
 from PIL import Image
-from plyfile import PlyData
 from sweeps import sweep
 
 import gsmerge
@@ -100,11 +99,3 @@ def test_dry_run_says_what_decides_the_count(compacted_scene: Path, tmp_path: Pa
     words = ("compact", compacted_scene / "small.ply", "-o", tmp_path / "few.ply", "--dry-run")
     assert names(run(*words, code=0).out, "or more until the PSNR against the input is 32.5 dB", "fit: full")
     assert "or more until" not in run(*words, "--budget", "5%", code=0).out
-
-
-def test_reading_leaves_out_what_is_not_finite(small_copy: Path) -> None:
-    ply = PlyData.read(small_copy / "scene.ply", mmap=False)
-    count = len(ply["vertex"]["x"])
-    ply["vertex"]["x"][::10] = np.nan
-    ply.write(small_copy / "scene.ply")
-    assert len(read_scene(small_copy, order="none").gaussians) == count - len(range(0, count, 10))

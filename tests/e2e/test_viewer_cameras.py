@@ -66,19 +66,6 @@ def test_none_are_written_unless_there_are_any(smallest_copy: Path, run: Run, tm
     assert sorted(path.name for path in out.iterdir()) == ["a.ply", "b.ply", "scene.ply"]
 
 
-def test_they_are_replaced_on_request_alone(smallest_copy: Path, run: Run) -> None:
-    cameras, call = (
-        smallest_copy / "small.cameras.json",
-        ("compact", smallest_copy, "-o", smallest_copy / "small.ply", *QUICK),
-    )
-    cameras.write_text("mine")
-    assert says(run(*call, code=2).err.removeprefix(ERROR), cameras, "exists")
-    assert not (smallest_copy / "small.ply").exists()
-    assert cameras.read_text() == "mine"
-    run(*call, "--overwrite", code=0)
-    assert len(json.loads(cameras.read_text())) == 3
-
-
 def test_a_second_format_shares_them(smallest_copy: Path, run: Run, tmp_path: Path) -> None:
     """They are there, with the same content; those of other views are no result's own."""
     out = tmp_path / "out"

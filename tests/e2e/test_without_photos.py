@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from batches import InlinePool, records
-from messages import noted
 from sweeps import sweep
 
 import gsmerge
@@ -85,23 +83,3 @@ def test_the_summary_says_what_the_result_is_measured_against(bare: Path, tmp_pa
     assert ROW_COLORS in run("evaluate", bare, out, "--lpips", "none", code=0).out
     page = run("view", bare, out, "-o", tmp_path / "page.html", "--json", code=0)
     assert ROW_COLORS in json.loads(page.out)["headline"]
-
-
-@pytest.mark.slow
-def test_states(bare: Path, tmp_path: Path, run: Run) -> None:
-    state, out = tmp_path / "state.gsm", tmp_path / "small.ply"
-    run("extend", state, bare, "--set", "superpixels=200", code=0)
-    document = json.loads(run("compact", state, "-o", out, "--json", code=0).out)
-    assert document["choices"]["fit"]["method"] == "full"
-    assert noted(document["notes"], ROW_COLORS)
-
-
-def test_a_batch_says_it_of_every_scene(
-    bare: Path, smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
-    for name, folder in (("bare", bare), ("photos", smallest_scene)):
-        shutil.copytree(folder, tmp_path / "scenes" / name)
-    run("batch", tmp_path / "scenes", "--output", tmp_path / "out", *QUICK, "-q", code=0)
-    actual = {record["output"]: record["report"]["psnr_reference"] for record in records(tmp_path / "out")}
-    assert actual == {"bare.ply": ROW_COLORS, "photos.ply": "photos"}

@@ -1,6 +1,8 @@
-"""Cameras that are wrong: random motions of the views."""
+"""Views that contradict others: by random motions, or by nearer depths."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,3 +23,13 @@ def disagreeing(scene: Scene, degrees: float = 0.8, shift: float = 0.01, views: 
     viewmats = scene.cameras.viewmats.astype(np.float64)
     viewmats[views] = matmul(random_motions(len(scene), degrees, shift), viewmats)[views]
     return move_views(scene, viewmats)
+
+
+def with_nearer_half(scene: Scene, views: list[int]) -> Scene:
+    """The right half of some views, with a Gaussian for each pixel, stands at six tenths of its depth."""
+    count, width, height = len(scene), scene.cameras.width, scene.cameras.height
+    means = scene.gaussians.means.reshape(count, height, width, 3).copy()
+    for view in views:
+        eye = scene.cameras.centres[view]
+        means[view, :, width // 2 :] = eye + 0.6 * (means[view, :, width // 2 :] - eye)
+    return replace(scene, gaussians=replace(scene.gaussians, means=means.reshape(-1, 3)))

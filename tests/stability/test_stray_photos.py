@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from messages import noted, says
+from messages import noted
 from sweeps import sweep
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
@@ -147,10 +147,6 @@ def test_photos_of_a_few_pixels_stay() -> None:
     assert odd_photos(scenes.make_scene(scenes.room(), scenes.arc(3, 24, 16)), np.copy) == []
 
 
-def test_a_view_given_twice_is_no_swap(room: Scene) -> None:
-    assert odd_photos(scenes.take_views(room, [0, 1, 1, 2, 3]), np.copy) == []
-
-
 @sweep("change", [one_black, one_of_noise, one_of_another_scene])
 def test_the_fit_does_without_some(room: Scene, unspoilt: CompactResult, change: Callable[[Photos], Photos]) -> None:
     """Nearly as good as with all photos, and as the input; the note and the report name them."""
@@ -181,16 +177,6 @@ def test_unaligned_gaussians_are_fitted_to_renders(room: Scene) -> None:
     result, without = compact(scene, **FIT), compact(replace(scene, images=None), **FIT)
     assert result.report.choices["fidelity"] == without.report.choices["fidelity"]
     assert scenes.identical(result.gaussians, without.gaussians)
-
-
-@pytest.mark.slow
-def test_sky_stays_where_most_are_wrong(room: Scene) -> None:
-    scene = with_photos(room, all_black, aligned=False)
-    whole, same = (compact(scene, **FIT, drop=drop) for drop in (None, "sky"))
-    assert scenes.identical(whole.gaussians, same.gaussians)
-    (note,) = set(same.report.notes) - set(whole.report.notes)
-    assert says(note, "drop sky", "photo", "sky")
-    assert "clean" not in same.report.choices
 
 
 def test_no_note_on_good_photos(unspoilt: CompactResult) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,7 +13,6 @@ from scenes import arc, make_scene, move, room
 
 from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
 from gsmerge.geometry.transforms import covariances, multiply_quats, rgb_to_sh0, rotmat_to_quat, sh0_to_rgb
-from gsmerge.kernels.elementary import log
 from gsmerge.values.arrays import as_array
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
@@ -208,23 +206,3 @@ def test_worldmirror(scene: Scene) -> None:
         integrations.worldmirror({}, images)
     with refuses(SceneError, "means", 2):
         integrations.worldmirror(predictions | {"splats": splats | {"means": [0, 0]}}, images)
-
-
-def trainer_of(scene: Scene) -> tuple[dict[str, torch.nn.Parameter], list[dict[str, torch.Tensor]]]:
-    """What gsplat's trainer optimises, and the views of its data set."""
-    g = scene.gaussians
-    columns = {
-        "means": g.means, "quats": 3 * g.quats, "scales": log(g.scales), "sh0": g.sh0, "shN": g.shN,
-        "opacities": log(g.opacities / (1 - g.opacities)),
-    }  # fmt: skip
-    views = [
-        {"camtoworld": torch.tensor(c2w).float(), "K": torch.tensor(K).float(), "image": torch.tensor(255 * image)}
-        for c2w, K, image in zip(np.linalg.inv(scene.cameras.viewmats), scene.cameras.Ks, scene.images, strict=True)
-    ]
-    return {name: torch.nn.Parameter(torch.tensor(column)) for name, column in columns.items()}, views
-
-
-def replace_opaque(scene: Scene) -> Any:
-    """A stand-in for a scene whose opacities have logits."""
-    gaussians = replace(scene.gaussians, opacities=scene.gaussians.opacities.clip(0.01, 0.99))
-    return replace_gaussians(scene, gaussians)

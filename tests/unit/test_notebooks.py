@@ -78,13 +78,6 @@ def test_a_result_shows_its_scene_beside_it(
 
 
 @pytest.mark.slow
-def test_a_light_page_lacks_the_scenes_own_gaussians(scene: gsmerge.Scene, result: gsmerge.CompactResult) -> None:
-    whole, light = (gsmerge.view(scene, result, light=light).text for light in (False, True))
-    assert len(re.findall('id="splats-', whole)) == 2
-    assert re.findall('id="(splats-.)"', light) == ["splats-1"]
-
-
-@pytest.mark.slow
 def test_a_result_does_not_keep_its_scene(tiny_scene: Path, result: gsmerge.CompactResult) -> None:
     copy = pickle.loads(pickle.dumps(result))
     assert repr(copy.show()).startswith("Page(100 Gaussians")  # alone: the other process has no scene

@@ -58,7 +58,7 @@ def test_every_setting_is_documented(stage: str) -> None:
     "setting",
     [
         {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"superpixels": "0%"}, {"superpixels": "150%"},
-        {"segmentation": "voronoi"}, {"effort": "slow"}, {"match": "iou"}, {"fit": "everything"},
+        {"segmentation": "voronoi"}, {"effort": "slow"}, {"recipe": "soup"}, {"match": "iou"}, {"fit": "everything"},
         {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"holdout": 2.0},
         {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0},
         {"min_opacity": -1.0}, {"overlap": float("nan")}, {"compactness": 2.0}, {"iou": 1.1}, {"similarity": -1.1},

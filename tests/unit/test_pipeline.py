@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-import unaligned_scenes
-from messages import refuses
 
-from gsmerge import CompactOptions, Scene, compact
+from gsmerge import Scene, compact
 from gsmerge.kernels import elementary
 from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.photos.views import pick_views
@@ -82,12 +80,6 @@ def test_many_views_are_scored_by_some(scene: Scene) -> None:
     assert better.report.choices["scored_views"] == len(scene)
 
 
-def test_more_gaussians_are_fitted_in_more_steps(scene: Scene) -> None:
-    few, many = (scenes.compacted(scene, effort="draft", superpixels=share).report for share in ("4%", "9.9%"))
-    assert (few.options["fit_steps"], few.choices["fit"]["steps"]) == (36, 36)
-    assert (many.options["fit_steps"], many.choices["fit"]["steps"]) == (54, 54)
-
-
 def test_what_no_photo_shows_is_not_written(scene: Scene) -> None:
     pruned, whole = (scenes.compacted(scene, fit_steps=160, min_contribution=least) for least in (1 / 255, 0))
     count = pruned.report.choices["pruned"]
@@ -129,20 +121,6 @@ def test_without_photos_colours_of_pixels_are_what_a_result_is_fitted_to_and_mea
     assert scenes.psnr_of(without.gaussians, scene) > scenes.psnr_of(with_photos.gaussians, scene) - 1
     assert report.worse is not None  # so few Gaussians show the pixels' own colours worse than they do themselves
     assert report.worse.startswith(f"the result shows {ROW_COLORS} worse than the input does: ")
-
-
-def test_without_photos_and_pixels_nothing_is_measured(scene: Scene) -> None:
-    bare = unaligned_scenes.without_order(replace(scene, images=None))
-    report = compact(bare, fit_steps=4).report
-    assert report.psnr_before is None
-    assert not {"input", "curve"} & set(report.seconds)
-
-
-def test_options_and_settings_combine(scene: Scene) -> None:
-    options = CompactOptions().with_settings({"fit": "none"})
-    one, two = compact(scene, options, superpixels=30), compact(scene, superpixels=30, fit="none")
-    assert np.array_equal(one.gaussians.means, two.gaussians.means)
-    assert one.report.options == two.report.options
 
 
 @pytest.mark.parametrize("match", ["overlap", "aabb", "none"])
@@ -218,17 +196,6 @@ def test_input_is_left_alone(scene: Scene) -> None:
     compact(scene, fit_steps=12)
     assert all(np.array_equal(getattr(scene.gaussians, n), b) for n, b in zip(scenes.FIELDS, before, strict=True))
     assert np.array_equal(scene.images, images)
-
-
-def test_wrong_settings_are_refused(scene: Scene) -> None:
-    with refuses(ValueError, "superpixels", 768, 769):
-        compact(scene, superpixels=32 * 24 + 1)
-    with refuses(ValueError, "threads", 0):
-        compact(scene, threads=0)
-    calls: list[str] = []
-    with refuses(ValueError, "k", "1 to 8", 0):
-        compact(scene, k=0, progress=lambda name, *_: calls.append(name))
-    assert calls == []
 
 
 def test_networks_correct_what_no_fit_corrects(scene: Scene) -> None:

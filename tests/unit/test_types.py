@@ -70,12 +70,6 @@ def test_to_keeps_everything(torch: Any) -> None:
     assert all(getattr(g.to("meta"), f.name).is_meta for f in fields(Gaussians))
 
 
-def test_device_is_that_of_tensors(torch: Any) -> None:
-    assert gaussians(2).device is None
-    assert gaussians(2).to("cpu").device == torch.device("cpu")
-    assert gaussians(2).to("meta").device == torch.device("meta")
-
-
 def test_gradients_pass_to_a_device_and_end_in_arrays(torch: Any) -> None:
     means = torch.ones(2, 3, dtype=torch.float64, requires_grad=True)
     tensors = replace(gaussians(2).to("cpu"), means=means)
@@ -198,29 +192,6 @@ def test_pixels_of_some_views(views: list[int]) -> None:
         assert np.array_equal(rows[part.fronts[part.shown]], whole.fronts[views][part.shown])
         assert np.array_equal(part.homes % 12, whole.homes[rows] % 12)
         assert np.array_equal(np.asarray(views)[part.homes // 12], whole.homes[rows] // 12)
-
-
-def test_scenes_of_tensors_become_such_of_arrays(torch: Any) -> None:
-    given = scene()
-    assert isinstance(given.numpy().gaussians.means, np.ndarray)
-    changed = {"gaussians": given.gaussians.to("cpu"), "cameras": given.cameras.to("cpu")}
-    changed |= {name: as_tensor(getattr(given, name)) for name in ("images",)}
-    unaligned = Scene(changed["gaussians"], changed["cameras"], changed["images"], None, given.names)
-    for tensors in (
-        replace(given, **changed),
-        replace(given, **{**changed, "images": None}),
-        unaligned,
-        replace(unaligned, images=None),
-    ):
-        arrays = tensors.numpy()
-        assert type(arrays) is type(tensors)
-        assert arrays.names == given.names
-        for one in (*vars(arrays.gaussians).values(), arrays.cameras.viewmats, arrays.cameras.Ks):
-            assert isinstance(one, np.ndarray)
-        for name in ("images",):
-            one, other = getattr(arrays, name, None), getattr(tensors, name, None)
-            assert (one is None) == (other is None)
-            assert one is None or (isinstance(one, np.ndarray) and np.array_equal(one, getattr(given, name)))
 
 
 @pytest.mark.parametrize(

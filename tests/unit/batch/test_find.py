@@ -12,7 +12,7 @@ import pytest
 from batches import touch
 from messages import refuses
 
-from gsmerge.batch.find import find_scenes, main_file, scene_plys
+from gsmerge.batch.find import find_scenes
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.scene_files import find_scene_files
 
@@ -108,12 +108,6 @@ def test_a_pattern_enters_folders_of_every_depth() -> None:
     assert actual("s/a/**") == ["s/a/b/c.ply"]
 
 
-def test_a_link_to_itself_is_passed_by() -> None:
-    touch("all/a.ply")
-    link("all/itself", "itself")
-    assert actual("all") == ["all/a.ply"]
-
-
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
 def test_a_folder_of_too_many_others_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.batch.find.MAX_FOLDERS", 3)
@@ -178,21 +172,6 @@ def test_a_folder_that_vanishes_is_a_scene_that_fails(is_listed: bool, monkeypat
     assert actual("all") == ["all/a.ply", "all/gone", "all/z/c.ply"]
     with refuses(SceneError, "all/gone", "no such file"):
         find_scene_files(Path("all/gone"))
-
-
-def test_a_folder_whose_files_may_not_be_looked_at_is_its_own_file(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that it fails alone, when it is read."""
-    touch("all/locked/a.ply")
-    stat = os.stat
-
-    def refuse(path: str | Path, *args: Any, **kwargs: Any) -> os.stat_result:
-        if Path(path).parent.name == "locked":
-            raise PermissionError(13, "Permission denied", str(path))
-        return stat(path, *args, **kwargs)
-
-    monkeypatch.setattr(os, "stat", refuse)
-    assert main_file(Path("all/locked")) == Path("all/locked")
-    assert scene_plys(Path("all/locked")) == []
 
 
 @pytest.mark.parametrize(

@@ -237,19 +237,6 @@ def test_what_another_run_works_on_comes_last(scene: Path, out: Path, monkeypatc
     assert seen == [("room.ply", False), ("other.ply", False), ("room.ply", True)]
 
 
-def test_warnings_become_notes(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import warnings
-
-    compact_files = calls.compact_files
-
-    def odd(*args: Any, **kwargs: Any) -> Any:
-        warnings.warn("odd thing", stacklevel=1)
-        return compact_files(*args, **kwargs)
-
-    monkeypatch.setattr(calls, "compact_files", odd)
-    assert run(scene, out)["report"]["notes"][-1] == "odd thing"
-
-
 KILLS = {
     "while it reads": ("gsmerge.batch.jobs.content_hash", True),
     "while it writes": ("gsmerge.io.formats.write.write_gaussians", False),
@@ -291,16 +278,6 @@ make_result(*one_job(Path({str(scene)!r}), Path({str(out)!r})), wait=False)
     assert after["status"] == (SKIPPED if recorded else DONE)
     assert results(out) == undisturbed
     assert statuses(out) == {"room.ply": [DONE]}
-
-
-def test_a_record_cut_in_the_middle_is_done_again(scene: Path, out: Path, undisturbed: dict[str, str]) -> None:
-    run(scene, out)
-    path = out / "batch.jsonl"
-    kill(out)
-    path.write_bytes(path.read_bytes()[:100])
-    assert run(scene, out)["status"] == DONE
-    assert results(out) == undisturbed
-    assert len(records(out)) == 1
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,13 +14,11 @@ from messages import names, noted, refuses
 from saved_cameras import write_transforms
 from tiny_scene import Tiny, make_tiny
 
-from gsmerge import compact_tensors
 from gsmerge.cameras.poses import max_pixels, move_cameras
 from gsmerge.cameras.score import sample_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import pose_changes, project_points
 from gsmerge.io import write_gaussians
-from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras
 
@@ -140,22 +137,3 @@ def test_photos_tell_whether_cameras_or_gaussians_are_off(wrong: str, tmp_path: 
     assert len(loaded.moves) == (3 if wrong == "cameras" else 0)
     assert pose_changes(right.cameras.viewmats, loaded.scene.cameras.viewmats)[0].max() < 0.1
     assert np.abs(loaded.scene.gaussians.means - right.gaussians.means).max() < 0.02
-
-
-def test_tensors_whose_cameras_are_off(large: Tiny) -> None:
-    g = large.gaussians
-    arrays = {"means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities, "sh0": g.sh0}
-    views = {"viewmats": off(large, 0.7, 0.02), "Ks": np.tile(large.K, (3, 1, 1)), "shape": (3, 140, 200)}
-    result = compact_tensors(**arrays, **views, fit="none", effort="draft")
-    assert noted(result.report.notes, "cameras", "off")
-    assert pose_changes(large.w2c, result.cameras.viewmats)[0].max() < 0.05
-
-
-def test_written_cameras_are_read_again(large: Tiny, tmp_path: Path) -> None:
-    cameras = cameras_of(large)
-    write_transforms(tmp_path / "cameras.json", replace(cameras, viewmats=off(large, 0.7, 0.02)), large.names)
-    read = read_cameras(tmp_path / "cameras.json")
-    np.testing.assert_allclose(read.viewmats, off(large, 0.7, 0.02), atol=1e-12)
-    np.testing.assert_allclose(read.Ks, cameras.Ks)
-    assert (read.names, set(read.widths), set(read.heights)) == (large.names, {200}, {140})
-    assert json.loads((tmp_path / "cameras.json").read_text())["camera_model"] == "PINHOLE"

@@ -48,16 +48,6 @@ def test_the_bar_of_a_run_fills_and_names_the_stage(monkeypatch: pytest.MonkeyPa
     assert any("done" in line and "━" * bar in line for line in lines)
 
 
-def test_failures_of_a_batch_stand_above_its_bar() -> None:
-    with redirect_stderr(Terminal()) as terminal, total_progress(3, quiet=False) as progress:
-        progress(RunEnd("kitchen", "done", 1, "", 0, 0.3))
-        progress(RunEnd("room", "failed", 2, "room/scene.ply: truncated", 1, 0.6))
-        progress(RunEnd("garden", "done", 3, "", 1, 1.0))
-    lines = [line for line in terminal.lines() if line]
-    assert "room: room/scene.ply: truncated" in lines
-    assert lines[-1].endswith("garden done, 1 failed")
-
-
 def test_without_a_terminal_each_run_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     with total_progress(4, quiet=False) as progress:
         progress(RunEnd("room", "failed", 1, "no photos", 1, 0.25))

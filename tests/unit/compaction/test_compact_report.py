@@ -9,7 +9,7 @@ import pytest
 
 from gsmerge.compaction import report
 from gsmerge.compaction.new_views import NewViews
-from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
+from gsmerge.compaction.report import CompactReport, Covered
 from gsmerge.measure.documents import to_json
 from gsmerge.settings.compact import CompactOptions
 
@@ -61,21 +61,6 @@ def test_what_the_input_covers_stands_beside_all_pixels(files: tuple[Path, Path]
     assert make_document(files)["psnr_covered"] is None
 
 
-def test_result_table(files: tuple[Path, Path]) -> None:
-    table = report.result_table(make_document(files), "gsmerge view scene small.ply")
-    assert table[0] == str(files[1])
-    assert [line.split() for line in table[1:]] == [
-        ["Gaussians", "1,000", "25", "2.50", "%"],
-        ["file", "2.5", "MB", "700", "B"],
-        ["its", "own", "photos", "20.00", "dB", "24.50", "dB", "a", "sample,", "of", "4", "of", "its", "views"],
-        ["time", "1.9", "s", "most", "in", "segment", "1.0,", "encode", "0.5"],
-        ["next", "gsmerge", "view", "scene", "small.ply"],
-    ]
-    assert max(map(len, table[1:])) <= 80
-    short = report.result_table(make_document(files, psnr_before=None, psnr_after=None))
-    assert [line.split()[0] for line in short[1:]] == ["Gaussians", "file", "time"]
-
-
 def test_new_views_come_first(files: tuple[Path, Path]) -> None:
     document = make_document(files, new_views=NewViews(17.25, 21.5, 3.0, 5.5, 3))
     assert document["new_views"] == {"before": 17.25, "after": 21.5, "low": 3.0, "high": 5.5, "views": 3}
@@ -84,13 +69,6 @@ def test_new_views_come_first(files: tuple[Path, Path]) -> None:
         i for i, row in enumerate(table) if row.startswith("new views 17.2 dB 21.5 dB +3.0 to +5.5 dB expected, from 3")
     )
     assert table[place + 1].startswith("its own photos")
-
-
-def test_photos_as_their_files_have_them_are_left_out_if_all_is_equal(files: tuple[Path, Path]) -> None:
-    for before, is_shown in ((20.0, False), (20.1, True)):
-        document = make_document(files, photo_files=PhotoFiles(before, 24.5001))
-        for text in ["\n".join(report.result_table(document))]:
-            assert ("photos as their files have them" in text) == is_shown
 
 
 def test_the_curve_marks_the_result(files: tuple[Path, Path]) -> None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import scenes
 
@@ -62,28 +60,6 @@ def test_notes_are_logged(scene: Scene, caplog: pytest.LogCaptureFixture) -> Non
     with caplog.at_level(logging.INFO, "gsmerge"):
         result = gsmerge.compact(scene, effort="draft", budget="auto")
     assert set(result.report.notes) <= {record.message for record in caplog.records}
-
-
-@pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_means_keep_their_precision(kind: type, scene: Scene) -> None:
-    gaussians = replace(scene.gaussians, means=scene.gaussians.means.astype(kind))
-    result = gsmerge.compact(replace(scene, gaussians=gaussians), effort="draft", budget=20)
-    assert result.gaussians.means.dtype == kind
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "said"),
-    [
-        ({"budgte": 60}, ValueError, "perhaps budget"),
-        ({"nothing": 60}, ValueError, "known: "),
-        ({"k": "2"}, ValueError, "got '2'"),
-    ],
-)
-def test_wrong_settings_say_what_is_meant(
-    arguments: dict[str, object], error: type[Exception], said: str, scene: Scene
-) -> None:
-    with pytest.raises(error, match=said):
-        gsmerge.compact(scene, **arguments)
 
 
 def test_wrong_kinds_say_what_is_expected(result: gsmerge.CompactResult, tmp_path: Path) -> None:

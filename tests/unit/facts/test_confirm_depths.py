@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import scenes
 import unaligned_scenes
+from motions import with_nearer_half
 
 from gsmerge import Cameras, Scene
 from gsmerge.facts.confirm_depths import FEWEST, MOST, PIXELS, REACH, SAME, Agreement, confirm_depths
 from gsmerge.kernels.elementary import log
-from gsmerge.runtime.threads import use_threads
 
 VIEWS, WIDTH, HEIGHT = 4, 48, 36
 
@@ -21,15 +21,6 @@ VIEWS, WIDTH, HEIGHT = 4, 48, 36
 @pytest.fixture(scope="module")
 def wall() -> Scene:
     return scenes.make_scene(scenes.wall(), scenes.arc(VIEWS, WIDTH, HEIGHT))
-
-
-def with_nearer_half(scene: Scene, views: list[int]) -> Scene:
-    """The right half of some views stands at six tenths of its depth."""
-    means = scene.gaussians.means.reshape(VIEWS, HEIGHT, WIDTH, 3).copy()
-    for view in views:
-        eye = scene.cameras.centres[view]
-        means[view, :, WIDTH // 2 :] = eye + 0.6 * (means[view, :, WIDTH // 2 :] - eye)
-    return replace(scene, gaussians=replace(scene.gaussians, means=means.reshape(-1, 3)))
 
 
 def turned_away(scene: Scene, view: int) -> Scene:
@@ -123,14 +114,6 @@ def test_scenes_in_which_nothing_can_be_compared_have_none(wall: Scene) -> None:
     assert confirm_depths(unaligned_scenes.without_order(wall)) is None
     none = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
     assert confirm_depths(Scene(wall.gaussians[:0], none, None, None, ())) is None
-
-
-def test_threads_change_nothing(wall: Scene) -> None:
-    scene, actual = with_nearer_half(wall, [0, 2]), []
-    for threads in (1, 2):
-        with use_threads(threads):
-            actual.append(confirm_depths(scene))
-    assert actual[0] == actual[1]
 
 
 def test_the_worst_part_is_named(wall: Scene) -> None:

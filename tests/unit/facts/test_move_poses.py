@@ -19,7 +19,6 @@ from gsmerge.geometry.transforms import motion_matrices, motion_vectors, pose_ch
 from gsmerge.geometry.transforms import without_common_motion as without_common
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
-from gsmerge.runtime.threads import use_threads
 
 VIEWS = range(5)
 
@@ -120,15 +119,6 @@ def test_clean_up_keeps_the_poses_of_the_fit(small: Scene) -> None:
 
     options, prepared = CompactOptions().with_settings({"drop": "floaters"}), prepare(small)
     assert build_cleaned(method, prepared, make_plan(prepared, options), None).cameras is moved
-
-
-def test_the_same_with_one_thread(scene: Scene) -> None:
-    wrong, found = motions.disagreeing(scene), []
-    for threads in (1, 2):
-        with use_threads(threads):
-            found.append(move_poses(wrong, VIEWS))
-    np.testing.assert_array_equal(found[0].cameras.viewmats, found[1].cameras.viewmats)
-    np.testing.assert_array_equal(found[0].gaussians.means, found[1].gaussians.means)
 
 
 @pytest.mark.parametrize("size", [(12, 8), (40, 1)])

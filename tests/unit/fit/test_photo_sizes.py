@@ -12,14 +12,13 @@ import scenes
 from messages import refuses
 
 from gsmerge import Gaussians, Scene, compact
-from gsmerge.fit import FitJob, FitOptions, fit, fit_photos
+from gsmerge.fit import FitJob, FitOptions, fit_photos
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale, training_weights
 from gsmerge.fit.schedule import DrawMode, prepare_fit
 from gsmerge.geometry.transforms import project
 from gsmerge.photos.views import subset
 from gsmerge.raster.photos import EPS2D, MASKED, scene_photos, score_photos
-from gsmerge.runtime.threads import use_threads
 from gsmerge.types import LargePhotos, PicturedScene
 
 LONG = FitOptions(fit_steps=160, holdout=0.2)
@@ -179,15 +178,6 @@ def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> No
         for scale in (1, 2)
     )
     assert sharp > usual + 0.3
-
-
-def test_result_does_not_depend_on_threads(truth: Gaussians, scene: Scene) -> None:
-    results, start = [], scenes.spoil(truth)
-    for threads in (1, 3):
-        with use_threads(threads):
-            photos = fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2))
-            results.append(fit(start, FitJob(photos, replace(LONG, fit_steps=60), count=len(start) + 20))[0])
-    assert scenes.identical(*results)
 
 
 def test_a_run_says_at_what_scale_it_looked(scene: Scene) -> None:

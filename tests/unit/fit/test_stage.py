@@ -37,13 +37,6 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     assert scenes.identical(result, expected)
 
 
-def test_stage_keeps_its_start_where_the_fit_is_refused(truth: Gaussians, noise: Pair) -> None:
-    grey = replace(truth, sh0=np.zeros_like(truth.sh0))
-    result, report = fit(grey, FitJob(noise, LONG, count=2 * len(grey)))
-    assert not report.accepted
-    assert scenes.identical(result, grey)
-
-
 def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
     opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
     hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])

@@ -95,14 +95,6 @@ def test_bits_are_those_of_the_slow_twin(case: Case, monkeypatch: pytest.MonkeyP
             assert np.abs(twin.poses.x).min() > 0
 
 
-def test_fixed_rows_stay_as_they_are() -> None:
-    case = CASES["fixed rows"]
-    state, start = take_steps(case, Optimiser.step)[0], case.state()
-    np.testing.assert_array_equal(state.x[:50], start.x[:50])
-    assert not state.m[:50].any()
-    assert state.m[50:].any()
-
-
 def test_cut_lists_are_shorter_and_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Five opaque curtains near the cameras, which are about the origin, hide what is behind them."""
     truth, lengths, states = scenes.self_made(0)[1], [], []

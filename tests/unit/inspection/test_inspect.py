@@ -9,7 +9,6 @@ import pytest
 import scenes
 from exports import depth_map_mask, export_rows, save_export, smooth_scene
 from messages import names, noted
-from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, write_npz
 
 from gsmerge import CompactOptions, compact, read_scene
@@ -171,16 +170,6 @@ def said(path: Path, **options: Path) -> dict[str, str]:
     return actual
 
 
-def test_a_plain_export(tmp_path: Path) -> None:
-    lines = said(save_export(tmp_path, SMOOTH, export_rows(SMOOTH)))
-    assert names(lines["rows"], "every", "view-major")
-    assert names(lines["alignment"], "3 x 36 x 48", "median")
-    assert lines["coverage"].startswith("100 % ")
-    assert names(lines["depth"], "confirm", "contradict", "do not see")
-    assert names(lines["note"], "only", "confirms")
-    assert names(lines["note"], "the depth is wrong")  # each view has one of its own
-
-
 def test_dropped_pixels(tmp_path: Path) -> None:
     kept = np.concatenate([np.flatnonzero(depth_map_mask(d)) + i * d.size for i, d in enumerate(SMOOTH.depths)])
     save_export(tmp_path / "gs_ply", SMOOTH, export_rows(SMOOTH, kept), cameras=False, name="0000.ply")
@@ -190,24 +179,6 @@ def test_dropped_pixels(tmp_path: Path) -> None:
     assert names(lines["alignment"], f"none for {missing:,}")
     assert not lines["coverage"].startswith("100 %")
     assert inspect(tmp_path)["num_missing"] == missing
-
-
-def test_the_camera_inside_the_file(tmp_path: Path) -> None:
-    square = smooth_scene(36, 36)
-    one = export_rows(square, np.tile(np.arange(36 * 36), 2))
-    parts = {
-        "extrinsic": square.w2c[0].reshape(-1),
-        "intrinsic": square.K.reshape(-1),
-        "image_size": np.array([36, 36]),
-    }
-    elements = [PlyElement.describe(one, "vertex")]
-    elements += [PlyElement.describe(np.array([(v,) for v in values], [(name, "f4")]), name)
-                 for name, values in (parts | {"version": np.array([1, 5, 0])}).items()]  # fmt: skip
-    PlyData(elements, byte_order="<").write(str(tmp_path / "photo.ply"))
-    lines = said(tmp_path)
-    assert names(lines["cameras"], ".ply", "1 (SHARP)")
-    assert lines["ignored"] == "element version"
-    assert names(lines["alignment"], "1 x 36 x 36")
 
 
 def test_no_cameras(tmp_path: Path) -> None:

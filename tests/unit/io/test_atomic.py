@@ -77,15 +77,6 @@ def test_a_file_as_folder_and_a_folder_as_target_are_refused(tmp_path: Path) -> 
         pass
 
 
-def test_what_a_writer_inside_says_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
-    """Writers that are atomic themselves know the temporary file only."""
-    with pytest.raises(SceneError) as raised, atomic_output(tmp_path / "out.ply") as temporary:
-        raise SceneError(temporary, "could not be written (No space left on device)")
-    assert str(raised.value) == f"{tmp_path / 'out.ply'}: could not be written (No space left on device)"
-    with pytest.raises(SceneError, match="other"), atomic_output(tmp_path / "out.ply"):
-        raise SceneError(tmp_path / "other.ply", "no such file")
-
-
 def left_by(pid: int, path: Path) -> Path:
     """The temporary file of an output that a process has left."""
     ours = temporary_path(path)

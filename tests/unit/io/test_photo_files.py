@@ -136,15 +136,6 @@ def test_many_large_photos_are_decoded_one_by_one(tmp_path: Path, tiny: Tiny, mo
         read[len(tiny.names)]
 
 
-def test_a_damaged_photo_among_many_large_ones(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(photos, "_AT_ONCE", 0)
-    write_images(tmp_path, tiny)
-    path = photos.match_images(tmp_path, tiny.names)[-1]
-    path.write_bytes(path.read_bytes()[:-20])
-    with refuses(SceneError, "11.png", "decoded"):
-        read_images(tmp_path, tiny.names)
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp", ".ppm", ".pgm"])
 def test_stored_size_is_that_of_the_decoded_image(suffix: str, tmp_path: Path) -> None:
     kinds = {".jpg": [[cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]]}

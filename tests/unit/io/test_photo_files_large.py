@@ -136,14 +136,6 @@ def test_views_of_unaligned_scenes_are_resized(tmp_path: Path, order: str) -> No
     assert np.abs(scene.images * 255 - small).max() < 0.6
 
 
-@pytest.mark.slow
-def test_small_enough_views_stay(tmp_path: Path) -> None:
-    loaded = load_scene(save(tmp_path), max_side=96)
-    assert loaded.scene.cameras.width == 96
-    assert not any("max_side" in note for note in loaded.notes)
-    assert load_scene(tmp_path).scene.cameras.width == 96
-
-
 def test_cameras_without_photos_are_resized_too(tmp_path: Path) -> None:
     folder = save(tmp_path)
     for path in (folder / "images").rglob("*.png"):

@@ -102,11 +102,6 @@ def test_a_video_is_what_was_drawn(name: str, tmp_path: Path, capfd: pytest.Capt
     assert capfd.readouterr() == ("", "")
 
 
-def test_odd_sides_get_one_more(tmp_path: Path) -> None:
-    clip.write_clip(tmp_path / "a.mp4", frames(3, 47, 63), 30)
-    assert [picture.shape for picture in read(tmp_path / "a.mp4")] == [(48, 64, 3)] * 3
-
-
 def test_another_encoder_stands_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(clip.ENCODERS, ".mp4", (("none", "None"), ("mp4v", "MPEG-4")))
     assert clip.write_clip(tmp_path / "a.mp4", frames(3), 30) == "MPEG-4"
@@ -152,19 +147,6 @@ def test_a_cut_video_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.M
     with refuses(SceneError, name, 12):
         clip.write_clip(tmp_path / name, frames(12), 24)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_failure_while_drawing_leaves_the_old_file(tmp_path: Path) -> None:
-    def broken() -> Iterator[Picture]:
-        yield from frames(3)
-        raise RuntimeError("drawing failed")
-
-    old = tmp_path / "a.mp4"
-    old.write_bytes(b"old")
-    with pytest.raises(RuntimeError, match="drawing failed"):
-        clip.write_clip(old, broken(), 30, overwrite=True)
-    assert old.read_bytes() == b"old"
-    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
 
 
 def test_a_gif_has_one_palette_and_plays_again(tmp_path: Path) -> None:

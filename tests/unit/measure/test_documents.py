@@ -1,11 +1,7 @@
 from __future__ import annotations
 
-import csv
-import io
-
 import pytest
 
-from gsmerge.measure import documents
 from gsmerge.measure.documents import text_table
 from gsmerge.runtime.memory import human_bytes, human_share
 
@@ -23,13 +19,6 @@ def test_human_bytes(count: float, text: str) -> None:
 )
 def test_human_share(share: float, text: str) -> None:
     assert human_share(share) == text
-
-
-def test_text_in_tables_is_no_formula() -> None:
-    text = ["=cmd|' x'!A1/s.ply", "+1.ply", "-1.ply", "@a.ply", "plain-1.ply"]
-    rows = csv.DictReader(io.StringIO(documents.csv_text(["name", "count"], [{"name": x, "count": -1} for x in text])))
-    actual = [(row["name"], row["count"]) for row in rows]
-    assert actual == [(f"'{x}" if x != "plain-1.ply" else x, "-1") for x in text]
 
 
 def test_tables_leave_out_columns_that_a_terminal_has_no_room_for() -> None:

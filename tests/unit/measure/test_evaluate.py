@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from messages import names, refuse_all
+from messages import refuse_all
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
@@ -139,16 +139,6 @@ def test_a_scene_in_no_order(scene: Scene, half: Gaussians) -> None:
         assert one.visible == pytest.approx(other.visible, abs=0.05)
 
 
-@pytest.mark.parametrize("factor", [1e-4, 1e4])
-def test_units_change_nothing(factor: float, scene: Scene, half: Gaussians) -> None:
-    moved = scenes.move(scene, np.eye(3), factor, np.zeros(3))
-    small = scenes.move_gaussians(half, np.eye(3), factor, np.zeros(3))
-    actual = evaluate(moved, {"half": small}, None, PLAIN)
-    usual = evaluate(scene, {"half": half}, None, PLAIN)
-    for one, other in zip(actual.results[1].scores, usual.results[1].scores, strict=True):
-        assert one.full.psnr == pytest.approx(other.full.psnr, abs=0.05)
-
-
 @pytest.mark.parametrize("threads", [1, 3])
 def test_threads_do_not_matter(threads: int, scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     again = evaluate(scene, {"half": half}, held_out(), replace(PLAIN, threads=threads))
@@ -271,29 +261,6 @@ def document_of(actual: Evaluation) -> dict[str, Any]:
     return evaluation_document(odd, facts, ["first <note>"])
 
 
-def test_tables_for_people(actual: Evaluation) -> None:
-    lines = evaluation_lines(evaluation_document(actual, {"half": {"bytes": 1234}}))
-    assert lines[0] == "Size"
-    assert lines[4].startswith("Quality")
-    assert len(lines) == 1 + 3 + 2 * (1 + 3) + 3
-    assert names(lines[4], "3 input views")
-    assert names(lines[8], "2 held-out views")
-    assert "1.2 kB" in lines[3]
-    assert "LPIPS" not in lines[5]
-    assert "smaller" not in lines[1]
-
-
-def test_narrow_terminals_keep_psnr_and_whole_words(actual: Evaluation) -> None:
-    wide = evaluation_lines(document_of(actual))
-    words = {word for line in wide for word in line.split()}
-    for columns in (79, 40):
-        lines = evaluation_lines(document_of(actual), columns)
-        assert max(map(len, lines)) <= columns
-        assert {word for line in lines for word in line.split()} <= words
-        assert sum(names(line, "PSNR (dB)", "SSIM") for line in lines) == 2
-        assert any("bytes each" in line for line in lines) == (columns == 79)
-
-
 def test_fog_and_holes_are_of_each_result(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
     given, result = actual.results
     assert given.fog == {}
@@ -382,10 +349,3 @@ def test_what_results_are_compared_with(scene: Scene) -> None:
     assert evaluate(unaligned, {}, held_out(), PLAIN).reference == "photos, and renders of the input in its own views"
     assert evaluate(bare, {}, held_out(), PLAIN).reference == f"photos, and {ROW_COLORS} in its own views"
     assert evaluate(bare, {}, held_out(), replace(PLAIN, context=False)).reference == "photos"
-
-
-def test_scores_are_described_in_one_line(scene: Scene, actual: Evaluation) -> None:
-    for value in (actual, *actual.results, evaluate(scene, {}, options=replace(PLAIN, own=False))):
-        assert len(repr(value)) < 120
-        assert "\n" not in repr(value)
-    assert "0 Gaussians" not in repr(actual.results[0])

@@ -5,12 +5,9 @@ import os
 from pathlib import Path
 
 import numpy as np
-from damage.changes import cut
-from messages import refuses
 from network_fixtures import SMALL, noisy, written
 
 import gsmerge
-from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import SHIPPED, find_checkpoint, load_checkpoint
 
 
@@ -30,13 +27,6 @@ def test_round_trip(tmp_path: Path) -> None:
 def test_the_same_networks_give_the_same_bytes(tmp_path: Path) -> None:
     a, b = (written(tmp_path / name, noisy()).read_bytes() for name in ("a", "b"))
     assert a == b
-
-
-def test_a_damaged_file_that_is_named_is_never_passed_over(tmp_path: Path) -> None:
-    path = written(tmp_path / "a.safetensors", noisy())
-    cut(0.5)(path)
-    with refuses(SceneError, "a.safetensors", "expected"):
-        find_checkpoint(str(path), required=False)
 
 
 def test_none_is_nothing() -> None:

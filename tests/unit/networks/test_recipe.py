@@ -96,15 +96,3 @@ def test_networks_with_absolute_outputs_ship(scene: Scene) -> None:
 def test_more_children_than_a_head_has_are_refused(scene: Scene, absolute: Path) -> None:
     with refuses(UsageError, "k", 4, 5):
         scenes.compacted(scene, recipe="paper", checkpoint=str(absolute), k=5)
-
-
-@pytest.mark.parametrize("rule", ["saliency", "distortion"])
-def test_mixed_k_lies_between_one_and_two(scene: Scene, rule: str) -> None:
-    settings = {"k_rule": rule, "checkpoint": "none", "fit": "none"}
-    one, mixed, two = (len(scenes.compacted(scene, k=k, **settings).gaussians) for k in (1, "mixed", 2))
-    assert one < mixed < two
-
-
-def test_unknown_recipe_is_refused() -> None:
-    with refuses(ValueError, "recipe", "'soup'"):
-        CompactOptions().with_settings({"recipe": "soup"})

@@ -114,11 +114,6 @@ def test_a_table_over_all_results(data: ViewData) -> None:
     assert page.count('<button class="link"') == 3
 
 
-def test_a_table_has_no_column_without_figures(data: ViewData) -> None:
-    sides = tuple(replace(side, mean=Quality()) for side in data.sides)
-    assert results_table(replace(data, sides=sides))[0] == ["", "File", "Gaussians", "Share"]
-
-
 def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
     page = page_of(replace(with_three_results(data), reference="renders of the input"))
     half, tenth, least = json.loads(block(page, "data"))["results"]
@@ -258,33 +253,8 @@ def test_one_scene_without_photos_is_compared_with_nothing(alone: ViewData) -> N
     assert page_of(alone).count('data-set="mode"') == 4
 
 
-def test_what_is_grey_says_why() -> None:
-    """Controls are disabled in one place, which gives the reason."""
-    script = files("gsmerge.pages").joinpath("templates", "view.js").read_text()
-    assert script.count(".disabled") == 1
-    assert re.search(r"control\.disabled = .*\n  control\.title = reason", script)
-
-
 def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
     assert "odd?" in page_of(replace(data, title="odd\udcff"))
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "words"),
-    [
-        (20.0, 25.04, "5.0 dB closer to its own photos"),
-        (20.0, 19.0, "1.0 dB farther from its own photos"),
-        (float("inf"), 30.0, "30.0 dB from the input's own renders"),
-        (None, None, "Gaussians"),
-        (float("inf"), float("inf"), "Gaussians"),
-    ],
-)
-def test_headline(before: float | None, after: float | None, words: str, data: ViewData) -> None:
-    sides = [replace(side, mean=Quality(psnr)) for side, psnr in zip(data.sides, (before, after), strict=True)]
-    line = headline(replace(data, sides=tuple(sides)))
-    assert headline(replace(data, sides=(sides[0],))).startswith(f"{sides[0].num_gaussians:,} Gaussians")
-    assert line.endswith(words)
-    assert line.startswith("50.0 % of the Gaussians")
 
 
 def test_the_renderer_is_the_one_that_was_vendored() -> None:

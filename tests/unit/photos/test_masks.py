@@ -201,9 +201,3 @@ def test_photos_in_place_of_masks_are_doubted(grey: bool, tiny_folder: Path, tin
     for name in tiny.names:
         write(tiny_folder / "signs" / f"{name}.png", half(tiny).astype(np.uint8) * 200)
     assert not any("look like photos" in note for note in load_scene(tiny_folder, protect=tiny_folder / "signs").notes)
-
-
-def test_a_picture_that_is_too_large_has_a_remedy(tmp_path: Path) -> None:
-    write(tmp_path / "a.png", np.full((4800, 6400), 255, np.uint8))
-    with refuses(SceneError, "a.png", "6400 x 4800", "a mask to that of its photo"):
-        decode_levels(tmp_path / "a.png")

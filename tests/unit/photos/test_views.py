@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
 
 from gsmerge.photos.views import (
     MAX_SCORED_VIEWS,
@@ -28,12 +27,6 @@ from gsmerge.types import Scene
 )
 def test_even_views(num_views: int, count: int, expected: list[int]) -> None:
     assert even_views(num_views, count) == expected
-
-
-@pytest.mark.parametrize("count", [0, 6])
-def test_more_views_than_there_are(count: int) -> None:
-    with refuses(ValueError, "views", "1 to 5"):
-        even_views(5, count)
 
 
 def test_even_views_are_distinct_and_keep_the_ends() -> None:

@@ -102,22 +102,6 @@ def test_errors_come_through_and_leave_the_pool_usable() -> None:
         parallel_map(fail, range(4))
 
 
-def test_two_callers_do_not_stop_each_other() -> None:
-    actual: dict[int, list[int]] = {}
-
-    def caller(i: int) -> None:
-        with use_threads(2):
-            for _ in range(20):
-                actual[i] = parallel_map(lambda j: i + j, range(10))
-
-    threads = [threading.Thread(target=caller, args=(i,)) for i in (0, 100)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    assert actual == {0: list(range(10)), 100: list(range(100, 110))}
-
-
 def test_overlapping_blocks_give_the_libraries_their_threads_back() -> None:
     """The first caller in is the first one out, while the second still works."""
     inside, out = threading.Event(), threading.Event()

@@ -20,13 +20,11 @@ from tiny_scene import rotation, save_json, write_colmap_text, write_images, wri
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply
-from gsmerge.scene.read import load_scene, read_scene
-from gsmerge.types import SH_C0
+from gsmerge.scene.read import load_scene
 
 SMOOTH = smooth_scene(48, 36)
 
 
-UNIT = 0.01  # of the maps in the Gaussians' world: six decimals are a ten thousandth of a depth, then
 ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
 
 
@@ -93,22 +91,6 @@ def test_harmonics_of_long_lrm(tmp_path: Path, degree: int) -> None:
     actual = read_ply(save_export(tmp_path, SMOOTH, rows, cameras=False) / "scene.ply").gaussians.shN
     assert np.array_equal(actual[:, :higher], shN)
     assert not actual[:, higher:].any()
-
-
-def test_colours_as_bytes(tmp_path: Path) -> None:
-    """nerfstudio's ``rgb`` mode: red, green and blue instead of harmonics."""
-    rows = export_rows(SMOOTH)
-    kept = [name for name in rows.dtype.names if not name.startswith("f_dc")]
-    other = np.zeros(len(rows), [(name, "f4") for name in kept] + [(name, "u1") for name in ("red", "green", "blue")])
-    for name in kept:
-        other[name] = rows[name]
-    for i, name in enumerate(("red", "green", "blue")):
-        other[name] = SMOOTH.images.reshape(-1, 3)[:, i]
-    path = save_export(tmp_path, SMOOTH, other)
-    scene = read_scene(path)
-    assert home(scene, SMOOTH) == 1
-    colours = 0.5 + SH_C0 * scene.gaussians.sh0[:, 0]
-    assert np.abs(colours * 255 - SMOOTH.images.reshape(-1, 3)).max() < 0.01
 
 
 # SHARP

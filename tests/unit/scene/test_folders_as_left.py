@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exports import export_rows, home, save_export, smooth_scene, turned
+from exports import export_rows, save_export, smooth_scene
 from messages import noted, refuses
 from model_files import MODELS
 from model_rows import check_cameras, check_pixels
@@ -25,34 +25,6 @@ from gsmerge.scene.read import load_scene
 
 SMOOTH = replace(smooth_scene(48, 36), names=tuple(f"input_{i:06d}.png" for i in (4, 17, 30)))
 ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
-
-
-def test_depthsplat_s_folders(tmp_path: Path) -> None:
-    """Rows trimmed, view fastest, in the first camera's frame; the photos of another scene are there as well."""
-    smooth = replace(smooth_scene(64, 48), names=SMOOTH.names)
-    grid = np.arange(3 * 48 * 64).reshape(3, 48, 64)
-    rows = grid[:, 8:-8, 8:-8].transpose(1, 2, 0).reshape(-1)
-    kept = np.isin(grid.reshape(-1), rows)
-    moved = turned(export_rows(smooth, rows), smooth.c2w[0, :3, :3].T)
-    save_export(tmp_path / "gaussians", smooth, moved, cameras=False, name="room.ply")
-    write_images(tmp_path / "images/room/color", smooth)
-    write_images(tmp_path / "images/hall/color", replace(smooth, images=smooth.images[::-1]))
-    save_json(tmp_path / "poses_of_room.json", frames_of(smooth))
-    save_json(tmp_path / "scores.json", {"psnr": 27.1})
-    for path in (tmp_path, tmp_path / "gaussians", tmp_path / "gaussians/room.ply"):
-        files = find_scene_files(path)
-        assert files.ply == tmp_path / "gaussians/room.ply"
-        assert files.cameras == tmp_path / "poses_of_room.json"
-        assert files.images == tmp_path / "images/room"
-    loaded = load_scene(tmp_path)
-    assert loaded.scene.has_own_pixels
-    assert home(loaded.scene, smooth, kept) == 1
-    assert np.array_equal((loaded.scene.images * 255).round(), smooth.images)
-    assert "depthsplat" in [exporter.name for exporter in loaded.exporters]
-    shutil.copy(tmp_path / "gaussians/room.ply", tmp_path / "gaussians/hall.ply")
-    assert find_scene_files(tmp_path / "gaussians/hall.ply").images == tmp_path / "images/hall"
-    with refuses(SceneError, tmp_path, "2 (hall.ply, room.ply)"):
-        find_scene_files(tmp_path)
 
 
 @sweep(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -275,19 +274,3 @@ def test_thumbnails_stand_for_no_photo(folder: Path, truth: np.ndarray) -> None:
     loaded = load_scene(folder)
     assert right_ones(loaded, truth) == [True] * VIEWS
     assert absent(loaded) == []
-
-
-@pytest.mark.slow
-def test_photos_among_others_of_the_place(folder: Path, made: Path, truth: np.ndarray, make_scene: Any) -> None:
-    """Some frames of a film, with names that no camera has."""
-    other = make_scene(folder.parent / "other", num_views=6, width=192, height=144)
-    for number, path in enumerate(photos_in(other)):
-        shutil.copy(path, folder / "images" / f"IMG_{number:03}.png")
-    for number, view in enumerate((2, 0, 3, 1)):
-        path = folder / "images" / photos_in(made)[view].name
-        path.rename(path.with_name(f"A{number}.png"))
-    name_frames(folder, lambda view, _: f"{view}.png")
-    loaded = load_scene(folder)
-    assert loaded.scene.images is not None
-    away = [float(np.abs(a - b).mean()) for a, b in zip(loaded.scene.images, truth, strict=True)]
-    assert max(away) < 0.03  # those at the ends are in both

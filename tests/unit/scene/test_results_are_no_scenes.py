@@ -18,7 +18,7 @@ from gsmerge.errors import SceneError
 from gsmerge.inspection.file_checks import check_content
 from gsmerge.io import read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.arrays import RESULT_COMMENT
-from gsmerge.io.formats.ply import file_bytes, header_content
+from gsmerge.io.formats.ply import header_content
 from gsmerge.io.scene_files import find_scene_files
 from gsmerge.settings.compact import CompactOptions
 
@@ -49,11 +49,6 @@ def test_results_of_commands_say_so(folder: Path, tmp_path: Path) -> None:
         assert RESULT_COMMENT in PlyData.read(path).comments
         assert read_ply(path).info.opacity_encoding == "logit"
     assert find_scene_files(folder).ply == folder / "room.ply"
-
-
-def test_a_result_is_as_large_as_a_budget_in_bytes_counts(tmp_path: Path, tiny: Tiny) -> None:
-    path = save_result(tmp_path / "x.ply", tiny)
-    assert path.stat().st_size == file_bytes(len(tiny.gaussians[::5]), 0)
 
 
 @pytest.mark.parametrize("name", ["x.ply", "scene.ply", "gaussians.ply", "gs_ply/0000.ply", "room2.ply"])
@@ -112,20 +107,6 @@ def test_cameras_of_a_result_with_the_scene_s_name(folder: Path, tiny: Tiny) -> 
     assert find_scene_files(folder / "room.ply").cameras == cameras
     (folder / "room.ply").unlink()
     assert find_scene_files(save_result(folder / "room.ply", tiny)).cameras == cameras
-
-
-def test_a_scene_that_gsmerge_wrote_keeps_its_own_cameras(tmp_path: Path, tiny: Tiny) -> None:
-    tiny.save(tmp_path)
-    write_inria(tmp_path / "scene.cameras.json", tiny)
-    write_gaussians(tmp_path / "scene.sog", tiny.gaussians[::5])
-    assert find_scene_files(tmp_path / "scene.ply").cameras == tmp_path / "transforms.json"
-
-
-def test_a_result_without_cameras_is_noted(tmp_path: Path, tiny: Tiny) -> None:
-    from gsmerge.scene.exporters import make_hints
-
-    files = find_scene_files(save_result(tmp_path / "x.ply", tiny))
-    assert noted(read_input(files, hints=make_hints({"order": "none"})).notes, "gsmerge", "no Gaussian per pixel")
 
 
 @pytest.mark.parametrize("name", ["x.spz", "x.sog", "x.splat", "x.glb"])

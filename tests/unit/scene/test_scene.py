@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from messages import names, noted, refuses
+from messages import noted, refuses
 from tiny_scene import Tiny, edited_json, frames_of, write_colmap_binary, write_images, write_npz, write_transforms
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.scene_files import find_scene_files, scene_title
-from gsmerge.photos.scene_photos import stored_photos
+from gsmerge.io.scene_files import scene_title
 from gsmerge.scene import rows
 from gsmerge.scene.read import load_scene, read_scene
 
@@ -58,17 +56,6 @@ def test_an_npz_with_its_own_images(tmp_path: Path, tiny: Tiny) -> None:
     other = tiny.save(tmp_path / "other", images=False)
     named = read_scene(other, images=tmp_path / "exports/npz/results.npz")
     assert np.array_equal(named.images, scene.images)
-
-
-def test_images_where_the_camera_file_says(tmp_path: Path, tiny: Tiny) -> None:
-    tiny.save(tmp_path, images=False)
-    write_images(tmp_path / "train", tiny)
-    rewrite(tmp_path / "transforms.json", lambda d: [f.update(file_path=f["file_path"].replace("images", "train"))
-                                                     for f in d["frames"]])  # fmt: skip
-    assert np.array_equal((read_scene(tmp_path).images * 255).round(), tiny.images)
-    files = find_scene_files(tmp_path)
-    assert files.images is None
-    assert len(stored_photos(files, read_cameras(files.cameras)))
 
 
 @pytest.mark.parametrize("name", ["../other/{}", "{root}/other/{}", "images/../../other/{}"])
@@ -144,15 +131,6 @@ def test_cameras_of_a_resized_image_are_scaled(tiny_folder: Path, tiny: Tiny) ->
     loaded = load_scene(tiny_folder)
     assert np.allclose(loaded.scene.cameras.Ks, tiny.K)
     assert loaded.notes == ("intrinsics scaled from 80 x 56 to the images' 20 x 14",)
-
-
-def test_images_under_the_names_of_other_views(tiny_folder: Path, tiny: Tiny) -> None:
-    write_images(tiny_folder / "images", replace(tiny, images=tiny.images[::-1]))
-    loaded = load_scene(tiny_folder)
-    assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)
-    assert loaded.left_out is None
-    (note,) = loaded.notes
-    assert names(note, "by their content", "photo a b/11.png for view images/a b/2.png")
 
 
 # What does not fit

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from messages import noted, refuses
-from tiny_scene import Tiny, write_colmap_binary, write_colmap_text, write_images, write_npz, write_transforms
+from tiny_scene import Tiny, write_colmap_text, write_images, write_transforms
 
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
@@ -19,31 +19,6 @@ def make(folder: Path, *names: str) -> Path:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(b"\0")
     return folder
-
-
-def test_a_plain_export(tiny_folder: Path) -> None:
-    for path in (tiny_folder, tiny_folder / "scene.ply"):
-        actual = find_scene_files(path)
-        assert actual.ply == tiny_folder / "scene.ply"
-        assert actual.cameras == tiny_folder / "transforms.json"
-        assert actual.images == tiny_folder / "images"
-
-
-def test_depth_anything_s_folders(tmp_path: Path, tiny: Tiny) -> None:
-    (tmp_path / "gs_ply").mkdir()
-    write_ply(tmp_path / "gs_ply" / "0000.ply", tiny.gaussians)
-    write_colmap_binary(tmp_path, tiny)
-    write_images(tmp_path / "images", tiny)
-    write_npz(tmp_path / "exports/mini_npz/results.npz", tiny, image=None)
-    for path in (tmp_path, tmp_path / "gs_ply" / "0000.ply", tmp_path / "gs_ply"):
-        actual = find_scene_files(path)
-        assert actual.ply == tmp_path / "gs_ply" / "0000.ply"
-        assert actual.cameras == tmp_path / "exports/mini_npz/results.npz"
-        assert actual.images == tmp_path / "images"
-    write_npz(tmp_path / "exports/npz/results.npz", tiny)
-    actual = find_scene_files(tmp_path)
-    assert actual.cameras == tmp_path / "exports/npz/results.npz"
-    assert actual.images == actual.cameras
 
 
 def test_cameras_and_photos_above_the_scene_up_to_the_named_folder(tmp_path: Path, tiny: Tiny) -> None:

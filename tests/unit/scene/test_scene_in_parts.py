@@ -112,13 +112,6 @@ def test_moments_name_both_calls(tmp_path: Path, tiny: Tiny, cuts: list[int]) ->
     assert gsmerge.read_ply(out).info.count == len(tiny.gaussians)
 
 
-def test_scenes_of_one_backbone_stay_apart(tmp_path: Path, tiny: Tiny) -> None:
-    """One file for each scene in a folder gaussians, as DepthSplat writes them."""
-    folder = split(tmp_path / "gaussians", tiny, ["0.ply", "1.ply", "2.ply"], [280, 560])
-    with refuses(SceneError, folder, 3):
-        find_scene_files(folder)
-
-
 def test_a_state_is_of_all_parts(tmp_path: Path, tiny: Tiny) -> None:
     folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
     assert main(["extend", str(folder / "scene.gsm"), str(folder), "--set", "superpixels=20%", "-q"]) == 0

@@ -135,17 +135,6 @@ def test_photos_of_something_else_beside_a_grid(tmp_path: Path) -> None:
     assert names(str(load_scene(folder).left_out), "the photos in", folder / "images", "not used")
 
 
-def test_a_damaged_photo(tmp_path: Path) -> None:
-    folder = save(tmp_path, "grid", cameras=True)
-    (folder / "images" / SMOOTH.names[0]).write_bytes(b"\x89PNG nothing")
-    actual = load_scene(folder)
-    assert names(str(actual.left_out), "1 of 3 views", "2.png", ".png file")
-    assert actual.scene.images is not None
-    assert actual.scene.masks is not None
-    assert actual.scene.masks.any((1, 2)).tolist() == [False, True, True]
-    assert np.array_equal((actual.scene.images[1:] * 255).round(), SMOOTH.images[1:])
-
-
 def test_a_picture_beside_a_grid_that_cannot_be_read(tmp_path: Path) -> None:
     folder = save(tmp_path, "grid")
     for number in range(3):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scenes
 import unaligned_scenes
+from motions import with_nearer_half
 
 import gsmerge
 from gsmerge import Scene
@@ -26,15 +25,6 @@ AUTO = CompactOptions().with_settings({"superpixels": "auto"})
 @pytest.fixture(scope="module")
 def wall() -> Scene:
     return scenes.make_scene(scenes.wall(), scenes.arc(4, 48, 36))
-
-
-def with_nearer_half(scene: Scene, views: list[int]) -> Scene:
-    """The right half of some views stands at six tenths of its depth."""
-    means = scene.gaussians.means.reshape(4, 36, 48, 3).copy()
-    for view in views:
-        eye = scene.cameras.centres[view]
-        means[view, :, 24:] = eye + 0.6 * (means[view, :, 24:] - eye)
-    return replace(scene, gaussians=replace(scene.gaussians, means=means.reshape(-1, 3)))
 
 
 def test_what_other_views_see_through_begins_fainter(wall: Scene) -> None:

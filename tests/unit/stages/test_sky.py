@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import scenes
-import unaligned_scenes
-from messages import noted, refuses
+from messages import noted
 from sky_scenes import CEILING, HAZE, HEIGHT, HORIZON, OVERCAST, WIDTH, ZENITH, painted
 
-from gsmerge import CompactOptions, compact, render
-from gsmerge.errors import UsageError
+from gsmerge import compact, render
 from gsmerge.stages.sky import sky, sky_region, sky_regions
 
 QUICK: dict[str, Any] = {"effort": "draft", "superpixels": 120, "fit_steps": 10, "poses": "fixed"}
@@ -81,16 +78,3 @@ def test_views_that_show_it_are_counted() -> None:
     indoors = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
     for scene, views in ((painted(ZENITH, HAZE)[0], [0, 1, 2, 3]), (indoors, [])):
         assert list(sky_regions(scene.gaussians.means, scene.cameras, scene.images)) == views
-
-
-def test_what_cannot_be() -> None:
-    scene, stages = replace(painted(ZENITH, HAZE)[0], images=None), []
-    with refuses(UsageError, "drop sky", "photos", "--images"):
-        compact(
-            unaligned_scenes.without_order(scene), **QUICK, drop="sky",
-            progress=lambda stage, *_: stages.append(stage),
-        )  # fmt: skip
-    assert set(stages) == {"prepare"}  # before any other work
-    with refuses(ValueError, "drop sky", "budget", "quality 30dB"):
-        CompactOptions().with_settings({"drop": "sky", "quality": "30dB"})
-    assert CompactOptions().with_settings({"drop": "sky"}).whole_only == ["drop sky"]

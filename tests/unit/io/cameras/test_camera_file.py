@@ -182,21 +182,6 @@ def test_colmap_models_with_distortion(tmp_path: Path, tiny: Tiny, model: str, p
     assert len(select_views(actual, [1]).lenses) == 1
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "k3": 0.5}, ("OPENCV", "perspective", (0.1, 0.2, 0.3, 0.4, 0.5))),
-        ({"distortion_params": [0.1, 0.2, 0.5, 0, 0.3, 0.4]}, ("OPENCV", "perspective", (0.1, 0.2, 0.3, 0.4, 0.5))),
-        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.2}, ("OPENCV_FISHEYE", "fisheye", (0.1, 0, 0, 0.2))),
-        ({"is_fisheye": True}, ("OPENCV_FISHEYE", "fisheye", (0, 0, 0, 0))),
-    ],
-)
-def test_transforms_with_distortion(tmp_path: Path, tiny: Tiny, change: dict, expected: tuple) -> None:
-    (tmp_path / "transforms.json").write_text(json.dumps(frames_of(tiny) | change))
-    lenses = read_cameras(tmp_path).lenses
-    assert [(lens.name, lens.model, lens.coefficients) for lens in lenses if lens] == [expected] * 3
-
-
 def test_one_lens_among_pinholes(tmp_path: Path, tiny: Tiny) -> None:
     data = frames_of(tiny)
     data["frames"][1]["k1"] = 0.1

@@ -15,14 +15,6 @@ from gsmerge.io import read_cameras
 from gsmerge.io.cameras.npz_files import array_names, read_arrays
 
 
-def test_npz_with_images(tmp_path: Path, tiny: Tiny) -> None:
-    write_npz(tmp_path / "exports/npz/results.npz", tiny)
-    actual = read_cameras(tmp_path)
-    assert_same(actual, tiny, atol=1e-6)
-    assert np.array_equal(actual.images, tiny.images)
-    assert actual.names == ("view 0", "view 1", "view 2")
-
-
 def test_npz_forms(tmp_path: Path, tiny: Tiny) -> None:
     write_npz(tmp_path / "a.npz", tiny, extrinsics=tiny.w2c, image=None)
     actual = read_cameras(tmp_path / "a.npz")

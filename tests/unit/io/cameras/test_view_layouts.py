@@ -255,6 +255,8 @@ def test_poses_that_instantsplat_optimised(tmp_path: Path) -> None:
     [
         ("transforms.json", '"fl_x"', '"k1": 0.1, "p2": 0.02, "fl_x"', "perspective", (0.1, 0, 0, 0.02, 0)),
         ("transforms.json", '"fl_x"', '"distortion_params": [0.1, 0.2], "fl_x"', "perspective", (0.1, 0.2, 0, 0, 0)),
+        ("transforms.json", '"fl_x"', '"distortion_params": [0.1, 0.2, 0.5, 0, 0.3, 0.4], "fl_x"', "perspective",
+         (0.1, 0.2, 0.3, 0.4, 0.5)),
         ("transforms.json", '"fl_x"', '"is_fisheye": true, "k1": 0.1, "fl_x"', "fisheye", (0.1, 0, 0, 0)),
         ("transforms.json", '"fl_x"', '"camera_model": "OPENCV_FISHEYE", "fl_x"', "fisheye", (0, 0, 0, 0)),
         ("OpenSfM", '"brown"', '"brown", "k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.01, "p2": 0.02', "perspective",

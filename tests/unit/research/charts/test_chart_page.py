@@ -110,15 +110,3 @@ def test_the_key_names_every_line_and_fits(count: int) -> None:
     assert drawing.bbox.x0 <= box.x0 < box.x1 <= drawing.bbox.x1
     assert drawing.bbox.y0 <= box.y0 < box.y1 <= drawing.bbox.y1
     assert all(axes.bbox.x1 <= box.x0 for axes in drawing.axes)
-
-
-@pytest.mark.slow
-def test_drawings_repeat_to_the_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    figure = figure_of(2, name="a $\\frac{$ b")  # which is no formula
-    draw_figures([figure], tmp_path / "a")
-    monkeypatch.setitem(matplotlib.rcParams, "font.size", 30)  # the user's own style does not matter
-    drawn = draw_figures([figure], tmp_path / "b")
-    for name in ("quality.png", "quality.svg"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-    assert drawn["quality"] == (tmp_path / "a" / "quality.svg").read_bytes()
-    assert b"<dc:date>" not in drawn["quality"]

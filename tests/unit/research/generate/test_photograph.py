@@ -19,7 +19,7 @@ from gsmerge.research.generate.photograph import (
     screen_boxes,
     trace,
 )
-from gsmerge.research.generate.shapes import LYING, Material, Shape, blob, box, column, pack, place, quad, rod
+from gsmerge.research.generate.shapes import LYING, Material, Shape, blob, box, pack, place, quad
 from gsmerge.research.generate.synthetic_scene import draw_path, is_usable, look_at
 from gsmerge.research.generate.textures import KINDS, Palette
 
@@ -31,23 +31,6 @@ DOWN = Light(np.array([0.0, -1.0, 0.0]), np.array([0.0, -5.0, 0.0]), np.ones(3),
 
 def stage(*shapes: Shape) -> Stage:
     return Stage(shapes, (WHITE,), DOWN, np.zeros(3), (1, 2))
-
-
-def test_a_column_stands_on_its_foot() -> None:
-    shape = column((0.0, 1.0, 3.0), 1.5, 0.2, LOOK, top=0.5)
-    hits = trace(pack([shape]), np.eye(4), Pinhole(200, 200, 200.0), 1)
-    rows = np.flatnonzero((hits.ids == 0).any(1))
-    assert (rows[-1] + 1 - 100) / 200 * hits.depth[rows[-1], 100] == pytest.approx(1.0, abs=0.02)
-    widths = (hits.ids == 0).sum(1)
-    assert widths[rows[3]] < 0.7 * widths[rows[-4]]
-
-
-def test_a_rod_joins_its_ends() -> None:
-    a, b = np.array([-0.5, -0.3, 2.0]), np.array([0.6, 0.4, 3.0])
-    shape = rod(a, b, 0.05, LOOK)
-    np.testing.assert_allclose(shape.centre - shape.rotation[:, 1] * shape.size[1], a, atol=1e-12)
-    np.testing.assert_allclose(shape.rotation.T @ shape.rotation, np.eye(3), atol=1e-12)
-    assert np.linalg.det(shape.rotation) == pytest.approx(1)
 
 
 def test_no_rectangle_cuts_off_what_is_seen() -> None:

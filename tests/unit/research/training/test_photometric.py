@@ -149,16 +149,6 @@ def test_a_window_with_too_much_in_it_is_halved(example: Example) -> None:
     assert Box(0, 0, 9, 12).halved() == Box(0, 0, 9, 12)
 
 
-def test_a_window_is_a_part_of_the_render_of_the_whole_photo(example: Example) -> None:
-    """In the middle of the photo, where nothing is clamped at the border."""
-    for photo in (0, 2):
-        whole = whole_photo(example, photo)
-        part, _ = render_window(replace(whole, box=Box(6, 5, 12, 10)), None, PHOTO)
-        expected = render_window(whole, None, PHOTO)[0][5:15, 6:18]
-        torch.testing.assert_close(part, expected, atol=2e-2, rtol=0)
-        assert float((part - expected).abs().mean()) < 1e-3
-
-
 def uniform_ssim(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
     """``[h,w]`` scores of uniform windows of 7 x 7 pixels, zero beyond the border."""
     x, y = image.astype(np.float64), photo.astype(np.float64)
@@ -290,14 +280,6 @@ def test_diversification_is_the_formula_of_the_paper() -> None:
     expected_loss = (weight * near + 0.75) / (weight + 1)
     parents = torch.tensor([0, 0, 1, 1])
     assert float(diversity_loss(both, parents, torch.ones(4))) == pytest.approx(expected_loss, rel=1e-5)
-
-
-def test_diversification_does_not_depend_on_the_unit_of_the_world() -> None:
-    parents, sizes = torch.tensor([0, 0, 1, 1]), torch.tensor([2.0, 2.0, 0.2, 0.2])
-    gaussians = boxes([[0.0, 0, 0], [0.2, 0, 0], [9.0, 0, 0], [9.1, 0, 0]], [1.0, 1.0, 0.1, 0.1], [0.5] * 4)
-    loss = float(diversity_loss(gaussians, parents, sizes))
-    larger = replace(gaussians, means=gaussians.means * 5, scales=gaussians.scales * 5)
-    assert float(diversity_loss(larger, parents, sizes * 5)) == pytest.approx(loss, rel=1e-4)
 
 
 def test_diversification_is_a_share_of_the_photometric_loss(example: Example) -> None:
