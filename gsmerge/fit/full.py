@@ -32,8 +32,7 @@ def fit_full(
 ) -> FitResult:
     """Fit all parameters of Gaussians to the photos of a run.
 
-    Held-out patches are scored once the first steps are done. If they are no better than at the start, the start is
-    returned. Otherwise the remaining steps follow, which use every patch.
+    Held-out patches are scored once the first steps are done. The remaining steps use every patch.
 
     Args:
         gaussians: The n Gaussians to start from.
@@ -42,19 +41,17 @@ def fit_full(
         fixed: ``[n]`` bool, Gaussians that stay unchanged; None: none.
 
     Returns:
-        The fitted Gaussians, or the start itself, and a report.
+        The fitted Gaussians and a report.
     """
     fit = start_fit(gaussians, run, survey, fixed)
     while fit.step < fit.steps:
         if fit.progress >= run.half_part:  # before the growth, because new halves score worse until they are fitted
             score_fit(fit)
-        if fit.is_refused:
-            break
         renew_state(fit)
         take_step(fit)
         report_step(fit)
     score_fit(fit)
-    return end_fit(fit, gaussians)
+    return end_fit(fit)
 
 
 @dataclass(eq=False)
@@ -77,11 +74,6 @@ class FullFit:
     def progress(self) -> float:
         """Share of the steps taken so far."""
         return self.step / self.steps
-
-    @property
-    def is_refused(self) -> bool:
-        """Whether held-out patches were scored and are no better than at the start."""
-        return self.after is not None and self.after <= self.before
 
     @property
     def half(self) -> Photos:
@@ -150,13 +142,9 @@ def report_step(fit: FullFit) -> None:
         fit.run.job.progress(fit.step, fit.steps, decibels(fit.error.mean), fit.run.half_part)
 
 
-def end_fit(fit: FullFit, start: Gaussians) -> FitResult:
-    """Return the result of a fit and a report; the result is the ``start`` if held-out patches got no better."""
+def end_fit(fit: FullFit) -> FitResult:
+    """Return the result of a fit and a report."""
     after = fit.before if fit.after is None else fit.after
-    if fit.is_refused:
-        why = f"held-out patches of the photos were no better after {fit.step} steps"
-        rows = np.arange(len(start))
-        return start, FitReport("none", False, fit.step, fit.before, after, why, origins=rows)
     state = fit.state
     fitted, viewmats = gaussians_of(fit.tail.of(state.x), state.splats.shN), fit.optimiser.viewmats
     report = FitReport("full", True, fit.step, fit.before, after, "all steps done", viewmats, origins=state.origins)

@@ -21,7 +21,7 @@ class FitReport(ArrayFields):
     """Facts about a fit and its scores."""
 
     method: str  # `"none"` or `"full"`: the fit from which the result comes
-    accepted: bool  # Whether the held-out patches got better; if not, nothing was changed
+    accepted: bool  # Whether the photos are shown better; if not, nothing was changed
     steps: int  # Steps of the full fit
     holdout_before: float  # PSNR (dB) on the held-out patches before the fit
     holdout_after: float  # The same after it
@@ -57,7 +57,7 @@ def record_fit(report: FitReport) -> None:
         seen = f"seen from outside, the result shows haze where the scene is empty: far fog {report.fog:.2f}"
         note(f"{seen}; --fit none makes less, and is farther from the photos" if report.accepted else seen)
     if not report.accepted:
-        note("the fit was not accepted: held-out patches of the photos did not get better")
+        note("the fit was not accepted: it shows the photos as a whole worse than its start does")
 
 
 def report_steps(step: int, steps: int, photos: float, half_part: float) -> None:

@@ -22,7 +22,7 @@ from gsmerge.runtime.record import choose, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-CLOSE = 1.0  # gain of the held-out patches, dB, below which whole photos are compared as well
+CLOSE = 1.0  # gain of the held-out patches, dB, below which whole photos decide
 START = 0.57  # share of the final number of Gaussians at the start of a run that grows
 
 
@@ -92,9 +92,10 @@ def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitR
     """Return the fitted Gaussians, or their start if whole photos got worse.
 
     Photos are compared only if held-out patches gained less than ``CLOSE`` dB. If Gaussians are fitted already, a
-    further fit with steps of the default size only scatters them.
+    further fit with steps of the default size only scatters them. Held-out patches alone refuse nothing: where few
+    views see a place, they get worse in fits that gain up to 10 dB in views that were left out.
     """
-    if not report.accepted or report.holdout_after - report.holdout_before >= CLOSE:
+    if report.holdout_after - report.holdout_before >= CLOSE:
         return after, report
     moved = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats[: len(photos)])
     if photo_error(after, moved) <= photo_error(before, photos):

@@ -25,11 +25,11 @@ def gaussians(draw: st.DrawFn) -> Gaussians:
     def array(shape: tuple[int, ...], elements: st.SearchStrategy[float]) -> np.ndarray:
         return draw(hnp.arrays(np.float32, shape, elements=elements))
 
-    quats = array((n, 4), floats(-(2.0**10), 2.0**10))
-    quats[~quats.any(1)] = 1  # a row without a rotation may be a placeholder, which is no Gaussian
+    means = array((n, 3), floats(-(2.0**30), 2.0**30))
+    means[~means.any(1)] = 1  # empty or equal rows at the origin are taken for placeholders, which are no Gaussians
     return Gaussians(
-        means=array((n, 3), floats(-(2.0**30), 2.0**30)),
-        quats=quats,
+        means=means,
+        quats=array((n, 4), floats(-(2.0**10), 2.0**10)),
         scales=elementary.exp(array((n, 3), floats(-29, 29))),
         opacities=array((n,), st.one_of(floats(0, 1), st.sampled_from([0.0, 1.0]))),
         sh0=array((n, 1, 3), floats(-(2.0**10), 2.0**10)),

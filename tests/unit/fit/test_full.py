@@ -231,24 +231,6 @@ def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
 # safety
 
 
-def test_fit_that_makes_it_worse_returns_the_same(truth: Gaussians, noise: Pair) -> None:
-    grey = replace(truth, sh0=np.zeros_like(truth.sh0))
-    result, report = fit_full(grey, scenes.run_for(noise, LONG, count=2 * len(grey)))
-    assert (report.method, report.accepted) == ("none", False)
-    assert report.holdout_after <= report.holdout_before
-    assert result is grey
-    assert report.steps < 160  # judged before the steps that look at everything
-    assert "no better" in report.stopped
-
-
-def test_perfect_start_is_not_spoilt(scene: Scene, truth: Gaussians, photos: Pair) -> None:
-    result, report = fit_full(truth, scenes.run_for(photos, LONG))
-    assert report.accepted == (report.holdout_after > report.holdout_before)
-    assert report.accepted or result is truth
-    actual, expected = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (result, truth))
-    assert np.abs(actual - expected).mean() < 0.01
-
-
 def test_held_out_patches_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
     """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
     options = scenes.tuned(replace(QUICK, half_res_share=1.0), ssim_lambda=0.0)

@@ -12,6 +12,7 @@ from gsmerge.fit import FitJob, FitOptions, fit
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import place_outside_views, score_fog
+from gsmerge.fit.schedule import prepare_fit
 from gsmerge.fit.survey import MOST_SCORED, choose_views, peak_weights, score_images, scored_views, survey_photos
 from gsmerge.raster import composite, contributions, make_splats, tile_view
 from gsmerge.raster.photos import Photos
@@ -42,6 +43,25 @@ def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
     hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
     alone, both = (fit(g, FitJob(photos, QUICK))[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
     assert len(both) == len(alone)
+
+
+def test_a_fit_that_shows_the_photos_worse_is_refused(truth: Gaussians, photos: Pair) -> None:
+    result, report = fit(truth, FitJob(photos, LONG))  # of a perfect start
+    assert (report.method, report.accepted) == ("none", False)
+    assert "worse" in report.stopped
+    assert scenes.identical(result, truth[visible(truth, photos[1])])
+
+
+def test_a_fit_is_taken_though_held_out_patches_get_worse(truth: Gaussians, photos: Pair) -> None:
+    """As they do where few views see a place: the photos as a whole decide."""
+    start, half = scenes.spoil(truth), photos[1]
+    state, images = start_state(start), half.images.copy()
+    for view, weight in enumerate(prepare_fit(FitJob(photos, LONG)).weights):
+        drawn = composite(tile_view(state.splats, **half.camera(view)), state.colors)[0]
+        images[view][weight == 0] = drawn.clip(0, 1)[weight == 0]  # patches show the start
+    _, report = fit(start, FitJob((photos[0], replace(half, images=images)), LONG))
+    assert report.holdout_after < report.holdout_before
+    assert report.accepted
 
 
 def test_nothing_to_fit(truth: Gaussians, photos: Pair) -> None:
