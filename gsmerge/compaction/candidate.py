@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from gsmerge.compaction.scores import covers_all, measure_renders, measure_result
+from gsmerge.compaction.scores import covers_all, measure_renders, measure_result, written
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import scene_depth
@@ -55,7 +55,7 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tup
     Both are against photos, or against renders of the input if these stand for photos; None without either.
     """
     if moved.reference.name == RENDERS:
-        fidelity = _measure_fidelity(moved.frame.enter(gaussians), moved, plan)
+        fidelity = _measure_fidelity(moved.frame.enter(written(gaussians, plan)), moved, plan)
         views, placed = len(plan.scored_views), moved.reference.placed
         choose(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
         return fidelity, fidelity

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsmerge.compaction.report import Covered, PhotoFiles
 from gsmerge.facts.prepare import Prepared
+from gsmerge.io.formats.rounding import round_as_written
 from gsmerge.photos.views import scored_views
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE, PhotoScore, scene_photos, score_photos
@@ -42,17 +43,22 @@ def _rendered_views(prepared: Prepared, plan: Plan) -> Sequence[int]:
     return [prepared.repeated[view] for view in plan.scored_views] if prepared.repeated else plan.scored_views
 
 
+def written(gaussians: Gaussians, plan: Plan) -> Gaussians:
+    """Return Gaussians with the rounding of the output's file; unchanged if no file is written."""
+    return round_as_written(plan.output, gaussians) if plan.output else gaussians
+
+
 def measure_result(
     gaussians: Gaussians, prepared: Prepared, plan: Plan, covered: Sequence[np.ndarray] | None = None
 ) -> PhotoScore | None:
-    """Score Gaussians of the world on the scored photos; None without photos.
+    """Score Gaussians of the world, as the output's file rounds them, on the scored photos; None without photos.
 
     ``covered``: a mask of pixels ``[h,w]`` of each scored photo, over which ``covered_psnr`` is measured; None: the
     pixels that the Gaussians cover.
     """
     if not prepared.reference.of_views:
         return None
-    return _score_photos("score", gaussians, prepared.result_views(), prepared, plan, covered)
+    return _score_photos("score", written(gaussians, plan), prepared.result_views(), prepared, plan, covered)
 
 
 def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
@@ -153,7 +159,7 @@ def measure_parts(before: InputScores, gaussians: Gaussians, prepared: Prepared,
 
     ``before`` are the scores of the input.
     """
-    covered, rounded = _measure_covered(before.photos, gaussians, prepared, plan), gaussians
+    covered, rounded = _measure_covered(before.photos, gaussians, prepared, plan), written(gaussians, plan)
     after = None if before.on_files is None else _measure_on_files(rounded, prepared, plan)
     files = None if before.on_files is None or after is None else PhotoFiles(before.on_files, after)
     within = None if before.protected is None else _measure_protected(rounded, prepared, plan)

@@ -78,7 +78,7 @@ def test_the_notebook_runs(root: Path, tmp_path: Path, monkeypatch: pytest.Monke
         assert isinstance(last, ast.Expr)
         exec(compile(ast.Module(body, []), "notebook.ipynb", "exec"), namespace)
         shown.append(show(eval(compile(ast.Expression(last.value), "notebook.ipynb", "eval"), namespace)))
-    texts = ("Scene(1,536", "data:image/png;base64,", "<iframe", "fit", "3 target views", "<iframe", "GaussianFile(")
+    texts = ("Scene(1,536", "CompactResult(", "<iframe", "fit", "Evaluation(", "<iframe", "GaussianFile(")
     assert len(shown) == len(texts)
     assert all(text in value for text, value in zip(texts, shown, strict=True)), shown
 

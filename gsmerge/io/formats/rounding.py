@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import numpy as np
 
 from gsmerge.geometry.transforms import medians
+from gsmerge.io.formats.read import read_gaussians
 from gsmerge.io.formats.table import PLY, output_format
+from gsmerge.io.formats.write import write_gaussians
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arrays import distinct
 
@@ -37,3 +43,18 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
         remedy = ("" if format_.round_means is PLY.round_means else "write a .ply, or ") + "crop far Gaussians"
     problem = f"positions so far from the origin lose digits in {format_.ending}"
     return [f"{problem}, and Gaussians move by about {100 * mean_square**0.5:.0f} % of their size; {remedy}"]
+
+
+def round_as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
+    """Write Gaussians in the format of a path and read them back; return them unchanged if rounding is invisible.
+
+    Formats that cannot be read back round the positions.
+    """
+    if not rounding_notes(path, gaussians):
+        return gaussians
+    format_ = output_format(path, levels=True, cameras=True)
+    if format_.read is None:
+        return replace(gaussians, means=format_.round_means(gaussians.numpy().means.astype(np.float64)))
+    with TemporaryDirectory() as folder:
+        write_gaussians(Path(folder) / f"a{format_.ending}", gaussians)
+        return read_gaussians(Path(folder) / f"a{format_.ending}").gaussians
