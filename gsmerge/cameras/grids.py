@@ -14,7 +14,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, sizes_of, to_cameras
 from gsmerge.io.cameras.table import FFGS
-from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
+from gsmerge.io.photo_files import PhotoTransform, Size, resize_and_crop, resize_to, same_shape
 from gsmerge.types import Cameras
 
 _STRETCHES = 0.1  # relative difference of the scales of width and height above which few models resize photos
@@ -92,7 +92,7 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> Grid:
         return _mapped_grid(camera_file, size, *camera_file.photo_map)
     width, height = size
     for w, h in sizes_of(camera_file):
-        if not same_shape((w, h), size) and not _are_stretched(camera_file, size):
+        if not same_shape((w, h), size):
             if camera_file.source == FFGS:
                 return _mapped_grid(camera_file, size, size, resize_and_crop(size, (w, h)))
             problem = f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}"
@@ -116,16 +116,6 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
         note += "; if the model did not squeeze them, rows were left out of the file: name its cameras with --cameras"
     is_same = file_size == (transform.width, transform.height)
     return Grid(camera_file, to_cameras(camera_file), transform, () if is_same else (note,))
-
-
-def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
-    """Return True if the model has stretched the photos, so that oblong pixels become square at the photos' size."""
-    if camera_file.focal is None:
-        return False
-    focals = camera_file.Ks[:, (0, 1), (0, 1)]
-    sides = np.stack([camera_file.widths, camera_file.heights], 1)
-    ratios = np.divide(*(focals * size / np.maximum(sides, 1)).T)
-    return bool((np.abs(ratios - 1) <= ASPECT_TOLERANCE).all())
 
 
 def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:

@@ -425,7 +425,6 @@ def _combine(
     order = _choose_order(ply, camera_file, hints)
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
-    notes += [camera_file.focal] if camera_file.focal else []
     without_bars, bar_notes = cut_bars(pictures, camera_file)
     limited, size_notes = limit_photo_size(without_bars, len(ply.gaussians), hints.max_side, unaligned=order == "none")
     if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians

@@ -49,7 +49,7 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
     """
     if files.cameras is not None:
         stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
-        if stored.focal is None:
+        if not stored.has_intrinsics:
             raise missing_intrinsics(stored.path)
         # if the number is a multiple, each view may have rows of its own
         return drop_repeats(stored) if len(ply.gaussians) % len(stored) else stored

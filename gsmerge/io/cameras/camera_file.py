@@ -83,8 +83,7 @@ class CameraFile:
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty if the file holds no images
     order: str = "auto"  # order of the Gaussians' rows; "auto" if the file does not name it
     lenses: tuple[Lens | None, ...] = ()  # of each camera, None for a pinhole; empty if all are pinholes
-    # "" if the file has focal lengths; otherwise a sentence about their estimate, or None before they are estimated
-    focal: str | None = ""
+    has_intrinsics: bool = True  # False if the file has poses alone; `Ks` are then placeholders
     # Size of the photos, and the transform of these photos to the cameras' size; None before the photos are known
     photo_map: tuple[Size, PhotoTransform] | None = None
     # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 for none, if the cameras were estimated from the rows
@@ -151,7 +150,7 @@ def make_camera_file(
         raise SceneError(path, "expected at least one camera, found none")
     check_count(path, len(views))
     lacks_intrinsics = all(view.K is None for view in views)
-    if lacks_intrinsics:  # placeholders until the focal length is estimated
+    if lacks_intrinsics:  # placeholders, which the checks accept
         sides = [float(max(view.size)) or 1.0 for view in views]
         views = [view._replace(K=make_pinhole(f, f, 0, 0)) for view, f in zip(views, sides, strict=True)]
     poses, Ks = np.tile(np.eye(4), (len(views), 1, 1)), np.array([view.K for view in views], np.float64)
@@ -178,7 +177,7 @@ def make_camera_file(
         images=images,
         order=order,
         lenses=lenses if any(lenses) else (),
-        focal=None if lacks_intrinsics else "",
+        has_intrinsics=not lacks_intrinsics,
     )
 
 
@@ -307,7 +306,7 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
     ``size`` is (width, height) of the photos. The new size must have the shape of the photos. Fractional sides are
     rounded to multiples of ``PATCH``, since the inputs of networks have such sides.
     """
-    if size is None or camera_file.focal is None or _stored_sizes(camera_file) != [(0, 0)]:
+    if size is None or _stored_sizes(camera_file) != [(0, 0)]:
         return camera_file
     sides = 2 * np.median(camera_file.Ks[:, :2, 2], 0)
     ratios = sides / size
@@ -331,7 +330,7 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
         (5, 3, 3)
     """
     path = camera_file.path
-    if camera_file.focal is None:
+    if not camera_file.has_intrinsics:
         raise missing_intrinsics(path)
     for name, lens in zip(camera_file.names, camera_file.lenses, strict=False):
         if lens is not None:
