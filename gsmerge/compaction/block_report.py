@@ -38,10 +38,9 @@ def join_reports(
     reference = None if before is None else starts[0].prepared.reference.name
     pictures = OWN_PHOTOS if reference == PHOTOS else reference
     worse = None if pictures is None else describe_loss("the result", before, after, pictures)
-    notes = list(dict.fromkeys(run.notes))
     return CompactReport(
         num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
         psnr_after=after, choices=run.choices | {"scored_views": sum(scored)},
-        notes=[*notes, *filter(None, [worse])], doubts=[*run.doubts, *filter(None, [worse])], options=options.to_dict(),
-        peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference,
+        notes=[*run.notes, *filter(None, [worse])], doubts=[*run.doubts, *filter(None, [worse])],
+        options=options.to_dict(), peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference,
     )  # fmt: skip

@@ -202,7 +202,7 @@ def adopt(part: Record) -> None:
     """Copy choices and notes of a part's record into the current record."""
     record = current_record()
     record.choices |= part.choices
-    record.entries += [entry for entry in part.entries if entry not in record.entries]
+    record.entries += [entry for entry in part.entries if entry.text not in record.notes]
 
 
 def expect_parts(parts: Iterable[Part]) -> None:
