@@ -80,7 +80,7 @@ def fit(starts: list[Decoded], prepared: Prepared, plan: Plan) -> Fitted:
     [start] = starts
     if start.is_input and prepared.reference.name == RENDERS:  # the pictures show exactly these Gaussians
         return unfitted(start, prepared)
-    return fit_scene(start, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
+    return fit_scene(start, prepared.scene, plan.fit, plan.seed)
 
 
 def prune_and_fill(fitted: Fitted, start: Decoded, prepared: Prepared, plan: Plan) -> Fitted:

@@ -173,7 +173,7 @@ def fit_block(start: BlockStart, everything: tuple[Gaussians, np.ndarray], growt
         used |= peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution
     rows = np.flatnonzero(used)
     decoded = Decoded(joined[rows], round(growth * len(rows)), exact=False)
-    fitted = fit_scene(decoded, scene, start.prepared.reference.fit_views, plan.fit, plan.seed)
+    fitted = fit_scene(decoded, scene, plan.fit, plan.seed)
     if fitted.report is None:  # without a fit, these are the start Gaussians of the block
         return fitted.gaussians
     assert fitted.report.origins is not None

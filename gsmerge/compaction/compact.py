@@ -221,7 +221,7 @@ def _clean(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gaussians, d
     from gsmerge.stages.clean import clean
 
     # the few cameras placed for scores do not show all of the scene; without cameras, `clean` places more
-    cameras = None if prepared.reference.placed else fitted.cameras
+    cameras = None if prepared.reference.placed else fitted.cameras[sorted({*prepared.repeated})]
     rows, dropped = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
     return fitted.gaussians[rows], dropped
 

@@ -68,7 +68,7 @@ def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) ->
         return None
     every = tuple(range(len(rest)))
     prepared_rest = replace(
-        prepared, input_scene=rest, scene=rest, reference=Reference(PHOTOS, every, every), repeated=every, moved=False,
+        prepared, input_scene=rest, scene=rest, reference=Reference(PHOTOS, every), repeated=every, moved=False,
         unseen=rest.gaussians[:0], agreement=None,
     )  # fmt: skip
     left_out_views = subset(scene, views)

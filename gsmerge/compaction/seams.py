@@ -57,7 +57,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart
     )  # fmt: skip
     decoded = Decoded(joined[rows], len(rows), exact=True, fixed=~at_seam[rows])
     with record_part(title="seams") as record:
-        fitted = fit_scene(decoded, scene, range(len(scene)), options, seed)
+        fitted = fit_scene(decoded, scene, options, seed)
     add_seconds(record.seconds)
     choose(seams={"views": len(scene), "num_gaussians": int(at_seam.sum()), "steps": options.steps})
     columns = {f.name: np.array(getattr(joined, f.name)) for f in fields(Gaussians)}
@@ -80,7 +80,7 @@ def find_seams(
     # measured a second time, because the weights of all views would not fit into memory
     for number, view, ids, weights in _view_weights(splats, starts):
         seam_weight, view_weight = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam[ids]], weights))
-        if view in starts[number].prepared.reference.fit_views and seam_weight > SEAM_SHARE * view_weight:
+        if seam_weight > SEAM_SHARE * view_weight:
             views[number].append(view)
     return at_seam, views
 

@@ -11,9 +11,10 @@ from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices, motion_vectors, nearest_views, normalize
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.photos.views import concat_cameras, take_rows
+from gsmerge.photos.views import concat_cameras, resize_cameras, take_rows
 from gsmerge.raster import contributions, make_splats, render, tile_view
 from gsmerge.raster.images import thin_out
+from gsmerge.raster.photos import NEAR_PLANE, blank_photos
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
@@ -186,8 +187,9 @@ def place_cameras(
     sample = thin_out(gaussians, SAMPLE_GAUSSIANS // step)
     centre, half = _extent(sample.means.astype(np.float64))
     viewmats = _candidates(centre, half)[::step]
-    shares = _shares_seen(sample, viewmats, CLEAR * float(np.sqrt((half * half).sum())))
-    best = _choose_candidates(shares, num_views)
+    candidates = Cameras(viewmats, np.repeat(_lens(PROBE)[None], len(viewmats), 0), PROBE, PROBE)
+    shares = _shares_seen(sample, candidates, CLEAR * float(np.sqrt((half * half).sum())))
+    best = _choose_candidates(shares, num_views, LEAST_GAIN)
     size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST, largest))
     return Cameras(viewmats[best], np.repeat(_lens(size)[None], len(best), 0), size, size)
 
@@ -250,25 +252,34 @@ def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return viewmat
 
 
-def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.ndarray:
-    """Return the part of each Gaussian's opacity that each candidate shows, ``[c,n]`` float32."""
-    splats, K = make_splats(sample), _lens(PROBE)
+def choose_cameras(sample: Gaussians, candidates: Cameras, counting: np.ndarray, least_added: float) -> list[int]:
+    """Choose candidates that show as much as possible of the ``counting [n]`` Gaussians of a canonical sample.
 
-    def view_shares(viewmat: np.ndarray) -> np.ndarray:
-        sums, _ = contributions(tile_view(splats, viewmat, K, PROBE, PROBE, near=near))
+    The next candidate has to add more than the share ``least_added`` of what those before it show.
+    """
+    shares = _shares_seen(sample, resize_cameras(candidates, PROBE, PROBE), NEAR_PLANE)
+    return _choose_candidates(shares[:, counting], NUM_VIEWS, least_added)
+
+
+def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndarray:
+    """Return the part of each Gaussian's opacity that each candidate shows, ``[c,n]`` float32."""
+    splats, photos = make_splats(sample), blank_photos(candidates)
+
+    def view_shares(view: int) -> np.ndarray:
+        sums, _ = contributions(tile_view(splats, **photos.camera(view), near=near))
         return np.minimum(sums / np.float32(ENOUGH), 1) * splats.opacities
 
-    return np.stack(parallel_map(view_shares, viewmats))
+    return np.stack(parallel_map(view_shares, range(len(candidates))))
 
 
-def _choose_candidates(shares: np.ndarray, num_views: int) -> list[int]:
+def _choose_candidates(shares: np.ndarray, num_views: int, least_added: float) -> list[int]:
     """Choose candidates greedily, at least one: the next always adds most to the opacity shown so far."""
     seen = np.zeros(shares.shape[1], np.float32)
     candidates: list[int] = []
     for _ in range(num_views):
         gains = np.maximum(shares - seen, 0).sum(1, dtype=np.float64)
         best = int(gains.argmax())
-        if candidates and gains[best] <= LEAST_GAIN * seen.sum(dtype=np.float64):
+        if candidates and gains[best] <= least_added * seen.sum(dtype=np.float64):
             break
         candidates.append(best)
         np.maximum(seen, shares[best], out=seen)

@@ -9,6 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
+from gsmerge.facts.draw_outside import draw_outside
 from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.move_poses import move_poses
 from gsmerge.facts.pixels import with_pixels
@@ -41,7 +42,6 @@ class Reference:
     """Pictures of a canonical scene that a result is fitted to and scored on."""
 
     name: str  # "photos", or the name of the pictures that replace them
-    fit_views: tuple[int, ...]  # Views whose pictures a fit may use
     score_views: tuple[int, ...]  # Views whose pictures results are scored on
     placed: bool = False  # The scene has no views of its own; its views were placed, only for scores
     # [v,h,w,3] unchanged photos of the input scene, if the run changed some of them
@@ -50,7 +50,7 @@ class Reference:
     @property
     def of_views(self) -> bool:
         """Whether the scene's own views have pictures for fits and scores that are not renders of the scene."""
-        return bool(self.fit_views) and self.name != RENDERS
+        return self.name != RENDERS
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +128,11 @@ def prepare(
 ) -> Prepared:
     """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
 
-    ``frame``: canonical frame; None: the scene's own. ``fill``: add Gaussians at pixels that only pictures show. Raises
-    ValueError if there is no finite Gaussian, or if there are images without cameras.
+    ``frame``: canonical frame of a scene of which this is a part; None: the scene's own. ``fill``: add Gaussians at
+    pixels that only pictures show. Raises ValueError if there is no finite Gaussian, or if there are images without
+    cameras.
     """
-    options = options or PrepareOptions()
+    options, is_whole = options or PrepareOptions(), frame is None
     input_scene, (scene, repeated, notes) = scene, without_repeats(scene)
     for text in notes:
         note(text)
@@ -145,7 +146,10 @@ def prepare(
         if agreement.doubt:
             note(agreement.doubt, doubt=True)
         prepared = replace(prepared, agreement=agreement)
-    return _without_holes(prepared, options) if fill and prepared.reference.of_views else prepared
+    prepared = _without_holes(prepared, options) if fill and prepared.reference.of_views else prepared
+    if prepared.reference.name != PHOTOS or scene.has_own_pixels or not is_whole:
+        return prepared
+    return replace(prepared, scene=draw_outside(prepared.scene))
 
 
 def _photos_before(input_scene: Scene, prepared: Prepared) -> np.ndarray | None:
@@ -172,7 +176,7 @@ def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
     reference = prepared.reference
     if filled.empty is not None and filled.masks is not None:
         seen = tuple(view for view in views if filled.masks[view].any())
-        reference = replace(reference, score_views=seen or views, fit_views=seen or reference.fit_views)
+        reference = replace(reference, score_views=seen or views)
     return replace(prepared, scene=filled, reference=reference)
 
 
@@ -191,9 +195,9 @@ def _with_references(
     if options.unseen == "keep" and not own:
         scene, unseen = _split_unseen(scene)
     if views:
-        reference = Reference(PHOTOS, every if own else views, views)
+        reference = Reference(PHOTOS, views)
     elif own:
-        reference = Reference(ROW_COLORS, every, every)
+        reference = Reference(ROW_COLORS, every)
     else:
         lacks_photos = input_scene.images is None
         reason = "no photos, and the rows are not the pixels of the views" if lacks_photos else "photos do not count"
@@ -201,7 +205,7 @@ def _with_references(
         note(f"{reason}: renders of the scene itself are used instead{remedy}")
         scene = draw_pictures(scene)
         shown = tuple(view for view in every if scene.images[view].any())  # any result equals an empty view
-        return Prepared(input_scene, scene, frame, Reference(RENDERS, every, shown or every), repeated, False, unseen)
+        return Prepared(input_scene, scene, frame, Reference(RENDERS, shown or every), repeated, False, unseen)
     input_scene, moved = _with_photos(input_scene, scene, repeated), None
     if own:  # each view's Gaussians have the exposure and the pose of the view
         scene = equalise_exposure(scene, reference.score_views, options.exposure)
@@ -273,7 +277,7 @@ def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
     finite = keep_finite(scene)
     note(NO_VIEWS)
     scored, frame = canonicalise(add_scored_views(finite))
-    reference = Reference(RENDERS, (), tuple(range(len(scored))), placed=True)
+    reference = Reference(RENDERS, tuple(range(len(scored))), placed=True)
     return Prepared(scene, draw_pictures(scored), frame, reference, (), moved=False, unseen=finite.gaussians[:0])
 
 

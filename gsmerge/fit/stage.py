@@ -29,19 +29,20 @@ START = 0.57  # share of the final number of Gaussians at the start of a run tha
 def fit_scene(
     decoded: Decoded,
     scene: PicturedScene,
-    views: Sequence[int],
     options: FitOptions,
     seed: int,
     *,
+    views: Sequence[int] | None = None,
     num_scored: int | None = None,
 ) -> Fitted:
-    """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene, if a fit is asked for.
+    """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene (None: all), if a fit is asked for.
 
     If renders stand for photos, the result is scored on the first ``num_scored`` views. None: there are photos, and the
     result is scored on all of them.
     """
     if options.fit == "none":
         return Fitted(decoded.gaussians, scene.cameras, None)
+    views = range(len(scene)) if views is None else views
     with stage("fit"):
         photos = fit_photos(scene, options, views)
         choose(start_count=len(decoded.gaussians))

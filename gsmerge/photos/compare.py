@@ -267,17 +267,16 @@ def _change_photos(
     """Change photos at both sizes; use the Gaussians' colours at ``hidden [v,h,w]`` pixels, and in all other views.
 
     The photos of ``views`` show the scene. The Gaussians' colours are ``pictures [v,h,w,3]``; None: drawings. In views
-    without a photo these colours count as a photo.
+    without a photo, colours of the view's own Gaussians count as a photo, and drawings as what masks leave out.
     """
     other_views = sorted({*range(len(scene))} - {*views})
     hidden[other_views] = True
     if scene.masks is not None:
         hidden |= ~scene.masks
-        absent = sorted({*other_views} - {*scene.photo_views})
-        if absent:
-            masks = scene.masks.copy()
-            masks[absent] = True
-            scene = replace(scene, masks=None if masks.all() else masks)
+    if other_views:
+        masks = np.full(hidden.shape, True) if scene.masks is None else scene.masks.copy()
+        masks[other_views] = scene.has_own_pixels
+        scene = replace(scene, masks=None if masks.all() else masks)
     with_hidden = np.flatnonzero(hidden.any((1, 2)))
     if len(with_hidden) == 0 and not any(changes):
         return scene

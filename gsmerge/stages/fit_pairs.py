@@ -51,7 +51,7 @@ def unfitted(start: Decoded, prepared: Prepared) -> Fitted:
 def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
     """Fit a start to renders of the scene's own views; a long fit also uses renders of views around them."""
     scene = prepared.scene_around if options.grows else prepared.scene
-    fitted = fit_scene(start, scene, range(len(scene)), options, seed, num_scored=len(prepared.scene))
+    fitted = fit_scene(start, scene, options, seed, num_scored=len(prepared.scene))
     accepted = fitted.report is not None and fitted.report.accepted
     gaussians = fitted.gaussians if accepted else start.gaussians
     return replace(fitted, gaussians=gaussians, cameras=prepared.scene.cameras)
@@ -67,7 +67,7 @@ def fit_to_placed(starts: Sequence[Decoded], best: int, prepared: Prepared, opti
     """
     scene = prepared.scene_placed(FITTED_LONG if options.steps >= LONG else FITTED)
     placed = range(len(prepared.scene), len(scene))
-    fits = [fit_scene(start, scene, placed, options, seed, num_scored=len(placed)) for start in starts]
+    fits = [fit_scene(start, scene, options, seed, views=placed, num_scored=len(placed)) for start in starts]
     accepted = [fit.report is not None and fit.report.accepted for fit in fits]
     after = [score_views(fit.gaussians, prepared) for fit in fits]
     if any(accepted):

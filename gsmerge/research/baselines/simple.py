@@ -35,7 +35,7 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """
     gaussians = prepared.scene.file_gaussians
     start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")
-    return fit_scene(start, prepared.scene, prepared.reference.fit_views, options, plan.seed).gaussians
+    return fit_scene(start, prepared.scene, options, plan.seed).gaussians
 
 
 def prune_faintest(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
