@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
@@ -24,7 +25,7 @@ from gsmerge.compaction.new_views import can_try, try_new_views
 from gsmerge.compaction.report import CompactReport
 from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, search_count
-from gsmerge.errors import DoubtWarning
+from gsmerge.errors import DoubtWarning, TargetError
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
@@ -51,6 +52,11 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
+# Settings that are tried in this order if a result is worse than its input, with words for a note
+SIMPLER: Sequence[tuple[str, dict[str, Any]]] = (
+    ("with the scene's own colours in place of the photos", {"look": "scene"}),
+    ("without a fit", {"fit": "none"}),
+)
 SURPLUS = 1.05  # The requested count has to remain after clean-up, so this many times more are built
 
 
@@ -70,6 +76,7 @@ def compact(
     Raises:
         SceneError: If a path cannot be read, or a scene has values of another convention, such as log scales.
         ValueError: If a setting is unknown or out of range.
+        TargetError: If no result is as good as the input, and no setting decides the number of Gaussians.
 
     Doubts about the result are warnings of the class :class:`gsmerge.DoubtWarning`. Notes go to the logger ``gsmerge``.
 
@@ -93,6 +100,31 @@ def compact(
 
 
 def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
+    """Compact a scene; if the result is worse than its input, go on in the next simpler way, with a note.
+
+    Raises TargetError if no result is as good as the input. The result stays, with a warning, where options decide the
+    number of Gaussians or replace the method.
+    """
+    result = _compact_once(scene, options)
+    cause, twice = result.report.worse, max(1, 2 * len(result.gaussians))
+    if not result.report.is_below or options.decides_count or options.replaces_stages:
+        return result
+    for words, settings in (*SIMPLER, ("with twice as many Gaussians", {"budget": twice})):
+        simpler = options.with_settings(settings)
+        if simpler == options:
+            continue
+        with record_part():
+            note(f"{cause}; so it was made again {words}")
+            result = _compact_once(scene, simpler)
+        if not result.report.is_below:
+            return result
+    problem = f"expected a result as good as its input, found none: {cause}"
+    raise TargetError(
+        f"{problem}; gsmerge inspect says how it is read, and --budget {twice} writes a result all the same"
+    )
+
+
+def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
     """Compact a scene: in blocks if its views are cut into several, otherwise in one piece."""
     size = measure_size(scene)
     choices = choose_for_scene(size, options)  # the decisions that need no computation

@@ -77,8 +77,8 @@ class CompactReport:
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how near the result came; None if it is met.
         worse: A warning, also among the notes: the result shows the scene's own photos more than .5 dB worse than the
-            input does or, if ``fidelity`` is measured, its PSNR against the input is below 30 dB. None if neither is
-            the case, or if it cannot be measured, as with a crop.
+            input does, or lies far from the input between the views; or, if ``fidelity`` is measured, its PSNR against
+            the input is below 30 dB. None if neither is the case, or if it cannot be measured, as with a crop.
         psnr_reference: What the PSNR of the input views is measured against: "photos" or "the model's own pixels"; None
             if it is not measured.
         covered: PSNR over the pixels that the input covers; None if it lacks at most 2 % of them.
@@ -108,6 +108,11 @@ class CompactReport:
     photo_files: PhotoFiles | None = None
     protected: Covered | None = None
     doubts: Sequence[str] = ()
+
+    @property
+    def is_below(self) -> bool:
+        """Whether the result shows the scene worse than its input does; False if nothing can tell."""
+        return self.worse is not None and self.psnr_after is not None
 
     def __repr__(self) -> str:
         return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"

@@ -87,7 +87,7 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
     num_steps = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
     if num_steps == 0:
         return None
-    sample = _sample(scene, ROWS * min(len(photos), PLACES)) if len(scene.gaussians) else start
+    sample = sample_gaussians(scene, ROWS * min(len(photos), PLACES)) if len(scene.gaussians) else start
     if len(sample) == 0 or len(photos) == 0:
         return None
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
@@ -123,7 +123,7 @@ def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarra
     return np.stack(list(in_turn(view_limits, range(len(views)))))
 
 
-def _sample(scene: Scene, count: int) -> Gaussians:
+def sample_gaussians(scene: Scene, count: int) -> Gaussians:
     """Return about ``count`` of a scene's Gaussians, evenly among the rows, enlarged to cover the same area."""
     num_rows = len(scene.gaussians)
     step = max(1, num_rows // max(1, count))

@@ -1,0 +1,68 @@
+"""Result -> whether it lies far from its input in pictures that no fit has seen.
+
+Photos tell how far the input is from the truth. A result that is farther from the input than twice that is farther from
+the truth than the input is, by the triangle inequality. The cause may be one that no rule foresees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsmerge.facts.place_cameras import FARTHEST, NEAREST, between_cameras
+from gsmerge.facts.prepare import Prepared
+from gsmerge.fit.outside import outside_cameras, sample_gaussians
+from gsmerge.kernels.pictures import blur
+from gsmerge.photos.views import even_views, resize_cameras
+from gsmerge.raster import render
+from gsmerge.raster.metrics import decibels
+from gsmerge.raster.photos import shrink_pictures
+from gsmerge.runtime.record import stage
+from gsmerge.types import Cameras, Gaussians
+
+TWICE = 20 * np.log10(2)  # dB between two distances of which one is twice the other
+# Gaussians that represent the input, pixels of the longer side, and standard deviation of a blur, pixels, by which
+# noise of the Gaussians hardly counts. On fifteen captures a result is .2 dB or more nearer to its input than the input
+# to its photos, and .03 s tell that
+SAMPLE, SIDE, BLUR = 40_000, 80, 1.0
+MOST_PHOTOS, MOST_BETWEEN = 2, 3
+
+
+@stage("score")
+def describe_far(gaussians: Gaussians, prepared: Prepared) -> str | None:
+    """Describe that canonical Gaussians lie far from the input of a scene with photos; None if they do not."""
+    scene, views = prepared.scene, prepared.reference.score_views
+    own = [views[i] for i in even_views(len(views), min(len(views), MOST_PHOTOS))]
+    share = SIDE / max(SIDE, scene.cameras.width, scene.cameras.height)
+    size = [max(1, round(side * share)) for side in (scene.cameras.width, scene.cameras.height)]
+    sample, cameras = sample_gaussians(scene, SAMPLE), resize_cameras(scene.cameras, *size)
+    more = _place_between(sample, cameras, views)
+    pictures = shrink_pictures(scene.images[own], *size)
+    counts = None if scene.masks is None else shrink_pictures(scene.masks[own].astype(np.float32), *size) == 1
+    error = _compare(sample, cameras[own], pictures, counts)
+    distance = _compare(sample, more, render(gaussians, more).images, None)
+    if not distance + TWICE < error:  # also without pixels to compare
+        return None
+    return (
+        "between the views, pictures of the result differ from pictures of the input more than twice as much as these"
+        f" differ from the photos: {distance:.1f} dB, {error:.1f} dB"
+    )
+
+
+def _place_between(sample: Gaussians, cameras: Cameras, views: Sequence[int]) -> Cameras:
+    """Place a few cameras between views; if there is no space between any, beside them."""
+    between = between_cameras(cameras[list(views)]) if len(views) > 1 else cameras[[]]
+    if len(between) == 0:
+        return outside_cameras(sample.means, cameras, MOST_BETWEEN, NEAREST, FARTHEST)
+    return between[even_views(len(between), min(len(between), MOST_BETWEEN))]
+
+
+def _compare(gaussians: Gaussians, cameras: Cameras, pictures: np.ndarray, counts: np.ndarray | None) -> float:
+    """Return the PSNR (dB) of ``pictures [v,h,w,3]`` and drawings, both blurred, where Gaussians cover a pixel."""
+    drawn = render(gaussians, cameras)
+    covered = drawn.alphas[..., 0] > 0.5
+    covered = covered if counts is None else covered & counts
+    pairs = zip(drawn.images, pictures, covered, strict=True)
+    errors = [((blur(a.clip(0, 1), BLUR) - blur(b.clip(0, 1), BLUR)) ** 2)[mask] for a, b, mask in pairs]
+    return decibels(float(np.concatenate(errors).mean())) if covered.any() else np.nan
