@@ -124,15 +124,20 @@ class Prepared:
 
 @stage("prepare")
 def prepare(
-    scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None, *, fill: bool = True
+    scene: Scene,
+    options: PrepareOptions | None = None,
+    frame: Frame | None = None,
+    *,
+    fill: bool = True,
+    outside: bool = True,
 ) -> Prepared:
     """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
 
-    ``frame``: canonical frame of a scene of which this is a part; None: the scene's own. ``fill``: add Gaussians at
-    pixels that only pictures show. Raises ValueError if there is no finite Gaussian, or if there are images without
-    cameras.
+    ``frame``: canonical frame; None: the scene's own. ``fill``: add Gaussians at pixels that only pictures show.
+    ``outside``: draw pictures of a part that no view sees; not if other views, of which these are a part, see it.
+    Raises ValueError if there is no finite Gaussian, or if there are images without cameras.
     """
-    options, is_whole = options or PrepareOptions(), frame is None
+    options = options or PrepareOptions()
     input_scene, (scene, repeated, notes) = scene, without_repeats(scene)
     for text in notes:
         note(text)
@@ -147,9 +152,8 @@ def prepare(
             note(agreement.doubt, doubt=True)
         prepared = replace(prepared, agreement=agreement)
     prepared = _without_holes(prepared, options) if fill and prepared.reference.of_views else prepared
-    if prepared.reference.name != PHOTOS or scene.has_own_pixels or not is_whole:
-        return prepared
-    return replace(prepared, scene=draw_outside(prepared.scene))
+    draws = outside and prepared.reference.name == PHOTOS and not scene.has_own_pixels
+    return replace(prepared, scene=draw_outside(prepared.scene)) if draws else prepared
 
 
 def _photos_before(input_scene: Scene, prepared: Prepared) -> np.ndarray | None:

@@ -132,7 +132,7 @@ def extend_features(
     _check_options(options)
     options = options.with_settings(PIECE)
     with use_threads(options.threads), record_run(progress) as record:
-        prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame)
+        prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame, outside=False)
         prepared_scene, world = prepared.scene, _check_world(state, prepared.scene, extend_options)
         plan = make_plan(prepared, options, None if state is None else _own_checkpoint(state, options))
         weights = plan.networks
