@@ -358,7 +358,7 @@ def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     """
     if options.decides_count or options.replaces_stages:  # other stages seldom keep the quality
         return False
-    return scene.rendered or not (scene.is_dense or options.budget.auto)
+    return scene.rendered or options.budget.keep or not (scene.is_dense or options.budget.auto)
 
 
 def check_pictures(prepared: Prepared, options: CompactOptions) -> None:

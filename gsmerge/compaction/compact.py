@@ -56,6 +56,7 @@ from gsmerge.values.arguments import check_arguments
 SIMPLER: Sequence[tuple[str, dict[str, Any]]] = (
     ("with the scene's own colours in place of the photos", {"look": "scene"}),
     ("without a fit", {"fit": "none"}),
+    ("with as many Gaussians as keep the quality of the input", {"keep": True}),
 )
 SURPLUS = 1.05  # The requested count has to remain after clean-up, so this many times more are built
 
@@ -106,10 +107,10 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
     number of Gaussians or replace the method.
     """
     result = _compact_once(scene, options)
-    cause, twice = result.report.worse, max(1, 2 * len(result.gaussians))
+    cause = result.report.worse
     if not result.report.is_below or options.decides_count or options.replaces_stages:
         return result
-    for words, settings in (*SIMPLER, ("with twice as many Gaussians", {"budget": twice})):
+    for words, settings in SIMPLER:
         simpler = options.with_settings(settings)
         if simpler == options:
             continue
@@ -118,9 +119,9 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
             result = _compact_once(scene, simpler)
         if not result.report.is_below:
             return result
-    problem = f"expected a result as good as its input, found none: {cause}"
+    problem, budget = f"expected a result as good as its input, found none: {cause}", max(1, len(result.gaussians))
     raise TargetError(
-        f"{problem}; gsmerge inspect says how it is read, and --budget {twice} writes a result all the same"
+        f"{problem}; gsmerge inspect says how it is read, and --budget {budget} writes a result all the same"
     )
 
 

@@ -16,12 +16,12 @@ from gsmerge.fit.outside import outside_cameras, sample_gaussians
 from gsmerge.kernels.pictures import blur
 from gsmerge.photos.views import even_views, resize_cameras
 from gsmerge.raster import render
-from gsmerge.raster.metrics import decibels
+from gsmerge.raster.metrics import POOR, decibels
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.types import Cameras, Gaussians
 
-TWICE = 20 * np.log10(2)  # dB between two distances of which one is twice the other
+TWICE = decibels(1 / 4)  # dB between two distances of which one is twice the other
 # Gaussians that represent the input, pixels of the longer side, and standard deviation of a blur, pixels, by which
 # noise of the Gaussians hardly counts. On fifteen captures a result is .2 dB or more nearer to its input than the input
 # to its photos, and .03 s tell that
@@ -29,7 +29,7 @@ SAMPLE, SIDE, BLUR = 40_000, 80, 1.0
 MOST_PHOTOS, MOST_BETWEEN = 2, 3
 
 
-@stage("score")
+@stage("input")
 def describe_far(gaussians: Gaussians, prepared: Prepared) -> str | None:
     """Describe that canonical Gaussians lie far from the input of a scene with photos; None if they do not."""
     scene, views = prepared.scene, prepared.reference.score_views
@@ -42,7 +42,7 @@ def describe_far(gaussians: Gaussians, prepared: Prepared) -> str | None:
     counts = None if scene.masks is None else shrink_pictures(scene.masks[own].astype(np.float32), *size) == 1
     error = _compare(sample, cameras[own], pictures, counts)
     distance = _compare(sample, more, render(gaussians, more).images, None)
-    if not distance + TWICE < error:  # also without pixels to compare
+    if not distance < min(error - TWICE, POOR):  # also without pixels to compare
         return None
     return (
         "between the views, pictures of the result differ from pictures of the input more than twice as much as these"

@@ -195,6 +195,7 @@ def _report(
         worse = describe_loss(name, *compared, OWN_PHOTOS if pictures == PHOTOS else pictures)
         if worse is None and level == 0:
             worse = describe_far(candidate.fitted.gaussians, prepared)
+            report = replace(report, is_far=worse is not None)
     return report if worse is None else with_worse(report, worse)
 
 

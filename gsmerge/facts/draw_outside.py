@@ -26,6 +26,7 @@ from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene
 # Share of the Gaussians from which on cameras are placed. Views of fifteen captures in voxels miss at most .001, at
 # their edges; two of four views of a narrow capture miss .02
 LEAST_OUTSIDE = 0.005
+LEAST_SHOWN = 0.02  # of the pixels of a placed camera's picture, which have to show mainly such Gaussians
 LEAST_ADDED = 0.2  # a further camera is placed if it adds more than this share of what those before it show
 SAMPLE_GAUSSIANS = 40_000  # cameras are chosen by pictures of at most this many Gaussians
 SOURCES, STEPS_BACK = 4, 8  # most views beside which cameras are placed, and cameras for each that step back
@@ -48,13 +49,17 @@ def draw_outside(scene: PicturedScene) -> PicturedScene:
     def is_outside(_: int, image: np.ndarray, transmittance: np.ndarray) -> np.ndarray:
         return np.asarray(image[..., 0] > (1 - transmittance) / 2)
 
-    counts = photo_errors(scene.gaussians, blank_photos(placed), is_outside, colors=white)
+    counts = np.stack(photo_errors(scene.gaussians, blank_photos(placed), is_outside, colors=white))
+    useful = np.flatnonzero(counts.mean((1, 2)) > LEAST_SHOWN)
+    if len(useful) == 0:
+        return scene
+    placed, counts = placed[useful], counts[useful]
     note(
         f"no view sees {100 * outside.mean():.0f} % of the Gaussians; pictures of the input from {len(placed)} places"
         " beside the views stand for photos there"
     )
     choose(placed_views=len(placed))
-    return _with_drawings(scene, placed, np.stack(counts))
+    return _with_drawings(scene, placed, counts)
 
 
 def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -> Cameras:

@@ -39,6 +39,7 @@ class BudgetOptions(Settings):
         "The photos are held out if there are four or more, otherwise they are those of the input. If the rows belong "
         "to no pixels and no number is asked for, the result keeps the quality of the input. Without photos it "
         "reaches 32.5 dB against renders of the input; with photos it loses at most 0.3 dB on them.")  # fmt: skip
+    keep: bool = setting(False, "Use as many Gaussians as keep the quality of the input.", internal=True)
     output: str = setting(
         "", "Name of the output file, with its ending. A file size as `budget` counts its bytes.", internal=True
     )

@@ -102,7 +102,7 @@ def test_numbers_are_met_and_limits_kept(scene: Scene, steps: int) -> None:
 
 def test_progress_tells_every_step_of_the_full_fit(scene: Scene) -> None:
     calls: list[tuple[str, int, int]] = []
-    compact(scene, fit_steps=12, checkpoint="none", progress=lambda *call: calls.append(call))
+    compact(scene, fit_steps=12, superpixels=40, checkpoint="none", progress=lambda *call: calls.append(call))
     steps = [call for call in calls if call[0].startswith("fit:")]
     assert [call[1:] for call in steps] == [(step, 12) for step in range(1, 13)]
     assert all("photos" in name for name, _, _ in steps)
@@ -111,7 +111,7 @@ def test_progress_tells_every_step_of_the_full_fit(scene: Scene) -> None:
 
 
 def test_without_photos_colours_of_pixels_are_what_a_result_is_fitted_to_and_measured_against(scene: Scene) -> None:
-    with_photos, without = (compact(one, fit_steps=40) for one in (scene, replace(scene, images=None)))
+    with_photos, without = (compact(one, fit_steps=40, superpixels=34) for one in (scene, replace(scene, images=None)))
     report = without.report
     assert (with_photos.report.psnr_reference, report.psnr_reference) == (PHOTOS, ROW_COLORS)
     assert report.choices["fit"]["accepted"]
