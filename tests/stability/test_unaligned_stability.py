@@ -34,7 +34,7 @@ def compacted(scene: Scene, **settings: Any) -> CompactResult:
 
 SETTINGS = [
     {}, {"budget": 150}, {"k": 2}, {"fit": "none"}, {"budget": 150, "fit_steps": 160}, {"budget": "auto"},
-    {"match": "none"}, {"match": "aabb"}, {"budget": "12KB"}, {"unseen": "keep"},
+    {"match": "none"}, {"match": "aabb"}, {"budget": "12KB"},
 ]  # fmt: skip
 
 
