@@ -288,7 +288,7 @@ def prepare_section(run: Run) -> str:
             "thresholds mean the same in every scene, and scaling changes no bit.",
             say(
                 "The photos show what the Gaussians show, so they are the reference of the fit and of all scores;",
-                prepared.reference.name == "photos" and prepared.reference.fit_views == tuple(range(VIEWS)),
+                prepared.reference.name == "photos" and prepared.reference.score_views == tuple(range(VIEWS)),
             ),
             "otherwise colours of the rows, or renders, would stand in for them.",
             f"Other views confirm the depth of {100 * agreement.confirmed:.0f} % of the pixels.",

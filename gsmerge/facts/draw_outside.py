@@ -40,7 +40,7 @@ def draw_outside(scene: PicturedScene) -> PicturedScene:
     canonical, and its rows are not pixels.
     """
     outside = scene.get_pixels().homes < 0
-    if outside.mean() < LEAST_OUTSIDE:  # few views lose more than their edges
+    if outside.mean() < LEAST_OUTSIDE or outside.all():  # cameras that see nothing are wrong, which is said later
         return scene
     placed = _place_beside(scene.gaussians, outside, scene.cameras)
     white = np.repeat(outside.astype(np.float32)[:, None], 3, 1)  # all other Gaussians are black

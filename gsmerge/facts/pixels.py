@@ -1,19 +1,27 @@
-"""Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel, by projection of centres.
+"""Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel; sizes of at least a pixel's low-pass.
 
+Pixels are found by projection of centres.
 Each view is divided into cells that are wider than the distances between neighbouring Gaussians. Gaussians behind the
 front of a cell are hidden. A pixel without a centre in it shows the front of its cell.
+
+A view draws every Gaussian with the low-pass of its pixels added. So Gaussians far smaller than a pixel, such as points
+that all got one tiny size, look sound, but what uses their sizes without drawing them would find an empty scene.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
+from gsmerge.geometry.pooling import pixel_sizes
+from gsmerge.geometry.transforms import find_nearest
 from gsmerge.kernels.gaussians.fronts import order_by_depth, project_centres, weigh_centres
 from gsmerge.raster.images import ONE_AT_A_TIME
-from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.raster.photos import EPS2D, NEAR_PLANE
+from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT
 
@@ -22,13 +30,47 @@ from gsmerge.types import Pixels, Scene, SceneT
 # and 5 dB
 COVERED = 0.96
 REACH = 4.0  # width of a Gaussian that shows nearly all of it, in standard deviations
-SAMPLE = 10_000  # the median size is estimated from at least this many Gaussians, if there are as many
+SAMPLE = 10_000  # medians and shares are estimated from at least this many Gaussians, if there are as many
 SAME_DEPTH = 1.05  # a centre is on the surface of its cell up to this multiple of the depth of the cell's front
+LOW_PASS = math.sqrt(EPS2D)  # standard deviation of the low-pass, pixels
+# The low-pass hides a Gaussian if all its scales are below the share HIDDEN of it. If less than the share FEWEST of the
+# Gaussians is hidden, nothing changes: a fit repairs so few, and scenes without cameras have up to .05 in placed views
+HIDDEN, FEWEST = 0.5, 0.1
 
 
 def with_pixels(scene: SceneT) -> SceneT:
     """Return a canonical scene with its pixels; unknown pixels are found by projection."""
     return scene if scene.pixels is not None else replace(scene, pixels=find_pixels(scene))
+
+
+def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
+    """Raise the scales of Gaussians that the low-pass hides, in a canonical scene, to the low-pass, with a note.
+
+    Where Gaussians share a pixel, each needs less than all of it, so views with few pixels change no sound scene. If
+    the cameras were ``placed``, the distance to the nearest Gaussian takes the place of a pixel.
+    """
+    g, cameras, placed = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
+    homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
+    step = max(1, len(g) // SAMPLE)
+    units = pixel_sizes(g.means[::step], homes[::step], cameras)
+    if placed:  # a part of the Gaussians of a surface lies farther apart
+        units = np.minimum(units, find_nearest(g.means[::step], 1)[1][:, 0] / math.sqrt(step))
+    if (g.scales[::step].max(1) < HIDDEN * LOW_PASS * units).mean() < FEWEST:
+        return scene
+    units = find_nearest(g.means, 1)[1][:, 0] if placed else pixel_sizes(g.means, homes, cameras)
+    sizes, seen = g.scales.max(1), (homes >= 0) | placed
+    num_sharing = 1 if placed else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
+    hidden = sizes * np.sqrt(num_sharing) < HIDDEN * LOW_PASS * units
+    if np.count_nonzero(hidden & seen) <= FEWEST * np.count_nonzero(seen):
+        return scene
+    share, usual = 100 * hidden.mean(), np.median(sizes[hidden] / units[hidden])
+    note(
+        f"{share:.0f} % of the Gaussians are far smaller than"
+        f" {'the distance to the next one' if placed else 'a pixel of the views'}, about {usual:.1g} of it; they count"
+        " as half of it, about as large as they look"
+    )
+    scales = np.where(hidden[:, None], LOW_PASS * units[:, None], g.scales).astype(np.float32)
+    return replace(scene, gaussians=replace(g, scales=scales))
 
 
 def find_pixels(scene: Scene) -> Pixels:

@@ -12,7 +12,7 @@ from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.draw_outside import draw_outside
 from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.move_poses import move_poses
-from gsmerge.facts.pixels import with_pixels
+from gsmerge.facts.pixels import raise_sizes, with_pixels
 from gsmerge.facts.place_cameras import (
     NO_VIEWS,
     add_scored_views,
@@ -139,7 +139,8 @@ def prepare(
     for text in notes:
         note(text)
     scene, frame = canonicalise(add_views(scene), frame)
-    prepared = _with_references(input_scene, with_pixels(scene), frame, tuple(repeated), options)
+    scene = raise_sizes(with_pixels(scene), placed=len(input_scene) == 0)
+    prepared = _with_references(input_scene, scene, frame, tuple(repeated), options)
     files = _photos_before(input_scene, prepared)
     prepared = replace(prepared, reference=replace(prepared.reference, photo_files=files))
     agreement = confirm_depths(prepared.scene)
@@ -277,7 +278,7 @@ def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
     note(NO_VIEWS)
     scored, frame = canonicalise(add_scored_views(finite))
     reference = Reference(RENDERS, tuple(range(len(scored))), placed=True)
-    return Prepared(scene, draw_pictures(scored), frame, reference, (), moved=False)
+    return Prepared(scene, draw_pictures(raise_sizes(scored, placed=True)), frame, reference, (), moved=False)
 
 
 def _with_photos(input_scene: Scene, canonical: PicturedScene, repeated: Sequence[int]) -> Scene:

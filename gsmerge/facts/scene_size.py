@@ -7,15 +7,14 @@ from functools import reduce
 
 import numpy as np
 
-from gsmerge.geometry.transforms import median, quantiles, vector_lengths
+from gsmerge.geometry.transforms import median, quantiles
 from gsmerge.photos.views import camera_kinds
 from gsmerge.types import Gaussians, Scene
 
-# Bounds for the Gaussians of captures. The median largest scale is at least TINY times the extent, which is twice the
-# median distance from the middle, because a far sky does not stretch this. It is at most LARGE times the diagonal of
-# the box that holds most Gaussians. The median coefficient of the base colours is at most BRIGHT. Fewer than FEWEST
-# Gaussians are not tested
-TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
+# Bounds for the Gaussians of captures. The median largest scale is at most LARGE times the diagonal of the box that
+# holds most Gaussians. The median coefficient of the base colours is at most BRIGHT. Fewer than FEWEST Gaussians
+# are not tested
+LARGE, BRIGHT, FEWEST = 0.25, 10.0, 100
 DENSE = 0.5  # a scene is dense from this number of Gaussians per pixel on
 FLAT, FAINT = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
 SAMPLE_GAUSSIANS = 65536  # these bounds are tested on at least this many Gaussians, if there are as many
@@ -65,9 +64,8 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
         return None
     sample = gaussians[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
     means = sample.means.astype(np.float64)
-    low, middle, high = quantiles(means, (0.01, 0.5, 0.99))
+    low, high = quantiles(means, (0.01, 0.99))
     diagonal = float(np.sqrt(((high - low) ** 2).sum()))
-    extent = 2 * median(vector_lengths(means - middle))
     size, color = median(reduce(np.maximum, sample.scales.T)), median(np.abs(sample.sh0))
     low_color, high_color = quantiles(sample.sh0[:, 0], (0.01, 0.99))
     flat, faint = float((high_color - low_color).max()) < FLAT, median(sample.opacities) < FAINT
@@ -77,8 +75,6 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
         problem = "the Gaussians have one flat colour"
     elif faint:
         problem = f"half of the opacities are below {FAINT:.2g}"
-    elif size < TINY * extent:
-        problem = f"half of the Gaussians are at most {size / extent:.2g} times as large as the scene"
     elif size > LARGE * diagonal:
         problem = f"half of the Gaussians are at least {size / max(diagonal, 1e-30):.2g} times as large as the scene"
     else:

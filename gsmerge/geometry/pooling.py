@@ -11,7 +11,7 @@ from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.pool import decompose, pool
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Gaussians, Pixels, Scene
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Pixels, Scene
 from gsmerge.values.arrays import to_float32
 
 Rule = Literal["depth", "paper"]
@@ -45,30 +45,33 @@ def _array(values: np.ndarray) -> np.ndarray:
 
 
 def scene_members(scene: Scene) -> Members:
-    """Return the Gaussians of a canonical scene with pixels as members.
+    """Return the Gaussians of a canonical scene with pixels as members; footprints are their :func:`pixel_sizes`."""
+    g, pixels = scene.gaussians, scene.get_pixels()
+    return _make_members(g, pixel_sizes(_array(g.means), pixels.homes, scene.cameras), pixels)
 
-    The footprint of a Gaussian is measured in the view of its pixel. Without a pixel, it is the smallest footprint over
-    all views.
+
+def pixel_sizes(means: np.ndarray, homes: np.ndarray, cameras: Cameras) -> np.ndarray:
+    """Return the size ``[n]`` of a pixel at means ``[n,3]``, world units, in the view of the pixels ``homes [n]``.
+
+    Without a pixel (-1), it is the smallest size over all views.
     """
-    g, cameras, homes = scene.gaussians, scene.cameras, scene.get_pixels().homes
-    means, footprints = _array(g.means), np.empty(len(g), np.float32)
-    viewmats, Ks = cameras.viewmats.astype(np.float32), cameras.Ks
+    footprints, viewmats, Ks = np.empty(len(means), np.float32), cameras.viewmats.astype(np.float32), cameras.Ks
     focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in Ks])
 
     def measure_footprints(start: int) -> None:
         rows = slice(start, start + ROWS)
-        views = homes[rows] // scene.pixels_per_view
+        views = homes[rows] // (cameras.height * cameras.width)
         depths = np.abs(camera_depths(means[rows], viewmats, views))
         footprints[rows] = np.maximum(depths, np.float32(1e-6)) / focals.astype(np.float32)[views]
 
-    parallel_map(measure_footprints, range(0, len(g), ROWS))
+    parallel_map(measure_footprints, range(0, len(means), ROWS))
     homeless = np.flatnonzero(homes < 0)
     if len(homeless):
         smallest = np.full(len(homeless), np.inf)
         for centre, focal in zip(cameras.centres.astype(np.float64), focals, strict=True):
             np.minimum(smallest, np.linalg.norm(means[homeless] - centre, axis=1) / focal, out=smallest)
         footprints[homeless] = np.maximum(smallest, 1e-6)
-    return _make_members(g, footprints, scene.get_pixels())
+    return footprints
 
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray) -> Members:

@@ -13,9 +13,10 @@ from typing import TypeVar
 import numpy as np
 
 from gsmerge.kernels.elementary import arctan2, cos, sin
+from gsmerge.kernels.gaussians.cross_view import make_tree, nearest_of_others
 from gsmerge.kernels.matrices import closest_rotation, invert, matmul, solve
 from gsmerge.kernels.raster.sh import view_colors
-from gsmerge.runtime.threads import parallel_map
+from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
 from gsmerge.values.arrays import Array
 
@@ -26,6 +27,7 @@ DIRECTIONS = 96  # directions in which harmonics are compared before and after a
 # More values than the first number are narrowed down before the median is taken: to those between two shares of a
 # sample of about the second number, which are so far from a half that the median is practically always between them
 FEW_VALUES, SAMPLE_VALUES, AROUND_MEDIAN = 1 << 17, 1 << 14, (0.47, 0.53)
+NEAREST_ROWS = 1 << 14  # points per task of a search for the nearest ones
 BRIGHT = np.float32(20.0)  # harmonic of degree 0 so large that no colour is clipped at 0
 
 
@@ -225,6 +227,30 @@ def vector_lengths(vectors: np.ndarray) -> np.ndarray:
     """Return the lengths ``[...,1]`` of vectors ``[...,d]``; summing column by column is faster for short rows."""
     columns = np.moveaxis(vectors * vectors, -1, 0)
     return np.asarray(np.sqrt(sum(columns, vectors.dtype.type(0))))[..., None]
+
+
+def find_nearest(points: np.ndarray, count: int, rows: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows and distances ``[m,count]`` of the nearest other points, nearest first, to each of ``rows [m]``.
+
+    There are more than ``count`` finite points ``[n,3]``. ``rows`` None: all.
+    """
+    rows = np.arange(len(points)) if rows is None else rows
+    others = np.ones(len(points), bool)
+    others[rows] = False
+    order = np.concatenate([rows, np.flatnonzero(others)])
+    points, ids = points[order].astype(np.float64), np.empty((len(points), count), np.int64)
+    tree, axes, splits = make_tree(points)
+    views = np.full(len(points), -1)  # -1: each point has a view of its own, so all others may be neighbours
+    distances = np.empty((len(rows), count))
+
+    def measure(start: int) -> None:
+        span = slice(start, min(start + NEAREST_ROWS, len(rows)))
+        nearest_of_others(points, views, tree, axes, splits, span.start, span.stop, len(points), ids)
+        distances[span] = np.sqrt(((points[ids[span]] - points[span, None]) ** 2).sum(2))
+
+    with use_threads():
+        parallel_map(measure, range(0, len(rows), NEAREST_ROWS))
+    return order[ids[: len(rows)]], distances
 
 
 def nearest_views(centres: np.ndarray, view: int) -> np.ndarray:

@@ -13,6 +13,8 @@ from gsmerge.cameras import check_cameras
 from gsmerge.compaction.estimate import estimate, estimate_lines
 from gsmerge.errors import SceneError
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
+from gsmerge.facts.pixels import raise_sizes, with_pixels
+from gsmerge.facts.place_cameras import add_scored_views
 from gsmerge.facts.prepare import views_notes, without_repeats
 from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.facts.support import count_views_in_world
@@ -130,17 +132,16 @@ def _describe_file(ply: GaussianFile) -> dict[str, Any]:
     }
 
 
-def _photo_notes(scene: Scene) -> list[str]:
-    """Return the notes of a run on photos that do not look like their Gaussians."""
+def _prepare_quietly(scene: Scene) -> tuple[Scene, list[str]]:
+    """Return the canonical scene with sizes as a run uses them, and the notes of a run on sizes and photos."""
+    if len(scene.gaussians) == 0:
+        return scene, []
     with record_part(silent=True) as record:
-        if scene.images is not None and len(scene) and len(scene.gaussians):
-            compare_photos(PicturedScene.with_pictures(canonicalise(scene)[0], scene.images, scene.masks))
-    return record.notes
-
-
-def _measure_agreement(scene: Scene) -> Agreement | None:
-    """Measure the share of depth that other views confirm; None without views or Gaussians."""
-    return confirm_depths(canonicalise(scene)[0]) if len(scene) and len(scene.gaussians) else None
+        canonical = canonicalise(scene if len(scene) else add_scored_views(scene))[0]
+        raised = raise_sizes(with_pixels(canonical) if len(scene) else canonical, placed=len(scene) == 0)
+        if raised.images is not None:
+            compare_photos(PicturedScene.with_pictures(raised, raised.images, raised.masks))
+    return raised, record.notes
 
 
 def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] | None:
@@ -194,10 +195,11 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         means = gaussians.means[np.isfinite(gaussians.means).all(1)]
         num_sky_views = len(sky_regions(means, scene.cameras, images))
     distinct = without_repeats(scene)[0]  # each view once, as in a run
-    agreement = _measure_agreement(distinct)
-    doubts = [unlike_captures(scene.gaussians), None if agreement is None else agreement.doubt]
+    canonical, notes = _prepare_quietly(distinct)
+    agreement = confirm_depths(canonical)
+    doubts = [unlike_captures(canonical.gaussians), None if agreement is None else agreement.doubt]
     facts: dict[str, Any] = {
-        "notes": [*load.notes, *views_notes(scene), *_photo_notes(scene), *filter(None, doubts)],
+        "notes": [*load.notes, *views_notes(scene), *notes, *filter(None, doubts)],
         "num_views": len(load.scene),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),

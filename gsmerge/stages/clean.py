@@ -9,9 +9,8 @@ import numpy as np
 from gsmerge.facts.crop import inside_crop
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.facts.support import count_views
-from gsmerge.kernels.gaussians.cross_view import make_tree, nearest_of_others
+from gsmerge.geometry.transforms import find_nearest
 from gsmerge.raster.photos import LEAST_OPACITY
-from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
@@ -19,7 +18,6 @@ from gsmerge.types import Cameras, Gaussians
 BOX_QUANTILES = (1, 99)  # percentiles of the positions along each axis that bound the scene's box
 OUTLIER_BOX = 10.0  # Gaussians are far from the scene if they lie outside of a box this many times as large
 NEIGHBORS = 8  # number of nearest Gaussians; a floater touches none of them
-ROWS = 1 << 14  # Gaussians per task
 TOUCH = 3.0  # two Gaussians touch if their distance is at most this many times the sum of their largest scales
 APART = 3.0  # the nearest Gaussian of a floater is farther away than this many times the median distance
 # A Gaussian hangs across the scene if its second or its largest scale exceeds the first or second share in CURTAIN of
@@ -68,24 +66,8 @@ def _nearest_of(means: np.ndarray, sizes: np.ndarray, rows: np.ndarray, count: i
 
     ``means [n,3]`` and ``sizes [n]`` are those of all rows, of which the ``count`` nearest are near.
     """
-    others = np.ones(len(means), bool)
-    others[rows] = False
-    order = np.concatenate([rows, np.flatnonzero(others)])
-    points, sizes, ids = means[order], sizes[order], np.empty((len(means), count), np.int64)
-    tree, axes, splits = make_tree(points)
-    views = np.full(len(means), -1)  # -1: each point has a view of its own, so all others may be neighbours
-    nearest, touched = np.empty(len(rows)), np.empty(len(rows), bool)
-
-    def measure(start: int) -> None:
-        span = slice(start, min(start + ROWS, len(rows)))
-        nearest_of_others(points, views, tree, axes, splits, span.start, span.stop, len(means), ids)
-        distances = np.sqrt(((points[ids[span]] - points[span, None]) ** 2).sum(2))
-        touched[span] = (distances <= TOUCH * (sizes[span, None] + sizes[ids[span]])).any(1)
-        nearest[span] = distances[:, 0]
-
-    with use_threads():
-        parallel_map(measure, range(0, len(rows), ROWS))
-    return nearest, touched
+    ids, distances = find_nearest(means, count, rows)
+    return distances[:, 0], (distances <= TOUCH * (sizes[rows, None] + sizes[ids])).any(1)
 
 
 def _sorted_scales(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:

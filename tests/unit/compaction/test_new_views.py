@@ -103,7 +103,7 @@ def test_left_out_views_leave_neither_photos_nor_rows(room: Scene) -> None:
     left_out = leave_out(prepared.scene, [1, 3], prepared)
     assert left_out is not None
     assert len(left_out.rest.scene) == 3
-    assert left_out.rest.reference.fit_views == (0, 1, 2)
+    assert left_out.rest.reference.score_views == (0, 1, 2)
     assert len(left_out.rows) == len(prepared.scene.gaussians) * 3 // 5
     assert (left_out.photos.images == prepared.scene.images[[1, 3]]).all()
     assert leave_out(prepared.scene, [], prepared) is None

@@ -92,7 +92,7 @@ def test_cameras_of_repeated_views_and_of_views_that_share_one(small: Scene) -> 
     placed = motions.random_motions(3, 1.0, 0.1) @ prepared.scene.cameras.viewmats
     found = prepared.with_cameras(replace(prepared.scene.cameras, viewmats=placed)).final_cameras()
     np.testing.assert_allclose(prepared.frame.enter_cameras(found).viewmats, placed[[0, 1, 0, 2]], atol=1e-9)
-    some = replace(prepared, reference=replace(prepared.reference, fit_views=(0, 2), score_views=(0, 2)))
+    some = replace(prepared, reference=replace(prepared.reference, score_views=(0, 2)))
     assert make_plan(some, options).scored_views == (0, 2, 3)
 
 

@@ -1,4 +1,4 @@
-"""Homes and fronts of Gaussians in any order, and of such that are wider apart than pixels."""
+"""Homes and fronts of Gaussians in any order, and of such that are wider apart than pixels; least sizes."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import pytest
 import scenes
 import unaligned_scenes
 
-from gsmerge import Scene
-from gsmerge.facts.pixels import choose_level, find_pixels
+from gsmerge import Gaussians, Scene, compact
+from gsmerge.facts.pixels import HIDDEN, LOW_PASS, choose_level, find_pixels, raise_sizes, with_pixels
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels import elementary
+from gsmerge.runtime.record import record_run
 
 WIDTH, HEIGHT = 96, 72
 
@@ -87,3 +88,71 @@ def test_nothing_is_in_front_of_views_that_look_away(room: Scene) -> None:
     away = replace(room, cameras=replace(room.cameras, viewmats=viewmats), pixels=None)
     shown = find_pixels(away).shown
     assert shown.any((1, 2)).tolist() == [True, False, True]
+
+
+def resized(gaussians: Gaussians, factor: float, every: int = 1) -> Gaussians:
+    scales = gaussians.scales.copy()
+    scales[::every] *= factor
+    return replace(gaussians, scales=scales)
+
+
+def least_scales(scene: Scene) -> np.ndarray:
+    """Scales of Gaussians that the low-pass of their pixel hides are the low-pass; of others, what they were."""
+    scales, homes = scene.gaussians.scales.copy(), scene.pixels.homes.tolist()
+    for row, home in enumerate(homes):
+        view = home // scene.pixels_per_view
+        depth = camera_depths(scene.gaussians.means[row].astype(float), scene.cameras.viewmats[view])
+        pixel = depth / np.sqrt(scene.cameras.Ks[view, 0, 0] * scene.cameras.Ks[view, 1, 1])
+        if scales[row].max() * np.sqrt(homes.count(home)) < HIDDEN * LOW_PASS * pixel:
+            scales[row] = LOW_PASS * pixel
+    return scales
+
+
+@pytest.mark.parametrize(
+    ("factor", "every", "noted"), [(1, 1, False), (1 / 30, 1, True), (1e-6, 3, True), (0.03, 15, False)]
+)
+@pytest.mark.parametrize("own", [True, False])
+def test_hidden_gaussians_get_the_size_of_the_low_pass(factor: float, every: int, noted: bool, own: bool) -> None:
+    """Unless they are few."""
+    room = scenes.make_scene(scenes.room(), scenes.arc(2, 32, 24))
+    room = canonicalise(replace(room, gaussians=resized(room.gaussians, factor, every)))[0]
+    scene = with_pixels(room if own else unaligned_scenes.shuffled(room))
+    seen = scene.pixels.homes >= 0
+    with record_run() as record:
+        raised = raise_sizes(scene)
+    assert len(record.notes) == noted
+    assert (raised is scene) == (not noted)
+    if noted:
+        np.testing.assert_allclose(raised.gaussians.scales[seen], least_scales(scene)[seen], rtol=1e-5)
+        assert (raised.gaussians.scales > scene.gaussians.scales)[seen].any(1).mean() > 0.2
+
+
+def test_views_of_few_pixels_change_no_sound_scene(room: Scene) -> None:
+    cameras = room.cameras
+    Ks = cameras.Ks / np.array([[8], [8], [1]], cameras.Ks.dtype)
+    small = replace(cameras, Ks=Ks, width=WIDTH // 8, height=HEIGHT // 8)
+    scene = with_pixels(Scene(room.gaussians, small, None, None, room.names))
+    assert raise_sizes(scene) is scene
+    assert raise_sizes(replace(scene, gaussians=resized(scene.gaussians, 0.01))) is not scene
+
+
+@pytest.mark.parametrize("factor", [1 / 30, 1e-5])
+@pytest.mark.parametrize("kind", ["grid", "shuffled", "no cameras"])
+def test_tiny_gaussians_are_merged_as_they_look(kind: str, factor: float) -> None:
+    """The input is drawn well by the low-pass alone, and the result is about as good as that of sound Gaussians."""
+    sound = scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36), noise=0.03)
+    if kind != "grid":
+        cameras = {"cameras": unaligned_scenes.NO_CAMERAS, "images": None, "names": ()} if kind == "no cameras" else {}
+        sound = replace(unaligned_scenes.shuffled(sound), **cameras)
+    scene = replace(sound, gaussians=resized(sound.gaussians, factor))
+    settings = {"budget": 600, "fit_steps": 60, "checkpoint": "none"} | (
+        {"fit": "none"} if kind == "no cameras" else {}
+    )
+    reports = [compact(some, **settings).report for some in (sound, scene)]
+    assert [report.num_output for report in reports] == [600, 600]
+    if kind == "no cameras":
+        psnrs = [report.choices["fidelity"]["psnr"] for report in reports]
+    else:
+        psnrs = [report.psnr_after for report in reports]
+        assert psnrs[1] > reports[1].psnr_before
+    assert psnrs[1] > psnrs[0] - 1, psnrs
