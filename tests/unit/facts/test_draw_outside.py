@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +16,11 @@ from gsmerge.facts.draw_outside import draw_outside
 from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.prepare import prepare
 from gsmerge.geometry.frame import canonicalise
+from gsmerge.photos.views import subset
 from gsmerge.types import SH_C0, LargePhotos, PicturedScene
 
 VIEWS = 3
-MAPS = ("images", "masks", "importance", "empty")
+DOUBLE = np.array([[2.0], [2.0], [1.0]])  # intrinsics of photos of twice the size
 
 
 @pytest.fixture(scope="module")
@@ -35,16 +35,18 @@ def seen_from(room: Scene, views: Sequence[int]) -> Scene:
     return replace(whole, cameras=room.cameras[views], images=room.images[views], names=names)
 
 
-def pictured(scene: Scene, **maps: Any) -> PicturedScene:
+def pictured(scene: Scene) -> PicturedScene:
     """The canonical scene with its pixels and pictures."""
-    canonical = with_pixels(canonicalise(scene)[0])
-    return replace(PicturedScene.with_pictures(canonical, scene.images, None), **maps)
+    return PicturedScene.with_pictures(with_pixels(canonicalise(scene)[0]), scene.images, None)
 
 
 @pytest.fixture(scope="module")
 def part(room: Scene) -> PicturedScene:
-    """As two of three views see it."""
-    return pictured(seen_from(room, [0, 1]))
+    """As two of three views see it, with all that may belong to a photo."""
+    scene, rng = pictured(seen_from(room, [0, 1])), np.random.default_rng(0)
+    masks, empty, importance = rng.random((3, *scene.images.shape[:3]), np.float32)
+    large = LargePhotos(scene.cameras.Ks * DOUBLE, 64, 48, (7, 4), lambda photo: np.full((48, 64, 3), photo, np.uint8))
+    return replace(scene, masks=masks < 0.5, empty=empty < 0.5, importance=1 + importance, large_photos=large)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +56,6 @@ def drawn(part: PicturedScene) -> PicturedScene:
 
 def test_drawings_count_where_they_show_mainly_what_no_view_sees(part: PicturedScene, drawn: PicturedScene) -> None:
     placed = drawn.cameras[range(len(part), len(drawn))]
-    assert len(placed) > 0
     np.testing.assert_array_equal(drawn.images[len(part) :], render(part.gaussians, placed).images.clip(0, 1))
     unseen = part.pixels.homes < 0
     whites = np.where(unseen, 0.5, -0.5)[:, None, None] / SH_C0  # all others are black
@@ -66,53 +67,33 @@ def test_drawings_count_where_they_show_mainly_what_no_view_sees(part: PicturedS
     assert drawn.pixels.homes[unseen].max() >= len(part) * part.pixels_per_view  # and so they are members
 
 
-@pytest.mark.parametrize("with_maps", [False, True])
-def test_own_views_stay_as_they_are(part: PicturedScene, drawn: PicturedScene, with_maps: bool) -> None:
-    before, after = part, drawn
-    if with_maps:
-        rng, shape = np.random.default_rng(0), part.images.shape[:3]
-        masks, empty = rng.random((2, *shape)) < 0.5
-        before = replace(part, masks=masks, empty=empty, importance=1 + rng.random(shape, np.float32))
-        after = draw_outside(before)
-    for name in MAPS:
-        values, expected = getattr(after, name), getattr(before, name)
-        if name == "masks" and expected is None:
-            assert values[: len(part)].all()
-        elif expected is None:
-            assert values is None
-        else:
-            np.testing.assert_array_equal(values[: len(part)], expected)
-            assert len(values) == len(after)
-    if with_maps:
-        assert (after.importance[len(part) :] == 1).all()
-        assert not after.empty[len(part) :].any()
-    assert after.names[: len(part)] == part.names
-    assert len({*after.names}) == len(after)
-    np.testing.assert_array_equal(after.cameras.viewmats[: len(part)], part.cameras.viewmats)
-    assert after.gaussians is before.gaussians
+def test_own_views_stay_as_they_are(part: PicturedScene, drawn: PicturedScene) -> None:
+    assert len({*drawn.names}) == len(drawn) > len(part)
+    assert drawn.gaussians is part.gaussians
+    own = subset(drawn, range(len(part)))
+    for name in ("images", "masks", "importance", "empty", "names"):
+        np.testing.assert_array_equal(getattr(own, name), getattr(part, name))
+    np.testing.assert_array_equal(own.cameras.viewmats, part.cameras.viewmats)
+    assert (drawn.importance[len(part) :] == 1).all()
+    assert not drawn.empty[len(part) :].any()
+    assert draw_outside(replace(part, masks=None)).masks[: len(part)].all()
 
 
-def test_larger_photos_get_larger_drawings(part: PicturedScene) -> None:
+def test_larger_photos_get_larger_drawings(part: PicturedScene, drawn: PicturedScene) -> None:
     """Those of the views are read as before, by their own numbers."""
-    double = np.array([[2.0], [2.0], [1.0]])
-    large = LargePhotos(part.cameras.Ks * double, 64, 48, (7, 4), lambda number: np.full((48, 64, 3), number, np.uint8))
-    after = draw_outside(replace(part, large_photos=large))
-    photos = after.large_photos
-    assert len(photos.ids) == len({*photos.ids}) == len(after)
-    assert [photos.read(number)[0, 0, 0] for number in photos.ids[:2]] == [7, 4]
-    np.testing.assert_allclose(photos.Ks, after.cameras.Ks * double)
-    for view in range(len(part), len(after)):
-        picture = photos.read(photos.ids[view])
-        assert picture.shape == (48, 64, 3)
-        camera = replace(after.cameras[[view]], Ks=photos.Ks[[view]], width=64, height=48)
-        np.testing.assert_allclose(picture / 255, render(part.gaussians, camera).images[0].clip(0, 1), atol=0.5 / 254)
+    photos = drawn.large_photos
+    assert [photos.read(number)[0, 0, 0] for number in photos.ids[: len(part)]] == [7, 4]
+    np.testing.assert_allclose(photos.Ks, drawn.cameras.Ks * DOUBLE)
+    pictures = np.stack([photos.read(number) for number in photos.ids[len(part) :]])
+    placed = replace(drawn.cameras, Ks=photos.Ks, width=64, height=48)[range(len(part), len(drawn))]
+    np.testing.assert_allclose(pictures / 255, render(part.gaussians, placed).images.clip(0, 1), atol=0.5 / 254)
 
 
 @pytest.mark.parametrize("far", [0, VIEWS * 32 * 24], ids=["views see all", "views see nothing"])
 def test_other_scenes_stay_as_they_are(room: Scene, far: int) -> None:
     scene = pictured(seen_from(room, range(VIEWS)))
-    hidden = unaligned_scenes.far_behind(scene.gaussians, far) if far else scene.gaussians
-    scene = with_pixels(replace(scene, gaussians=hidden, pixels=None))
+    if far:
+        scene = with_pixels(replace(scene, gaussians=unaligned_scenes.far_behind(scene.gaussians, far), pixels=None))
     assert draw_outside(scene) is scene
 
 
