@@ -15,7 +15,7 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.facts.confirm_depths import FEWEST, Agreement
-from gsmerge.facts.counts import CountLimits, FileSize, count_limits, exact_count, file_size, has_few_rows, max_allowed
+from gsmerge.facts.counts import CountLimits, FileSize, count_limits, file_size, has_few_rows, max_allowed
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import photo_scale, start_share
@@ -35,7 +35,7 @@ from gsmerge.settings.stages import (
     SegmentOptions,
 )
 from gsmerge.stages.segment import SharedTree, SuperpixelChoices
-from gsmerge.types import Gaussians, Scene
+from gsmerge.types import Scene
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
@@ -94,7 +94,6 @@ class Plan:
     fit: FitOptions  # Fit to the photos
     merges_pairs: bool  # Merge neighbours pair by pair instead of superpixels
     clean: CleanOptions  # What is left out of the result
-    unseen: Gaussians  # Merged canonical Gaussians that no view sees
     target_psnr: float | None  # PSNR (dB) that the result has to reach; None: no target, or not known yet
     keeps_fidelity: bool  # See :func:`keeps_fidelity`
     max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
@@ -108,7 +107,7 @@ class Plan:
     settings: dict[str, Any]  # All settings by flat name, for reports
     free_poses: bool = False  # The options ask for moved cameras, even where the scene does not need it
     new_views: bool = False  # Estimate the quality of new views
-    is_trial: bool = False  # Only a score of the fit counts, in which neither unseen Gaussians nor filled gaps show
+    is_trial: bool = False  # Only a score of the fit counts, in which filled gaps do not show
     before: PhotoScore | None = None  # Score of the input, if photos and not pixels decide the count
     # [h,w] bool for each scored view, if renders of the input stand for photos: the pixels that the input covers; None:
     # nearly all
@@ -186,14 +185,12 @@ def fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
     return FilledOptions(options, replace(filled, decode=decode), segment, clean)
 
 
-def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | None, unseen: Gaussians) -> Plan:
-    """Make all decisions about a run; ``unseen`` are the merged Gaussians that no view sees."""
+def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | None) -> Plan:
+    """Make all decisions about a run."""
     size, asked, options, segment = prepared.size, filled.asked, filled.options, filled.segment
     keeps = keeps_fidelity(size, asked)
     target = FIDELITY_PSNR if keeps and size.rendered else asked.budget.target_psnr
-    choices = choose_for_scene(
-        size, filled.counted, num_input=count_input(prepared), num_reserved=len(unseen), keeps=keeps
-    )
+    choices = choose_for_scene(size, filled.counted, num_input=count_input(prepared), keeps=keeps)
     limits, pairs = choices.limits, checkpoint is None and choices.may_merge_pairs
     fit = _fit_photos(prepared, options, choices.fit)
     fit = _fit_renders(prepared, options, fit) if pairs else fit
@@ -210,7 +207,6 @@ def decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | N
         fit=fit,
         merges_pairs=pairs,
         clean=filled.clean,
-        unseen=unseen,
         target_psnr=target,
         keeps_fidelity=keeps,
         max_drop=budget.max_drop,
@@ -235,20 +231,7 @@ def cuts_views(options: CompactOptions, size: SceneSize) -> bool:
 
 def count_input(prepared: Prepared) -> int | None:
     """Return the number of Gaussians that shares of a budget refer to; None: that of the prepared scene."""
-    if len(prepared.unseen):
-        return prepared.size.num_gaussians + len(prepared.unseen)
     return prepared.input_scene.num_gaussians if len(prepared.scene) < len(prepared.input_scene) else None
-
-
-def count_unseen(prepared: Prepared, filled: FilledOptions) -> int:
-    """Return the number of Gaussians that no view sees in the result; their share is the same as in the input."""
-    options, num_unseen = filled.options, len(prepared.unseen)
-    if num_unseen == 0:
-        return 0
-    num_input = prepared.size.num_gaussians + num_unseen
-    exact = exact_count(options.budget, num_input, prepared.unseen.sh_degree)
-    rate = filled.segment.share * options.decode.mean_k if exact is None else exact / num_input
-    return int(rate * num_unseen)
 
 
 @dataclass(frozen=True)
@@ -270,17 +253,12 @@ class SceneChoices:
 
 
 def choose_for_scene(
-    scene: SceneSize,
-    options: CompactOptions,
-    *,
-    num_input: int | None = None,
-    num_reserved: int = 0,
-    keeps: bool | None = None,
+    scene: SceneSize, options: CompactOptions, *, num_input: int | None = None, keeps: bool | None = None
 ) -> SceneChoices:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
-    ``num_input``, ``num_reserved``: see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: the result of
-    :func:`keeps_fidelity` for the options as they were given; None: for these options.
+    ``num_input``: see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: the result of :func:`keeps_fidelity` for
+    the options as they were given; None: for these options.
     """
     keeps = keeps_fidelity(scene, options) if keeps is None else keeps
     if scene.num_views == 0 and (keeps or resolve_fit(options).steps <= SHORT_STEPS) and options.effort != "best":
@@ -289,7 +267,7 @@ def choose_for_scene(
     segment, decode = options.segment, resolve_decode(options, scene)
     if segment.superpixels == AUTO:  # only computation on the scene could decide it
         segment = replace(segment, superpixels=SHARE)
-    limits = count_limits(scene, segment, decode, options.budget, num_input=num_input, num_reserved=num_reserved)
+    limits = count_limits(scene, segment, decode, options.budget, num_input=num_input)
     fit = resolve_fit(options)
     share = limits.share if fit.share is None and scene.num_views else fit.share
     steps = steps_for(options, scene.num_views, USUAL_SHARE if share is None else share)

@@ -21,7 +21,7 @@ class Candidate:
 
     count: int | None  # Gaussians that were asked for; None: as many as `superpixels` and K give
     fitted: Fitted  # Fitted canonical Gaussians
-    gaussians: Gaussians  # The same in the world, and the Gaussians that no view sees
+    gaussians: Gaussians  # The same in the world
     cameras: Cameras  # The given views in the world; their poses are those of the fit
     psnr: float | None  # Mean PSNR (dB) of the scored views, against photos or renders of the input; None without views
     record: Record  # Seconds, choices and notes of building and scoring it
@@ -30,11 +30,9 @@ class Candidate:
 
 
 def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
-    """Move canonical Gaussians into the world, add the Gaussians that no view sees, and measure the PSNR."""
-    gaussians, moved = fitted.gaussians, with_moved_views(prepared, fitted.cameras)
-    if len(plan.unseen):
-        gaussians = Gaussians.concat([gaussians, plan.unseen])
-    gaussians, cameras = moved.frame.leave(gaussians), moved.input_scene.cameras
+    """Move canonical Gaussians into the world, and measure the PSNR."""
+    moved = with_moved_views(prepared, fitted.cameras)
+    gaussians, cameras = moved.frame.leave(fitted.gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
         _note_moves(prepared, cameras, plan)
     psnr, deciding_psnr = _measure_candidate(gaussians, moved, plan)

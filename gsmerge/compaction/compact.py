@@ -139,7 +139,7 @@ def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
         if len(blocks) > 1:
             return compact_in_blocks(scene, options, choices, blocks, covisibility)
     method = choose_method(options, scene)  # ours, ours for scenes without cameras, or a baseline
-    prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
+    prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses
     return compact_prepared(prepared, method, options).to(scene.gaussians.device)
 
 

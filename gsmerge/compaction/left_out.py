@@ -69,7 +69,7 @@ def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) ->
     every = tuple(range(len(rest)))
     prepared_rest = replace(
         prepared, input_scene=rest, scene=rest, reference=Reference(PHOTOS, every), repeated=every, moved=False,
-        unseen=rest.gaussians[:0], agreement=None,
+        agreement=None,
     )  # fmt: skip
     left_out_views = subset(scene, views)
     left_out = LeftOut(prepared_rest, scene_photos(left_out_views), cover(rest, left_out_views))

@@ -96,18 +96,16 @@ def count_limits(
     budget: BudgetOptions,
     *,
     num_input: int | None = None,
-    num_reserved: int = 0,
 ) -> CountLimits:
     """Compute the limits on the number of Gaussians.
 
-    ``num_input``: the number of Gaussians that shares of a budget refer to; None: that of the scene. ``num_reserved``:
-    the number of Gaussians of the result that exist already, such as those that no view sees. Raises UsageError if more
-    superpixels are requested than there are pixels, or fewer Gaussians than views.
+    ``num_input``: the number of Gaussians that shares of a budget refer to; None: that of the scene. Raises UsageError
+    if more superpixels are requested than there are pixels, or fewer Gaussians than views.
     """
     count, views = scene.num_gaussians, scene.num_views
     exact = exact_count(budget, count if num_input is None else num_input, scene.sh_degree)
     if exact is not None:
-        exact = min(max(1, exact - num_reserved), count)
+        exact = min(exact, count)
     max_count = min(max_allowed(budget, count, scene.sh_degree), count if exact is None else exact)
     if max_count < min(views, count):
         remedy = f'; for {max_count} % pass "{max_count}%"' if max_count <= 100 else ""

@@ -28,11 +28,10 @@ from gsmerge.geometry.frame import Frame, canonicalise, sample_rows
 from gsmerge.photos.compare import compare_photos
 from gsmerge.photos.exposure import equalise_exposure
 from gsmerge.photos.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
-from gsmerge.photos.views import distinct_views, subset, take_rows
-from gsmerge.raster.images import seen_weights
+from gsmerge.photos.views import distinct_views, subset
 from gsmerge.runtime.record import choose, note, record_part, stage
 from gsmerge.settings.stages import Look, PrepareOptions
-from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
+from gsmerge.types import Cameras, PicturedScene, Scene
 
 FLAT = 2 / 255  # a picture shows one flat colour if the range of its values is smaller
 
@@ -58,14 +57,12 @@ class Prepared:
     """A scene in its canonical frame, as the stages use it, with facts about it."""
 
     input_scene: Scene  # The scene as it was read, in its own world frame, with photos that look like its Gaussians
-    # The canonical scene with pixels. It has every view once, and photos that do not show the scene are replaced. It
-    # has all Gaussians except `unseen`
+    # The canonical scene with pixels. It has every view once, and photos that do not show the scene are replaced
     scene: PicturedScene
     frame: Frame  # The canonical frame
     reference: Reference  # Use of the pictures
     repeated: tuple[int, ...]  # Index in the canonical scene of every view of the input scene
     moved: bool  # Views were moved to poses at which their photos agree, before a fit or by it
-    unseen: Gaussians  # Canonical Gaussians that no view sees, if the options keep them
     agreement: Agreement | None = None  # Shares of depth that views confirm; None if views cannot be compared
 
     @property
@@ -196,9 +193,7 @@ def _with_references(
     own = canonical.has_own_pixels
     stand_in = partial(add_row_colors, has_photos=canonical.images is not None) if own else blank_pictures
     scene, views = _with_pictures(canonical, stand_in, options.look)
-    every, unseen = tuple(range(len(scene))), scene.gaussians[:0]
-    if options.unseen == "keep" and not own:
-        scene, unseen = _split_unseen(scene)
+    every = tuple(range(len(scene)))
     if views:
         reference = Reference(PHOTOS, views)
     elif own:
@@ -210,13 +205,13 @@ def _with_references(
         note(f"{reason}: renders of the scene itself are used instead{remedy}")
         scene = draw_pictures(scene)
         shown = tuple(view for view in every if scene.images[view].any())  # any result equals an empty view
-        return Prepared(input_scene, scene, frame, Reference(RENDERS, shown or every), repeated, False, unseen)
+        return Prepared(input_scene, scene, frame, Reference(RENDERS, shown or every), repeated, False)
     input_scene, moved = _with_photos(input_scene, scene, repeated), None
     if own:  # each view's Gaussians have the exposure and the pose of the view
         scene = equalise_exposure(scene, reference.score_views, options.exposure)
         fixed, always = options.poses == "fixed", options.poses == "free"
         moved = None if fixed else move_poses(scene, reference.score_views, always=always)
-    return Prepared(input_scene, moved or scene, frame, reference, repeated, moved is not None, unseen)
+    return Prepared(input_scene, moved or scene, frame, reference, repeated, moved is not None)
 
 
 def _with_pictures(
@@ -283,8 +278,7 @@ def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
     note(NO_VIEWS)
     scored, frame = canonicalise(add_scored_views(finite))
     reference = Reference(RENDERS, tuple(range(len(scored))), placed=True)
-    pictured, unseen = draw_pictures(raise_sizes(scored, placed=True)), finite.gaussians[:0]
-    return Prepared(scene, pictured, frame, reference, (), moved=False, unseen=unseen)
+    return Prepared(scene, draw_pictures(raise_sizes(scored, placed=True)), frame, reference, (), moved=False)
 
 
 def _with_photos(input_scene: Scene, canonical: PicturedScene, repeated: Sequence[int]) -> Scene:
@@ -294,13 +288,3 @@ def _with_photos(input_scene: Scene, canonical: PicturedScene, repeated: Sequenc
     masks = None if canonical.masks is None else canonical.masks[list(repeated)]
     large = None if canonical.large_photos is None else input_scene.large_photos
     return replace(input_scene, images=canonical.images[list(repeated)], masks=masks, large_photos=large)
-
-
-def _split_unseen(scene: PicturedScene) -> tuple[PicturedScene, Gaussians]:
-    """Split off the Gaussians that no view sees; if views see none or all of them, all stay in the scene."""
-    seen = seen_weights(scene) > 0
-    num_unseen = int((~seen).sum())
-    note(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
-    if num_unseen in (0, len(seen)):
-        return scene, scene.gaussians[:0]
-    return with_pixels(take_rows(scene, np.flatnonzero(seen))), scene.gaussians[~seen]

@@ -5,21 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from threading import Lock
 from typing import Any
 
 import numpy as np
 
 from gsmerge.kernels.raster.project import TILE
-from gsmerge.raster.composite import (
-    Rendering,
-    background_color,
-    blend,
-    contributions,
-    draw_views,
-    prepare_views,
-    view_colors,
-)
+from gsmerge.raster.composite import Rendering, background_color, blend, draw_views, prepare_views, view_colors
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.tiled_view import FAR_PLANE, TiledView, make_splats, tile_view
 from gsmerge.runtime.threads import parallel_map
@@ -139,19 +130,6 @@ def _tiler(
         return tile_view(splats, *camera, band=band, columns=None if spans is None else spans[view], **options)
 
     return tile_one
-
-
-def seen_weights(scene: Scene) -> np.ndarray:
-    """Sum each Gaussian's blending weights in every view, and return the largest sum ``[n]`` float32, pixels."""
-    largest, lock = np.zeros(len(scene.gaussians), np.float32), Lock()
-
-    def raise_largest(_: int, tiled: TiledView) -> None:
-        sums, _peaks = contributions(tiled)
-        with lock:
-            np.maximum(largest, sums, out=largest)
-
-    tile_views(scene, raise_largest)
-    return largest
 
 
 def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Sequence[int] | None = None) -> None:

@@ -12,7 +12,6 @@ from gsmerge.settings.setting import Settings, setting, suggest_name
 
 Poses = Literal["auto", "fixed", "free"]
 Exposure = Literal["auto", "fixed", "per-photo"]
-Unseen = Literal["drop", "keep"]
 Look = Literal["auto", "scene", "photos"]
 Extent = Literal["auto", "photos", "beyond"]
 MatchMethod = Literal["overlap", "aabb", "none"]
@@ -31,7 +30,7 @@ DROPS = ("floaters", "sky", "transparent", "unseen")
 
 @dataclass(frozen=True)
 class PrepareOptions(Settings):
-    """Settings of the preparation: poses, exposure, unseen Gaussians, colours and extent."""
+    """Settings of the preparation: poses, exposure, colours and extent."""
 
     poses: Poses = setting("auto", "Move cameras to where their photos agree. auto: only if their poses are wrong; "
         "fixed: never; free: always.",
@@ -40,9 +39,6 @@ class PrepareOptions(Settings):
     exposure: Exposure = setting("auto", "Bring the exposure and white balance of all photos to their mean. "
         "auto: if they differ at random; fixed: never; per-photo: always.",
         "The Gaussians of their pixels change with them.")  # fmt: skip
-    unseen: Unseen = setting("drop", "Gaussians that belong to no pixel and that no view sees: drop them, or keep "
-        "them.",
-        "`keep` merges them with their neighbours, at the same rate as the other Gaussians.")  # fmt: skip
     look: Look = setting("auto", "Source of the colours. photos: the photos; scene: the scene itself; auto: the "
         "photos, unless the scene was given another look, such as a style.")  # fmt: skip
     extent: Extent = setting("auto", "Places that may get Gaussians although the scene has none there. auto: small "

@@ -8,17 +8,13 @@ from threading import Lock
 import numpy as np
 
 from gsmerge.errors import UsageError
-from gsmerge.geometry.pooling import Members, pool_members, scene_members
-from gsmerge.geometry.transforms import morton_codes
+from gsmerge.geometry.pooling import Members, scene_members
 from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.raster import TiledView
 from gsmerge.raster.images import tile_views
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.stages import DecodeOptions
-from gsmerge.stages.decode import decode
-from gsmerge.stages.encode import from_moments
-from gsmerge.types import Gaussians, Groups, Pixels, Scene
+from gsmerge.types import Groups, Scene
 
 
 @stage("members")
@@ -38,17 +34,6 @@ def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Me
             " Gaussians: give the cameras that belong to it"
         )
     return members
-
-
-def merge_unseen(gaussians: Gaussians, scene: Scene, count: int) -> Gaussians:
-    """Merge n Gaussians that no view sees into ``count`` Gaussians, by runs along Morton's curve."""
-    order = np.argsort(morton_codes(gaussians.means.astype(np.float64)), kind="stable")
-    fronts = np.full((len(scene), scene.cameras.height, scene.cameras.width), -1, np.int32)
-    nowhere = Pixels(np.full(len(gaussians), -1), fronts, own=False)
-    members = scene_members(Scene(gaussians, scene.cameras, None, nowhere, scene.names))
-    starts = np.linspace(0, len(order), count + 1).astype(np.int64)
-    features = from_moments(pool_members(members, starts, order), starts, order, np.full(count, -1))
-    return decode(features, members, DecodeOptions(min_opacity=0.0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.geometry.frame import Frame
 from gsmerge.geometry.pooling import Members, feature_to_gaussians, gaussian_members
+from gsmerge.io.formats.gsm import NUM_HIGHER
 from gsmerge.kernels.gaussians.cluster import connected_components
 from gsmerge.networks.apply import NetworkContext, decode_gaussians
 from gsmerge.networks.checkpoint import Checkpoint
@@ -68,7 +69,6 @@ class FeatureState:
     group: np.ndarray  # [g,n] float32, the networks' inputs about each group
     samples: ViewSamples  # of all views
     cameras: Cameras  # of all views, canonical, at the size of the first batch's views
-    unseen: Gaussians  # canonical Gaussians that no view sees
     frame: Frame  # from canonical to world
     networks: NetworkWeights
     checkpoint: str = ""  # name of the networks, as the user gave it
@@ -147,12 +147,11 @@ def extend_features(
         if state is None:
             merged = merge(features, match(features, plan.match), context)
             saliency = group_saliency(merged, members, corners)
-            extended = _refine(merged, context, saliency, samples, prepared.frame, plan.unseen)
+            extended = _refine(merged, context, saliency, samples, prepared.frame)
         else:
             _check_degree(state, scene)
             saliency = group_saliency(features, members, corners)
             extended = _join(state, features, saliency, context, samples, plan.match)
-            extended = replace(extended, unseen=Gaussians.concat([state.unseen, plan.unseen]))
     numbers = {"num_views": len(prepared_scene), "num_input": scene.num_gaussians, "num_new": len(features)}
     notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == NOT_KNOWN else [])]
     report = BatchReport(
@@ -179,7 +178,7 @@ def _check_options(options: CompactOptions) -> None:
 
 def _check_degree(state: FeatureState, scene: Scene) -> None:
     """Raise UsageError if the harmonics of a scene and of a state have different degrees."""
-    degree, expected = scene.gaussians.sh_degree, state.unseen.sh_degree
+    degree, expected = scene.gaussians.sh_degree, NUM_HIGHER.index(state.merged.shN.shape[1])
     if degree != expected:
         raise UsageError(f"expected harmonics of degree {expected}, as in the state, got {degree}")
 
@@ -231,8 +230,7 @@ def sample_views(members: Members, cameras: Cameras, state: FeatureState | None)
 
 
 def _refine(
-    merged: FeatureGaussians, context: NetworkContext, saliency: np.ndarray, samples: ViewSamples, frame: Frame,
-    unseen: Gaussians,
+    merged: FeatureGaussians, context: NetworkContext, saliency: np.ndarray, samples: ViewSamples, frame: Frame
 ) -> FeatureState:  # fmt: skip
     """Refine merged Feature Gaussians, and describe the groups for the heads."""
     refined = context.refine(merged)
@@ -248,7 +246,6 @@ def _refine(
         group=np.asarray(described.group),
         samples=samples,
         cameras=context.cameras,
-        unseen=unseen,
         frame=frame,
         networks=cast("NetworkWeights", context.networks),
     )
@@ -275,7 +272,7 @@ def _join(
     merged = merge(parts, _match_parts(parts, len(state), options), join_context)
     part_saliency = np.concatenate([state.saliency, saliency])
     merged_saliency = _mean_of_parts(merged, part_saliency, num_members.astype(np.float64))
-    return _refine(merged, join_context, merged_saliency, samples, state.frame, state.unseen)
+    return _refine(merged, join_context, merged_saliency, samples, state.frame)
 
 
 def _mean_of_parts(merged: FeatureGaussians, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -330,4 +327,4 @@ def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
     context = NetworkContext(state.networks, no_members, state.cameras)
     gaussians = decode_gaussians(children, parents, described, context)
     gaussians = gaussians[gaussians.opacities >= options.min_opacity]
-    return state.frame.leave(Gaussians.concat([gaussians, state.unseen]))
+    return state.frame.leave(gaussians)

@@ -62,7 +62,6 @@ def save_state(path: StrPath, state: State, *, overwrite: bool = False) -> None:
     arrays |= {f"refined.{name}": getattr(features.refined, name) for name in CORRECTED}
     arrays |= {name: getattr(features, name) for name in ("views", "num_members", "saliency", "group")}
     arrays |= {f"samples.{name}": column for name, column in vars(features.samples).items()}
-    arrays |= {f"unseen.{name}": np.asarray(column) for name, column in vars(features.unseen).items()}
     arrays |= {f"networks.{name}": array for name, array in features.networks.arrays.items()}
     cameras, frame = features.cameras, features.frame
     arrays |= {"viewmats": cameras.viewmats, "Ks": cameras.Ks, "merged.views": features.merged.views}
@@ -124,7 +123,6 @@ def _read_features(file: GsmFile) -> FeatureState:
         merged=merged,
         refined=replace(merged, **corrected),
         samples=_read_samples(file, num_views),
-        unseen=_read_unseen(file, num_higher),
         views=_whole_numbers(file, "views", g, 0, num_views),
         num_members=_whole_numbers(file, "num_members", g, 1, _MAX_MEMBERS + 1),
         saliency=file.finite("saliency", np.float64, g),
@@ -163,13 +161,6 @@ def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
     shapes = {"means": (3,), "opacities": (), "sh0": (3,)}
     grid = num_views, height, width
     return ViewSamples(*(_numbers(file, f"samples.{name}", *grid, *shape) for name, shape in shapes.items()))
-
-
-def _read_unseen(file: GsmFile, num_higher: int) -> Gaussians:
-    """Read the Gaussians that no view sees."""
-    n = len(file.array("unseen.means", np.float32, None, 3))
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (num_higher, 3)}
-    return Gaussians(*(_numbers(file, f"unseen.{name}", n, *shape) for name, shape in shapes.items()))
 
 
 def _numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:

@@ -19,7 +19,7 @@ from .case import Change, Damage, refuse
 from .changes import edit_bytes, fill_with_zeros, pack_at, pack_members, write_file
 
 RESULTS = ("means", "quats", "scales", "opacities", "sh0", "shN", "viewmats", "Ks")
-FEATURES = ("merged.means", "refined.latents", "views", "group", "samples.means", "unseen.means", "saliency", "origin")
+FEATURES = ("merged.means", "refined.latents", "views", "group", "samples.means", "saliency", "origin")
 WEIGHT = "encoder.latent.weight"
 
 

@@ -46,5 +46,5 @@ def test_of_many_gaussians_one_view_at_a_time(scene: Scene, monkeypatch: pytest.
     for many in (0, 10**9):
         monkeypatch.setattr("gsmerge.raster.images.ONE_AT_A_TIME", many)
         unaligned = unaligned_scenes.without_order(scene)
-        actual.append(compact(unaligned, fit="none", superpixels="10%", unseen="keep").gaussians)
+        actual.append(compact(unaligned, fit="none", superpixels="10%").gaussians)
     assert scenes.identical(actual[0], actual[1])

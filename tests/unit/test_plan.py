@@ -171,17 +171,6 @@ def test_a_budget_counts_repeated_views(scene: Scene) -> None:
     assert plan_of(twice, budget="2%").limits.exact == round(0.02 * len(twice.gaussians))
 
 
-def test_what_no_view_sees_takes_its_share_of_a_budget(scene: Scene) -> None:
-    unaligned = unaligned_scenes.without_order(scene)
-    means = unaligned.gaussians.means.copy()
-    means[::4] *= -1  # behind the cameras
-    hidden = replace(unaligned, gaussians=replace(unaligned.gaussians, means=means))
-    plan = plan_of(hidden, unseen="keep", budget=400)
-    assert 0 < len(plan.unseen) < 400
-    assert (plan.limits.exact or 0) + len(plan.unseen) == 400
-    assert len(plan_of(hidden, budget=400).unseen) == 0
-
-
 @pytest.mark.parametrize(("settings", "reason"), [({"quality": "-1dB"}, "35dB"), ({"drop": "sky"}, "drop sky")])
 def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason: str, scene: Scene) -> None:
     """Where no pixel is known, whose colour could stand in."""

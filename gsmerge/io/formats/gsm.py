@@ -37,7 +37,7 @@ REMEDY = "run extend again with all batches"
 ENTRIES: Mapping[str, type] = {
     "schema": int, "gsmerge": str, "kind": str, "width": int, "height": int, "names": list, "about": dict,
 }  # fmt: skip
-NUM_HIGHER = (0, 3, 8, 15, 24)  # harmonics above degree 0
+NUM_HIGHER = (0, 3, 8, 15, 24)  # harmonics above degree 0, by the degree
 _LEAST_SCALE = 1e-30  # scale that replaces 0, so that its logarithm is finite
 
 

@@ -5,14 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+import unaligned_scenes
 from messages import noted, refuses
 
-from gsmerge import Scene
+from gsmerge import Scene, render
 from gsmerge.facts.prepare import prepare
+from gsmerge.fit import FitOptions, fit_photos
 from gsmerge.geometry.frame import canonicalise, scene_frame
 from gsmerge.geometry.transforms import project
-from gsmerge.photos.row_colors import ROW_COLORS
-from gsmerge.raster.photos import scene_pictures
+from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.photos.scene_photos import without_photo
+from gsmerge.raster.photos import MASKED, scene_pictures
 from gsmerge.runtime.record import record_part
 
 
@@ -105,3 +108,20 @@ def test_renders_stand_in_for_photos_where_no_pixels_are_known_alone(scene: Scen
     with record_part(silent=True) as record:
         prepare(replace(bare, pixels=None))
     assert noted(record.notes, "no photos", "the rows are not the pixels of the views", "--images")
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["rows are pixels", "rows are no pixels"])
+def test_views_without_a_photo_take_part_in_a_fit(own: bool) -> None:
+    """Colours of the view's own Gaussians count as a photo, and drawings as what masks leave out."""
+    room = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
+    prepared = prepare(without_photo(room if own else unaligned_scenes.without_order(room), [1]))
+    reference, scene = prepared.reference, prepared.scene
+    assert (reference.name, reference.score_views) == (PHOTOS, (0, 2))
+    weights = fit_photos(scene, FitOptions())[0].weights
+    if own:
+        assert scene.masks is None
+        assert weights is None
+    else:
+        np.testing.assert_array_equal(scene.masks.all((1, 2)), [True, False, True])
+        np.testing.assert_array_equal(weights[:, 0, 0], [1, MASKED, 1])
+        np.testing.assert_array_equal(scene.images[1], render(scene.gaussians, scene.cameras[[1]]).images[0].clip(0, 1))

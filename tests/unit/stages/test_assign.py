@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 import unaligned_scenes
-from messages import noted, refuses
+from messages import refuses
 
 from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
@@ -19,7 +19,7 @@ from gsmerge.geometry.frame import canonicalise, scene_frame
 from gsmerge.geometry.pooling import scene_members
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions
-from gsmerge.stages.assign import assign, find_owners, merge_unseen, middle_pixels, owner_pixels
+from gsmerge.stages.assign import assign, find_owners, middle_pixels, owner_pixels
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups
@@ -135,32 +135,7 @@ def test_placed_cameras_see_most(room: Scene) -> None:
     assert (owners.values > 0).mean() > 0.8
 
 
-def test_neighbours_are_merged(room: Scene) -> None:
-    merged = merge_unseen(room.gaussians, unaligned_scenes.without_order(room), 50)
-    assert len(merged) == 50
-    low, high = room.gaussians.means.min(0), room.gaussians.means.max(0)
-    assert ((merged.means >= low - 1e-5) & (merged.means <= high + 1e-5)).all()
-    all_of_them = merge_unseen(room.gaussians[:20], unaligned_scenes.without_order(room), 20)
-    assert np.allclose(all_of_them.means.sum(0), room.gaussians.means[:20].sum(0), atol=1e-4)
-
-
-@pytest.mark.parametrize("settings", [{}, {"budget": 150}], ids=str)
-def test_unseen_ones_are_dropped_or_kept(room: Scene, settings: dict) -> None:
-    hidden = unaligned_scenes.far_behind(room.gaussians, 600)
-    scene = replace(unaligned_scenes.without_order(room), gaussians=type(hidden).concat([room.gaussians, hidden]))
-    options = {"superpixels": "10%", "fit": "none", "poses": "fixed", **settings}
-    dropped, kept = (compact(scene, unseen=unseen, **options) for unseen in ("drop", "keep"))
-    behind = [int((result.gaussians.means[:, 2] < -5).sum()) for result in (dropped, kept)]
-    assert behind[0] == 0
-    assert behind[1] > 20
-    assert noted(kept.report.notes, "view", "sees")
-    if "budget" in settings:
-        assert len(kept.gaussians) <= 150
-        assert len(kept.gaussians) > 140
-
-
 def test_nothing_seen_at_all(room: Scene) -> None:
     scene = replace(unaligned_scenes.without_order(room), gaussians=unaligned_scenes.far_behind(room.gaussians, 500))
-    for unseen in ("drop", "keep"):
-        with refuses(UsageError, "", "none of 3", 500):
-            compact(scene, unseen=unseen)
+    with refuses(UsageError, "", "none of 3", 500):
+        compact(scene)
