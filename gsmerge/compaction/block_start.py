@@ -41,7 +41,7 @@ def start_block(
     ``piece`` is the scene of the block's views, ``frame`` the canonical frame of all blocks.
     """
     begin_part()
-    prepared = prepare(piece, options.prepare, frame, outside=False)
+    prepared = prepare(piece, options.prepare, frame)
     plan = make_plan(prepared, options)
     decoded = decode_views(prepared, plan, plan.limits.count)
     keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)

@@ -93,7 +93,7 @@ def _with_drawings(scene: PicturedScene, cameras: Cameras, counts: np.ndarray) -
     importance, empty, large = scene.importance, scene.empty, scene.large_photos
     if large is not None:
         large = _with_large_drawings(large, scene.gaussians, cameras)
-    return with_pixels(
+    drawn = with_pixels(
         replace(
             scene, cameras=concat_cameras(scene.cameras, cameras), pixels=None, large_photos=large,
             names=(*scene.names, *(f"placed {view}" for view in range(len(cameras)))),
@@ -103,6 +103,8 @@ def _with_drawings(scene: PicturedScene, cameras: Cameras, counts: np.ndarray) -
             empty=None if empty is None else np.concatenate([empty, np.zeros(counts.shape, empty.dtype)]),
         )
     )  # fmt: skip
+    homes, pixels = scene.get_pixels().homes, drawn.get_pixels()  # a drawing takes no Gaussian from a photo
+    return replace(drawn, pixels=replace(pixels, homes=np.where(homes < 0, pixels.homes, homes)))
 
 
 def _with_large_drawings(large: LargePhotos, gaussians: Gaussians, cameras: Cameras) -> LargePhotos:
