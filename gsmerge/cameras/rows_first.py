@@ -20,7 +20,7 @@ from gsmerge.cameras.dropped_rows import follow_rows
 from gsmerge.cameras.estimate import estimate_cameras
 from gsmerge.cameras.frames import exporter_frames, fit_frame, own_poses, scale_by
 from gsmerge.cameras.grids import Grid, PlacedGrid, file_grids, photo_grid, with_photo_size, with_poses
-from gsmerge.cameras.layouts import ESTIMATED, Layout
+from gsmerge.cameras.layouts import ESTIMATED, NO_CAMERAS_USED, Layout
 from gsmerge.cameras.poses import max_pixels, move_cameras, other_conventions
 from gsmerge.cameras.score import (
     AS_NEAR,
@@ -118,6 +118,7 @@ class AlignmentResult:
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
     given: np.ndarray | None = None  # ``[c,4,4]`` given poses, to which views are to be moved with their Gaussians
     problem: str | None = None  # why the rows belong to no pixels; None if they do
+    own_views: int = 0  # views of the grid that rows without pixels here form by themselves; 0 if they form none
 
 
 def align(
@@ -187,7 +188,19 @@ def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
         layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
     if int(source.ply.valid.sum()) < min(_MIN_ROWS, _MIN_SHARE * count):
         return None
-    return next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
+    recovery = next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
+    return recovery if recovery is None or _shows_layers(source, recovery, layers) else None
+
+
+def _shows_layers(source: RowSource, recovery: Recovery, layers: int) -> bool:
+    """Return whether the rows of each layer lie in their pixels; other rows may belong to views without a camera."""
+    if layers <= 1:
+        return True
+    cameras, ids, rows = recovery.place.cameras, recovery.layout.pixel_ids(), np.arange(len(source.ply.gaussians))
+    layer_ids = rows % layers if ids[0] == ids[1] else rows // (len(rows) // layers)
+    inputs = source.inputs(recovery.place.grid, photos=False)
+    of_layers = (replace(recovery.layout, ids=np.where(layer_ids == layer, ids, -1)) for layer in range(layers))
+    return all(check_pairs(inputs.pairs(layout), cameras).ok for layout in of_layers)
 
 
 def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | None:
@@ -323,7 +336,17 @@ def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence
     if place.frame is not IDENTITY:
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
     notes = (*place.notes(source.camera_file.convention), *more_notes)
-    return AlignmentResult(None, cameras, inputs.images, camera_file, notes, grid.transform, problem=no_pixels.problem)
+    own = None if source.order == "none" else source.own_cameras
+    return AlignmentResult(
+        pixel_ids=None,
+        cameras=cameras,
+        images=inputs.images,
+        camera_file=camera_file,
+        notes=notes,
+        transform=grid.transform,
+        problem=no_pixels.problem,
+        own_views=0 if own is None else len(own),
+    )
 
 
 def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
@@ -334,7 +357,7 @@ def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
     if usual.source == ESTIMATED:
         separate = len(set(map(bytes, usual.Ks))) > 1
         subject = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
-        notes.append(f"no cameras are used: {subject} are estimated from the Gaussians' own grid")
+        notes.append(f"{NO_CAMERAS_USED}: {subject} are estimated from the Gaussians' own grid")
     return AlignmentResult(
         pixel_ids=recovery.layout.pixel_ids(),
         cameras=place.cameras,
