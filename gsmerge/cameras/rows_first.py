@@ -43,6 +43,7 @@ from gsmerge.types import Cameras
 _EVIDENCE = "Gaussians' places in their pixels"  # for a frame, in words
 _PLAIN_PX = 0.5  # rows in order that are nearer to their pixels, pixels, need no other cameras
 _MIN_ROWS, _MIN_SHARE = 24, 0.05  # finite rows needed to find pixels: this number, or this share of all rows
+_MOST_ROWS = 0.75  # share of rows near their pixels in layers: of two layers, one may belong to other views
 _MOVED_GAUSSIANS = 2000  # Gaussians of a view that its moved pose is solved from
 _ROUNDING_PX = 0.1  # by which cameras in one frame may fit worse than own poses, since files round numbers
 _FIRST_ROWS = 20_000  # rows that must follow the order of the pixels before all rows are tried
@@ -188,19 +189,7 @@ def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
         layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
     if int(source.ply.valid.sum()) < min(_MIN_ROWS, _MIN_SHARE * count):
         return None
-    recovery = next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
-    return recovery if recovery is None or _shows_layers(source, recovery, layers) else None
-
-
-def _shows_layers(source: RowSource, recovery: Recovery, layers: int) -> bool:
-    """Return whether the rows of each layer lie in their pixels; other rows may belong to views without a camera."""
-    if layers <= 1:
-        return True
-    cameras, ids, rows = recovery.place.cameras, recovery.layout.pixel_ids(), np.arange(len(source.ply.gaussians))
-    layer_ids = rows % layers if ids[0] == ids[1] else rows // (len(rows) // layers)
-    inputs = source.inputs(recovery.place.grid, photos=False)
-    of_layers = (replace(recovery.layout, ids=np.where(layer_ids == layer, ids, -1)) for layer in range(layers))
-    return all(check_pairs(inputs.pairs(layout), cameras).ok for layout in of_layers)
+    return next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
 
 
 def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | None:
@@ -217,6 +206,8 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
         alignment = check_pairs(pairs, cameras)
         far_px = SHUFFLED_MARGIN * max(alignment.worst_px, AS_NEAR_PX)
         is_right = alignment.ok and alignment.worst_px <= limit and median(pixel_errors(shuffled, cameras)) >= far_px
+        is_near = pixel_errors(pairs, cameras) <= max_pixels(*grid.size)
+        is_right = is_right and (layout.ids is None or float(is_near.mean()) >= _MOST_ROWS)
         return Recovery(PlacedGrid(grid, frame, _EVIDENCE), layout, alignment) if is_right else None
 
     usual = exporter_frames(grid.cameras, source.scale)[0]
@@ -336,7 +327,6 @@ def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence
     if place.frame is not IDENTITY:
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
     notes = (*place.notes(source.camera_file.convention), *more_notes)
-    own = None if source.order == "none" else source.own_cameras
     return AlignmentResult(
         pixel_ids=None,
         cameras=cameras,
@@ -345,7 +335,7 @@ def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence
         notes=notes,
         transform=grid.transform,
         problem=no_pixels.problem,
-        own_views=0 if own is None else len(own),
+        own_views=0 if source.order == "none" else len(source.own_cameras or ()),
     )
 
 

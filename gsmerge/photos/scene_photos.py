@@ -504,6 +504,22 @@ def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, 
     return [f"{count} and {'is' if len(spare) == 1 else 'are'} not used: {which}"]
 
 
+def describe_missing(names: Sequence[str], stored: CameraFile, *, is_right: bool) -> str | None:
+    """Note which views of a grid have no camera in the file ``stored``; None if it may be of another scene.
+
+    ``names`` of the views are those of their photos, where photos show them. ``is_right``: the cameras see the
+    Gaussians; otherwise only photos with their names show that they belong to the scene.
+    """
+    known, count = {PurePath(name).stem for name in stored.names}, len(names) - len(stored)
+    lacking = [name for name in names if PurePath(name).stem not in known]
+    are_named = len(lacking) == count > 0
+    if not (are_named or is_right):
+        return None
+    which = f" ({list_some(lacking)})" if are_named else ""
+    text = f"{count} of {len(names)} views {'has' if count == 1 else 'have'} no camera in {stored.path}{which}"
+    return f"{text}: the poses and focal length of all views are estimated from the Gaussians' own grid"
+
+
 def describe_unused(proposal: Proposal, camera_file: CameraFile) -> str:
     """Note that none of the photos is used, and why."""
     verb = "not used" if camera_file.source == ESTIMATED else "left out"

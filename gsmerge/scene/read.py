@@ -30,6 +30,7 @@ from gsmerge.photos.scene_photos import (
     ScenePhotos,
     assign_to_views,
     describe_assignment,
+    describe_missing,
     describe_unused,
     fit_to_grid,
     list_guessed,
@@ -54,15 +55,7 @@ from gsmerge.scene.exporters import (
     make_hints,
 )
 from gsmerge.scene.rows import read_rotations, take_gaussians
-from gsmerge.scene.views import (
-    cut_bars,
-    describe_missing,
-    find_larger_and_masks,
-    limit_photo_size,
-    limit_view_size,
-    read_scene_cameras,
-    without_cameras,
-)
+from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, LargePhotos, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
@@ -246,17 +239,21 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
     in :func:`read_scene`. ``photos=False``: search no photos.
     """
     answer = _read_views(ply, files, hints, photos=photos)
-    has_views = isinstance(answer, Loaded) and answer.own_views <= len(answer.scene)
+    lacks_views = isinstance(answer, Loaded) and answer.own_views > len(answer.scene)
+    if isinstance(answer, Loaded) and not lacks_views:
+        return answer
     is_stray = isinstance(answer, SceneError) and "cameras" not in files.named and not _is_named(files, answer)
-    if files.cameras not in (None, files.ply) and not has_views and (is_stray or isinstance(answer, Loaded)):
-        stored = _answer(partial(read_scene_cameras, ply, files))
-        alone = _read_views(ply, without_cameras(files, stored), hints, photos=photos)
+    if files.cameras not in (None, files.ply) and (lacks_views or is_stray):
+        fewer = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
+        alone = _read_views(ply, fewer, hints, photos=photos)
         lacks_named = "images" in files.named and files.images is not None
         if isinstance(alone, Loaded) and not (lacks_named and alone.scene.images is None):
-            text = describe_missing(alone.scene.names, stored, is_right=not is_stray)
+            stored = _answer(partial(read_scene_cameras, ply, files))
+            text = None
+            if isinstance(stored, CameraFile):
+                text = describe_missing(alone.scene.names, stored, is_right=lacks_views)
             if text is not None:
-                others = (note for note in alone.notes if not note.startswith(NO_CAMERAS_USED))
-                return replace(alone, notes=(text, *others))
+                return replace(alone, notes=(text, *(n for n in alone.notes if not n.startswith(NO_CAMERAS_USED))))
             if isinstance(answer, SceneError):
                 return _note_left_out(alone, files, [str(files.cameras)], answer)
     if isinstance(answer, Loaded):

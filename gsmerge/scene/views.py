@@ -1,18 +1,11 @@
-"""Read the cameras and photos of a scene at a size that memory has room for; find larger photos and masks.
-
-Also say which views of a grid have no camera in the file.
-"""
+"""Read the cameras and photos of a scene at a size that memory has room for; find larger photos and masks."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import PurePath
 
 import numpy as np
 
-from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import (
     CameraFile,
     drop_repeats,
@@ -39,8 +32,7 @@ from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.photos.masks import NO_MASKS, Masks, read_masks
-from gsmerge.photos.scene_photos import ScenePhotos, propose_photos
-from gsmerge.runtime.record import list_some
+from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.types import Cameras, LargePhotos
 
 _MAX_BYTES = 2 << 30  # size of all photos as floats, up to which photos are not resized unless rows have no pixels
@@ -69,35 +61,6 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
     from gsmerge.cameras import estimate_cameras  # few files need it
 
     return estimate_cameras(files.ply, ply.gaussians.means, ply.valid)
-
-
-def without_cameras(files: SceneFiles, stored: CameraFile | SceneError | None) -> SceneFiles:
-    """Return the files of a scene without its camera file, but with the folder of the photos that this file names."""
-    images = None if files.images == files.cameras else files.images
-    if images is None and "images" not in files.named and isinstance(stored, CameraFile):
-        with suppress(SceneError):  # photos that cannot be read are told of when they are needed
-            proposal = propose_photos(files, stored)
-            images = proposal.pool[0].parent if proposal is not None and proposal.pool else None
-    return replace(files, cameras=None, images=images)
-
-
-def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | None, *, is_right: bool) -> str | None:
-    """Note which views have no camera in the file ``stored``; None if it has all, or may be of another scene.
-
-    ``names`` of the views are those of their photos, where photos show them. ``is_right``: the cameras see the
-    Gaussians; otherwise only photos with their names show that they belong to the scene.
-    """
-    if not isinstance(stored, CameraFile) or len(stored) >= len(names):
-        return None
-    known = {PurePath(name).stem for name in stored.names}
-    lacking = [name for name in names if PurePath(name).stem not in known]
-    are_named = len(lacking) + len(stored) == len(names)
-    if not (are_named or is_right):
-        return None
-    which = f" ({list_some(lacking)})" if are_named else ""
-    missing = len(names) - len(stored)
-    count = f"{missing} of {len(names)} views {'has' if missing == 1 else 'have'} no camera in {stored.path}{which}"
-    return f"{count}: the poses and focal length of all views are estimated from the Gaussians' own grid"
 
 
 def find_larger_and_masks(
