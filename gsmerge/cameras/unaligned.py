@@ -41,7 +41,7 @@ _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
 # Where the Gaussians' middle is tried in a picture to find a shift: x and y in widths and heights, and logarithm of
 # the depth in radii of the scene. Colours agree over about a tenth of a picture
 _PLACES = tuple(np.linspace(*ends).tolist() for ends in ((-0.2, 1.2, 15), (-0.2, 1.2, 15), (-1.5, 2.25, 16)))
-_SHIFT_VIEWS = 8  # views that shifts are tried on
+_SHIFT_VIEWS = 4  # views that shifts are tried on
 # Searches around the best places: number of Gaussians, places that are kept, and steps
 _SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) for i in range(10)]
 
@@ -320,7 +320,7 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
         found = check_cameras(*rows, move(place).move(cameras), images, samples)
         return float(np.nan_to_num(found.share_seen * (1 - found.color_ratio)))
 
-    best: list[tuple[float, ...]] = sorted(product(*_PLACES), key=lambda place: -score(place, 500))[:8]
+    best: list[tuple[float, ...]] = sorted(product(*_PLACES), key=lambda place: -score(place, 300))[:8]
     for samples, count, step in _SHIFT_STEPS:
         moves = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
         around = {tuple((place + move).tolist()) for place in best for move in moves}

@@ -387,8 +387,7 @@ def _assign(
         alone = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
         text = describe_unused(proposal, camera_file)
         return alone.with_left_out([text]) if isinstance(alone, Loaded) else alone
-    are_pixels = base.scene.has_own_pixels
-    described, unused = describe_assignment(proposal, chosen, camera_file, are_pixels=are_pixels)
+    described, unused = describe_assignment(proposal, chosen, camera_file, are_pixels=base.scene.has_own_pixels)
     if load is None or chosen != proposal.choice:
         camera_file = name_by_photos(camera_file, proposal, chosen, fit)
         answer = _answer(partial(_combine_chosen, ply, files, camera_file, proposal, chosen, hints))

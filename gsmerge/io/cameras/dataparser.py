@@ -17,8 +17,7 @@ from gsmerge.io.cameras.camera_source import number_errors, to_array, to_number
 from gsmerge.kernels.matrices import invert, matmul
 
 DATAPARSER = "dataparser_transforms.json"
-_OFFSET_ENDINGS = (".txt", ".xyz", ".xml")
-_MAX_OFFSET, _MAX_OFFSETS = 1 << 14, 8  # size of a file that may have an offset, and number of such files
+_OFFSET_ENDINGS, _MAX_OFFSETS = (".txt", ".xml", ".xyz"), 8  # of files that may have an offset, and how many are read
 _OFFSET = re.compile(r"(?:^|[>:=(])\s*N[\s,;]+N[\s,;]+N\s*(?:$|[<)])".replace("N", r"([-+]?\d+\.?\d*)"), re.MULTILINE)
 
 
@@ -55,13 +54,13 @@ def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
     offset in both directions, since either side may be without it.
     """
     paths = sorted({path for folder in folders for path in folder.glob("[!.]*") if path.suffix in _OFFSET_ENDINGS})
-    small = [
-        path for path in paths if path.is_file() and path.stat().st_size <= _MAX_OFFSET and os.access(path, os.R_OK)
-    ]
+    small = [path for path in paths if path.is_file() and os.access(path, os.R_OK) and path.stat().st_size <= 1 << 12]
     found = [(path.name, _OFFSET.search(path.read_text("latin-1"))) for path in small[:_MAX_OFFSETS]]
     offsets = {tuple(map(float, numbers.groups())): name for name, numbers in found if numbers is not None}
     return [
-        Similarity(np.eye(3), 1.0, sign * np.array(offset), f"moved by {sign:+d} times the offset in {name}")
+        Similarity(
+            np.eye(3), 1.0, sign * np.array(offset), f"moved by {'minus ' if sign < 0 else ''}the offset in {name}"
+        )
         for offset, name in offsets.items()
         for sign in (-1, 1)
         if max(map(abs, offset)) < MAX_NUMBER
