@@ -204,7 +204,7 @@ def choose_cameras(
         _check_colors(inputs, other.move(inputs.cameras), other.description, no_pixels)
         return PlacedGrid(grid, other, "photos' colours"), []
     if not check.ok:
-        remedy = f"{no_pixels.remedy}, or the x, y and z by which they are shifted in offset.txt beside the file"
+        remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
         raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
     if poses is None:
         return unchanged, [note] if note else []
@@ -239,7 +239,8 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     frames = exporter_frames(inputs.cameras)
     best, score = _best_frame(inputs, frames)
     stands_out = _stands_out(inputs, best, score)
-    if inputs.scale is None and not stands_out:
+    # views without a photo are black; a single photo fits somewhere in any scene
+    if inputs.scale is None and not stands_out and inputs.images.any((1, 2, 3)).sum() > 1:
         solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
         best, score = _best_frame(inputs, [best, *solved, *([] if usual.ok else _solve_shift(inputs))])
         stands_out = _stands_out(inputs, best, score)
@@ -325,5 +326,8 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
         moves = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
         around = {tuple((place + move).tolist()) for place in best for move in moves}
         best = sorted(sorted(around), key=lambda place: -score(place, samples))[:count]
-    found = check_cameras(*rows, move(best[0]).move(cameras), images, foremost=True)
-    return [move(best[0])] if found.ok and found.color_ratio <= MAX_FRONT_RATIO else []
+    frame = move(best[0])
+    each = [(frame.move(cameras[view : view + 1]), images[view : view + 1]) for view in range(len(cameras))]
+    ratios = [check_cameras(*rows, *one, foremost=True).color_ratio for one in each]
+    known = [ratio for ratio in ratios if not np.isnan(ratio)]
+    return [frame] if len(known) > 1 and max(known) <= RANDOM_SHARE and np.mean(known) <= MAX_FRONT_RATIO else []

@@ -17,7 +17,7 @@ from gsmerge.scene.read import Loaded, load_scene
 
 SMOOTH = smooth_scene(96, 64)
 ALL = np.arange(len(SMOOTH.gaussians))
-FAR = np.argsort(-SMOOTH.gaussians.means[:, 2])[: len(ALL) // 12]
+FAR = np.argsort(-SMOOTH.gaussians.means[:, 2], kind="stable")[: len(ALL) // 12]
 
 
 def registered(views: list[int], *, moved: bool = False) -> Tiny:
