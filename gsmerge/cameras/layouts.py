@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 ESTIMATED = "estimated from the grid"  # source of cameras
+NO_CAMERAS_USED = "no cameras are used"  # a note on cameras that are estimated begins so
 TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every border
 
 

@@ -20,7 +20,7 @@ from gsmerge.cameras.dropped_rows import follow_rows
 from gsmerge.cameras.estimate import estimate_cameras
 from gsmerge.cameras.frames import exporter_frames, fit_frame, own_poses, scale_by
 from gsmerge.cameras.grids import Grid, PlacedGrid, file_grids, photo_grid, with_photo_size, with_poses
-from gsmerge.cameras.layouts import ESTIMATED, Layout
+from gsmerge.cameras.layouts import ESTIMATED, NO_CAMERAS_USED, Layout
 from gsmerge.cameras.poses import max_pixels, move_cameras, other_conventions
 from gsmerge.cameras.score import (
     AS_NEAR,
@@ -43,6 +43,7 @@ from gsmerge.types import Cameras
 _EVIDENCE = "Gaussians' places in their pixels"  # for a frame, in words
 _PLAIN_PX = 0.5  # rows in order that are nearer to their pixels, pixels, need no other cameras
 _MIN_ROWS, _MIN_SHARE = 24, 0.05  # finite rows needed to find pixels: this number, or this share of all rows
+_MOST_ROWS = 0.75  # share of rows near their pixels in layers: of two layers, one may belong to other views
 _MOVED_GAUSSIANS = 2000  # Gaussians of a view that its moved pose is solved from
 _ROUNDING_PX = 0.1  # by which cameras in one frame may fit worse than own poses, since files round numbers
 _FIRST_ROWS = 20_000  # rows that must follow the order of the pixels before all rows are tried
@@ -118,6 +119,7 @@ class AlignmentResult:
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
     given: np.ndarray | None = None  # ``[c,4,4]`` given poses, to which views are to be moved with their Gaussians
     problem: str | None = None  # why the rows belong to no pixels; None if they do
+    own_views: int = 0  # views of the grid that rows without pixels here form by themselves; 0 if they form none
 
 
 def align(
@@ -204,6 +206,8 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
         alignment = check_pairs(pairs, cameras)
         far_px = SHUFFLED_MARGIN * max(alignment.worst_px, AS_NEAR_PX)
         is_right = alignment.ok and alignment.worst_px <= limit and median(pixel_errors(shuffled, cameras)) >= far_px
+        is_near = pixel_errors(pairs, cameras) <= max_pixels(*grid.size)
+        is_right = is_right and (layout.ids is None or float(is_near.mean()) >= _MOST_ROWS)
         return Recovery(PlacedGrid(grid, frame, _EVIDENCE), layout, alignment) if is_right else None
 
     usual = exporter_frames(grid.cameras, source.scale)[0]
@@ -323,7 +327,16 @@ def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence
     if place.frame is not IDENTITY:
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
     notes = (*place.notes(source.camera_file.convention), *more_notes)
-    return AlignmentResult(None, cameras, inputs.images, camera_file, notes, grid.transform, problem=no_pixels.problem)
+    return AlignmentResult(
+        pixel_ids=None,
+        cameras=cameras,
+        images=inputs.images,
+        camera_file=camera_file,
+        notes=notes,
+        transform=grid.transform,
+        problem=no_pixels.problem,
+        own_views=0 if source.order == "none" else len(source.own_cameras or ()),
+    )
 
 
 def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
@@ -334,7 +347,7 @@ def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
     if usual.source == ESTIMATED:
         separate = len(set(map(bytes, usual.Ks))) > 1
         subject = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
-        notes.append(f"no cameras are used: {subject} are estimated from the Gaussians' own grid")
+        notes.append(f"{NO_CAMERAS_USED}: {subject} are estimated from the Gaussians' own grid")
     return AlignmentResult(
         pixel_ids=recovery.layout.pixel_ids(),
         cameras=place.cameras,

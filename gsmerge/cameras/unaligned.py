@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import Convention
 from gsmerge.kernels.elementary import exp
+from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Cameras, Gaussians
 
 # Colour error, divided by the colour error of shuffled pixels. Above this share colours agree no better than at random
@@ -32,10 +34,16 @@ _MIN_SEEN = 0.5  # share of the Gaussians that must be in some camera
 MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, but for only the foremost Gaussians in a frame chosen by colours
 # Largest depth of a foremost Gaussian, divided by the least depth in its cell; and mean number of Gaussians per cell
 _FRONT, _PER_CELL = 1.05, 3
-_SCALES = np.geomspace(1 / 30, 30, 55)  # of the cameras' positions, tried in turn
+_SCALES = np.geomspace(1 / 1300, 1300, 115)  # of the cameras' positions, tried in turn: engines' units differ by 1000
 _SCALE_GAUSSIANS = 2000  # Gaussians that the scales are tried on
 # Finer searches around the best scale: range (natural logarithm), steps, Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
+# Where the Gaussians' middle is tried in a picture to find a shift: x and y in widths and heights, and logarithm of
+# the depth in radii of the scene. Colours agree over about a tenth of a picture
+_PLACES = tuple(np.linspace(*ends).tolist() for ends in ((-0.2, 1.2, 15), (-0.2, 1.2, 15), (-1.5, 2.25, 16)))
+_SHIFT_VIEWS = 4  # views that shifts are tried on
+# Searches around the best places: number of Gaussians, places that are kept, and steps
+_SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) for i in range(10)]
 
 
 @dataclass(frozen=True)
@@ -186,18 +194,18 @@ def choose_cameras(
     """
     rows, unchanged = (inputs.gaussians, inputs.valid), PlacedGrid(grid, IDENTITY)
     if frames:
-        given_score = check_cameras(*rows, inputs.cameras, inputs.images).score
-        checks = [check_cameras(*rows, frame.move(inputs.cameras), inputs.images) for frame in frames]
-        best = max(checks, key=lambda check: check.score)
-        if best.ok and best.score > given_score:
-            return replace(unchanged, frame=frames[checks.index(best)]), []
+        checks = [check_cameras(*rows, frame.move(inputs.cameras), inputs.images) for frame in (IDENTITY, *frames)]
+        best = int(np.argmax([check.score * check.ok for check in checks]))
+        if best > 0:
+            return replace(unchanged, frame=frames[best - 1]), []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
     other = _choose_frame(inputs, check)
     if other is not None:
         _check_colors(inputs, other.move(inputs.cameras), other.description, no_pixels)
         return PlacedGrid(grid, other, "photos' colours"), []
     if not check.ok:
-        raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", no_pixels.remedy)
+        remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
+        raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
     if poses is None:
         return unchanged, [note] if note else []
     cameras = replace(inputs.cameras, viewmats=poses.viewmats)
@@ -231,9 +239,10 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     frames = exporter_frames(inputs.cameras)
     best, score = _best_frame(inputs, frames)
     stands_out = _stands_out(inputs, best, score)
-    if inputs.scale is None and not stands_out:
-        solved = (_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[-1]))
-        best, score = _best_frame(inputs, [best, *solved])
+    # views without a photo are black; a single photo fits somewhere in any scene
+    if inputs.scale is None and not stands_out and inputs.images.any((1, 2, 3)).sum() > 1:
+        solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
+        best, score = _best_frame(inputs, [best, *solved, *([] if usual.ok else _solve_shift(inputs))])
         stands_out = _stands_out(inputs, best, score)
     if best is IDENTITY or not stands_out:
         return None
@@ -268,16 +277,57 @@ def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool
 def _scale_frame(frame: Similarity, factor: float) -> Similarity:
     """Multiply the scale of a frame by ``factor``, about the origin of the Gaussians."""
     scale = factor * frame.scale
-    text = f"positions scaled by {scale:.4g}"
+    text = f"positions scaled by {scale:.4g} (--hint scene_scale={scale:.4g})"
     name = frame.description.partition("positions scaled")[0].removesuffix(", ")
-    words = f"{name}, {text}" if name else text
+    words = f"{name or 'in another scale'}, {text}"
     return replace(frame, scale=scale, shift=factor * frame.shift, description=words)
 
 
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
-    """Solve for the scale of a frame by the colours in the photos, in ever smaller steps."""
-    best, _ = _best_frame(inputs, (_scale_frame(frame, float(scale)) for scale in _SCALES), _SCALE_GAUSSIANS)
+    """Solve for the scale of a frame by the colours in the photos, in ever smaller steps.
+
+    The search begins where the score exceeds the scores two steps away most. Far from the true scale all cameras may be
+    in one place, so that scores are high, but equal.
+    """
+    scaled = [_scale_frame(frame, float(scale)) for scale in _SCALES]
+    scores = np.array([_score_frame(inputs, candidate, _SCALE_GAUSSIANS) for candidate in scaled])
+    best = scaled[2 + int(np.argmax(scores[2:-2] - np.maximum(scores[:-4], scores[4:])))]
     for reach, steps, samples in _FINER:
         factors = exp(np.linspace(-reach, reach, steps))
         best, _ = _best_frame(inputs, [_scale_frame(best, float(factor)) for factor in factors], samples)
     return best
+
+
+def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
+    """Solve for the shift of cameras that have the scale and the axes of the Gaussians; empty if no photos show it.
+
+    The middle of the Gaussians is looked for in the picture of the middle camera, at many depths.
+    """
+    some = slice(None, None, -(-len(inputs.cameras) // _SHIFT_VIEWS))
+    rows, cameras, images = (inputs.gaussians, inputs.valid), inputs.cameras[some], inputs.images[some]
+    to_world = invert(cameras.viewmats)
+    centres, points = to_world[:, :3, 3], inputs.gaussians.means[inputs.valid].astype(np.float64)
+    view = int(np.argmin(np.linalg.norm(centres - np.median(centres, 0), axis=1)))
+    middle = np.median(points, 0)
+    radius = np.median(np.linalg.norm(points - middle, axis=1))
+    to_ray = radius * matmul(to_world[view, :3, :3], invert(cameras.Ks[view]))
+
+    def move(place: Sequence[float]) -> Similarity:
+        pixel = np.array([place[0] * cameras.width, place[1] * cameras.height, 1.0])
+        shift = middle - centres[view] - matmul(to_ray, pixel) * exp(np.array(place[2]))
+        return Similarity(np.eye(3), 1.0, shift, f"moved by {', '.join(f'{number:.10g}' for number in shift)}")
+
+    def score(place: Sequence[float], samples: int) -> float:
+        found = check_cameras(*rows, move(place).move(cameras), images, samples)
+        return float(np.nan_to_num(found.share_seen * (1 - found.color_ratio)))
+
+    best: list[tuple[float, ...]] = sorted(product(*_PLACES), key=lambda place: -score(place, 300))[:8]
+    for samples, count, step in _SHIFT_STEPS:
+        moves = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
+        around = {tuple((place + move).tolist()) for place in best for move in moves}
+        best = sorted(sorted(around), key=lambda place: -score(place, samples))[:count]
+    frame = move(best[0])
+    each = [(frame.move(cameras[view : view + 1]), images[view : view + 1]) for view in range(len(cameras))]
+    ratios = [check_cameras(*rows, *one, foremost=True).color_ratio for one in each]
+    known = [ratio for ratio in ratios if not np.isnan(ratio)]
+    return [frame] if len(known) > 1 and max(known) <= RANDOM_SHARE and np.mean(known) <= MAX_FRONT_RATIO else []

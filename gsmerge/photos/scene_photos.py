@@ -445,9 +445,12 @@ def _inside(path: Path, proposal: Proposal) -> str:
 
 
 def describe_assignment(
-    proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile
+    proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile, *, are_pixels: bool
 ) -> tuple[list[str], list[str]]:
-    """Describe where the assignment of photos differs from their names; return notes, and notes on missing photos."""
+    """Describe where the assignment of photos differs from their names; return notes, and notes on missing photos.
+
+    ``are_pixels``: the rows are pixels of the views, so no view lacks its camera.
+    """
     count, notes = len(chosen), list[str]()
     changes: dict[str, list[str]] = {"turned": [], "mirrored": []}
     for assignment in chosen:
@@ -466,7 +469,7 @@ def describe_assignment(
     if moved:
         names = "names" if proposal.exact else "their order"
         notes.append(f"photos are matched with views by their content, not by {names}: {list_some(moved)}")
-    notes += _describe_spare(proposal, chosen)
+    notes += _describe_spare(proposal, chosen, are_pixels=are_pixels)
     missing = [view for view, assignment in enumerate(chosen) if assignment is None]
     if not missing:
         return notes, []
@@ -485,16 +488,36 @@ def _explain(proposal: Proposal, view: int, name: str) -> str:
     return f"{_inside(proposal.pool[photo], proposal)}: shows something else than its camera"
 
 
-def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None]) -> list[str]:
-    """Note photos without a camera in the folders of the used photos, if they are fewer than the used photos."""
+def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, are_pixels: bool) -> list[str]:
+    """Note photos without a camera in the folders of the used photos: parts of the scene may be in these alone.
+
+    Rows that are pixels are seen by their own cameras. Other photos are noted there only if they are fewer.
+    """
     used = [proposal.pool[assignment.photo] for assignment in chosen if assignment is not None]
     named = [proposal.pool[photo] for photo in proposal.named if photo is not None]
     folders, stems = {path.parent for path in used}, {path.stem for path in (*used, *named)}
     spare = [path for path in proposal.pool if path.parent in folders and path.stem not in stems]
-    if not proposal.exact or not 0 < len(spare) < len(used):
+    if not spare or (are_pixels and (not proposal.exact or len(spare) >= len(used))):
         return []
     which = list_some([_inside(path, proposal) for path in spare])
-    return [f"photos without a camera are not used, {len(spare)} of {len(spare) + len(used)}: {which}"]
+    count = f"{len(spare)} of {len(spare) + len(used)} photos {'has' if len(spare) == 1 else 'have'} no camera"
+    return [f"{count} and {'is' if len(spare) == 1 else 'are'} not used: {which}"]
+
+
+def describe_missing(names: Sequence[str], stored: CameraFile, *, is_right: bool) -> str | None:
+    """Note which views of a grid have no camera in the file ``stored``; None if it may be of another scene.
+
+    ``names`` of the views are those of their photos, where photos show them. ``is_right``: the cameras see the
+    Gaussians; otherwise only photos with their names show that they belong to the scene.
+    """
+    known, count = {PurePath(name).stem for name in stored.names}, len(names) - len(stored)
+    lacking = [name for name in names if PurePath(name).stem not in known]
+    are_named = len(lacking) == count > 0
+    if not (are_named or is_right):
+        return None
+    which = f" ({list_some(lacking)})" if are_named else ""
+    text = f"{count} of {len(names)} views {'has' if count == 1 else 'have'} no camera in {stored.path}{which}"
+    return f"{text}: the poses and focal length of all views are estimated from the Gaussians' own grid"
 
 
 def describe_unused(proposal: Proposal, camera_file: CameraFile) -> str:

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsmerge.cameras import ESTIMATED, Alignment, AlignmentResult, Recovery, align, check_pixels
+from gsmerge.cameras import ESTIMATED, NO_CAMERAS_USED, Alignment, AlignmentResult, Recovery, align, check_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
@@ -30,6 +30,7 @@ from gsmerge.photos.scene_photos import (
     ScenePhotos,
     assign_to_views,
     describe_assignment,
+    describe_missing,
     describe_unused,
     fit_to_grid,
     list_guessed,
@@ -82,6 +83,7 @@ class Loaded:
     moves: Sequence[dict[str, Any]] = ()
     joined: Sequence[dict[str, Any]] = ()  # where each of several joined scenes lies; empty for one scene
     left_out: str | None = None  # the note on files beside the scene that do not belong to it
+    own_views: int = 0  # views of the grid that rows without pixels here form by themselves; 0 if they form none
 
     def pixel_scene(self) -> Scene:
         """Return the scene; SceneError with the reason if it does not have one Gaussian per pixel."""
@@ -237,14 +239,25 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
     in :func:`read_scene`. ``photos=False``: search no photos.
     """
     answer = _read_views(ply, files, hints, photos=photos)
-    if isinstance(answer, Loaded):
+    lacks_views = isinstance(answer, Loaded) and answer.own_views > len(answer.scene)
+    if isinstance(answer, Loaded) and not lacks_views:
         return answer
-    if "cameras" not in files.named and files.cameras not in (None, files.ply) and not _is_named(files, answer):
+    is_stray = isinstance(answer, SceneError) and "cameras" not in files.named and not _is_named(files, answer)
+    if files.cameras not in (None, files.ply) and (lacks_views or is_stray):
         fewer = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
         alone = _read_views(ply, fewer, hints, photos=photos)
         lacks_named = "images" in files.named and files.images is not None
         if isinstance(alone, Loaded) and not (lacks_named and alone.scene.images is None):
-            return _note_left_out(alone, files, [str(files.cameras)], answer)
+            stored = _answer(partial(read_scene_cameras, ply, files))
+            text = None
+            if isinstance(stored, CameraFile):
+                text = describe_missing(alone.scene.names, stored, is_right=lacks_views)
+            if text is not None:
+                return replace(alone, notes=(text, *(n for n in alone.notes if not n.startswith(NO_CAMERAS_USED))))
+            if isinstance(answer, SceneError):
+                return _note_left_out(alone, files, [str(files.cameras)], answer)
+    if isinstance(answer, Loaded):
+        return answer
     if "cameras" not in files.named:
         _check_hints(ply, hints)
     options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
@@ -374,7 +387,7 @@ def _assign(
         alone = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
         text = describe_unused(proposal, camera_file)
         return alone.with_left_out([text]) if isinstance(alone, Loaded) else alone
-    described, unused = describe_assignment(proposal, chosen, camera_file)
+    described, unused = describe_assignment(proposal, chosen, camera_file, are_pixels=base.scene.has_own_pixels)
     if load is None or chosen != proposal.choice:
         camera_file = name_by_photos(camera_file, proposal, chosen, fit)
         answer = _answer(partial(_combine_chosen, ply, files, camera_file, proposal, chosen, hints))
@@ -522,6 +535,7 @@ def _make_load(
         recovery=recovery,
         problem=result.problem,
         moves=result.moves,
+        own_views=result.own_views,
     )
 
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import unaligned_scenes
-from messages import names
+from messages import names, noted
 from PIL import Image
 from sweeps import sweep
+from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge import read_scene
@@ -43,6 +45,51 @@ def test_floor(settings: dict, made: Path, tmp_path: Path, target_psnr: Measure,
     out = tmp_path / "small.ply"
     gsmerge.write_ply(out, result.gaussians)
     floor(target_psnr(made / "targets", out))
+
+
+def scale(folder: Path) -> None:
+    gaussians = gsmerge.read_ply(folder / "scene.ply").gaussians
+    scaled = replace(gaussians, means=100 * gaussians.means, scales=100 * gaussians.scales)
+    gsmerge.write_ply(folder / "scene.ply", scaled, overwrite=True)
+
+
+def shift(folder: Path) -> None:
+    with edited_json(folder / "transforms.json") as data:
+        for frame in data["frames"]:
+            for axis, offset in enumerate((448262.5, 4582120.25, 187.5)):
+                frame["transform_matrix"][axis][3] += offset
+
+
+def forget(folder: Path) -> None:
+    with edited_json(folder / "transforms.json") as data:
+        del data["frames"][1:]
+
+
+@pytest.mark.parametrize(
+    ("harm", "kind", "words"),
+    [(scale, "voxels", ("another scale", "--hint")), (shift, "voxels", ("moved by",)),
+     (forget, "grid", ("no camera", "transforms.json"))],
+)  # fmt: skip
+def test_cameras_that_contradict_the_gaussians_cost_nothing(
+    harm: Callable[[Path], None],
+    kind: str,
+    words: tuple[str, ...],
+    made: Path,
+    made_scene: Path,
+    tmp_path: Path,
+    run: Run,
+) -> None:
+    """Searches for scales and shifts take seconds."""
+    scores = {}
+    for name in ("sound", "harmed"):
+        folder = Path(shutil.copytree(made if kind == "voxels" else made_scene, tmp_path / name))
+        if name == "harmed":
+            harm(folder)
+        said = run("compact", folder, "-o", tmp_path / f"{name}.ply", "--effort", "draft", "--json", code=0)
+        document = json.loads(said.out)
+        scores[name] = document["psnr_input_views"]["after"]
+        assert noted(document["notes"], *words) == (name == "harmed")
+    assert scores["harmed"] > scores["sound"] - 0.3
 
 
 @pytest.mark.parametrize(("beside", "least"), [("cameras", 30), ("nothing", 28)])  # which other views judge

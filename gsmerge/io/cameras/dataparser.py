@@ -1,7 +1,10 @@
-"""Read how nerfstudio moved its cameras into the Gaussians' world."""
+"""Read how programs moved cameras into the Gaussians' world: nerfstudio's map, or an offset of surveys."""
 
 from __future__ import annotations
 
+import os
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,8 @@ from gsmerge.io.cameras.camera_source import number_errors, to_array, to_number
 from gsmerge.kernels.matrices import invert, matmul
 
 DATAPARSER = "dataparser_transforms.json"
+_OFFSET_ENDINGS, _MAX_OFFSETS = (".txt", ".xml", ".xyz"), 8  # of files that may have an offset, and how many are read
+_OFFSET = re.compile(r"(?:^|[>:=(])\s*N[\s,;]+N[\s,;]+N\s*(?:$|[<)])".replace("N", r"([-+]?\d+\.?\d*)"), re.MULTILINE)
 
 
 def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
@@ -27,7 +32,7 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
     if path is None:
-        return []
+        return _read_offsets(folders)
     data = read_json(path)
     with number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
         transform = _square(data["transform"])
@@ -40,6 +45,26 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
             factor = to_number(camera_data.get("applied_scale") or 1)
             candidates.append(make_similarity(path, matmul(transform, invert(applied)), scale / factor))
     return candidates
+
+
+def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
+    """Read offsets that surveys subtract from coordinates in metres: three numbers alone in a small text or XML file.
+
+    Metashape and CloudCompare have them in text files, and DJI Terra in metadata.xml. The cameras are moved by each
+    offset in both directions, since either side may be without it.
+    """
+    paths = sorted({path for folder in folders for path in folder.glob("[!.]*") if path.suffix in _OFFSET_ENDINGS})
+    small = [path for path in paths if path.is_file() and os.access(path, os.R_OK) and path.stat().st_size <= 1 << 12]
+    found = [(path.name, _OFFSET.search(path.read_text("latin-1"))) for path in small[:_MAX_OFFSETS]]
+    offsets = {tuple(map(float, numbers.groups())): name for name, numbers in found if numbers is not None}
+    return [
+        Similarity(
+            np.eye(3), 1.0, sign * np.array(offset), f"moved by {'minus ' if sign < 0 else ''}the offset in {name}"
+        )
+        for offset, name in offsets.items()
+        for sign in (-1, 1)
+        if max(map(abs, offset)) < MAX_NUMBER
+    ]
 
 
 def _square(values: Any) -> np.ndarray:

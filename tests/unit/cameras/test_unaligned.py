@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from exports import export_rows, save_export, smooth_scene, turned
-from messages import noted, refuses
+from exports import Smooth, export_rows, save_export, smooth_scene, turned
+from messages import names, noted, refuses
 from model_rows import merge_voxels
 from sweeps import sweep
 from tiny_scene import make_tiny, write_images
@@ -66,6 +66,59 @@ def test_voxels_in_the_first_camera_at_any_scale(tmp_path: Path, scale: float) -
     assert np.allclose(loaded.scene.cameras.viewmats[0], np.eye(4), atol=1e-6)
     centres = (SMOOTH.c2w[:, :3, 3] - SMOOTH.c2w[0, :3, 3]) @ SMOOTH.c2w[0, :3, :3]
     assert np.allclose(loaded.scene.cameras.centres, scale * centres, atol=0.03 * scale)
+
+
+@sweep("scale", [0.01, 39.37, 100.0, 1000.0], often=2)
+@pytest.mark.parametrize("turn", [np.eye(3), np.diag([1.0, -1, -1])], ids=["as it is", "y up"])
+def test_the_units_of_another_program(tmp_path: Path, scale: float, turn: np.ndarray) -> None:
+    """Three frames are searched at a hundred scales each, which takes seconds."""
+    loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxels(), turn, scale=scale)))
+    (note,) = [note for note in loaded.notes if "scale" in note]
+    solved = float(note.partition("--hint scene_scale=")[2].partition(")")[0])
+    assert solved == pytest.approx(scale, rel=0.02)
+    assert np.allclose(loaded.scene.cameras.centres, scale * SMOOTH.c2w[:, :3, 3] @ turn.T, atol=0.02 * scale)
+    assert len(loaded.scene.photo_views) == 3
+    hinted = load_scene(tmp_path, scene_scale=solved)
+    assert np.allclose(hinted.scene.cameras.centres, loaded.scene.cameras.centres, atol=0.01 * scale)
+
+
+OFFSET = np.array([448262.5, 4582120.25, 187.5])
+OFFSET_FILES = {
+    "none": None,
+    "offset.txt": "448262.5 4582120.25 187.5\n",
+    "shift.txt": "# of the cameras\n448262.5, 4582120.25, 187.5",
+    "metadata.xml": "<M><SRS>EPSG:32631</SRS><SRSOrigin>448262.5,4582120.25,187.5</SRSOrigin></M>",
+    "wrong.txt": "1 2 3\n",
+}
+
+
+def shifted(scene: Smooth, offset: np.ndarray) -> Smooth:
+    c2w = scene.c2w.copy()
+    c2w[:, :3, 3] += offset
+    return replace(scene, c2w=c2w)
+
+
+@pytest.mark.parametrize("name", OFFSET_FILES)
+@sweep("sign", [1, -1], often=1)
+def test_cameras_with_an_offset(tmp_path: Path, name: str, sign: int) -> None:
+    """Without a right file, a thousand places are tried, which takes seconds."""
+    text = OFFSET_FILES[name]
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    loaded = load_scene(save_export(tmp_path, shifted(SMOOTH, sign * OFFSET), voxels()))
+    is_exact = name not in ("none", "wrong.txt")
+    assert np.allclose(loaded.scene.cameras.centres, SMOOTH.c2w[:, :3, 3], atol=1e-4 if is_exact else 0.03)
+    assert noted(loaded.notes, "cameras are moved by", name if is_exact else "photos")
+    assert len(loaded.scene.photo_views) == 3
+
+
+def test_without_photos_no_shift_is_found(tmp_path: Path) -> None:
+    folder = save_export(tmp_path, shifted(SMOOTH, OFFSET), voxels())
+    for photo in (folder / "images").rglob("*.png"):
+        photo.unlink()
+    left_out = load_scene(folder).left_out
+    assert left_out is not None
+    assert names(left_out, "transforms.json", "0 %", "offset.txt")
 
 
 def test_voxels_turned_to_y_up(tmp_path: Path) -> None:

@@ -68,16 +68,12 @@ def test_a_world_moved_by_any_similarity(tmp_path: Path, smooth: Tiny, layers: i
     assert len(loaded.scene.gaussians) == layers * len(smooth.gaussians)
 
 
-@pytest.mark.parametrize("views", ["wrong", "missing"])
-def test_a_wrong_or_missing_camera_costs_its_view_alone(small_scene: Path, tmp_path: Path, views: str) -> None:
+def test_a_wrong_camera_costs_its_view_alone(small_scene: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(small_scene, tmp_path / "scene"))
     with edited_json(folder / "transforms.json") as data:
-        if views == "missing":
-            del data["frames"][1]
-        else:
-            pose = np.array(data["frames"][1]["transform_matrix"])
-            pose[:3, :3] = rotation(0.1, -0.15, 0.1) @ pose[:3, :3]
-            data["frames"][1]["transform_matrix"] = pose.tolist()
+        pose = np.array(data["frames"][1]["transform_matrix"])
+        pose[:3, :3] = rotation(0.1, -0.15, 0.1) @ pose[:3, :3]
+        data["frames"][1]["transform_matrix"] = pose.tolist()
     scene = load_scene(folder).scene
     right = load_scene(small_scene).scene.cameras.viewmats
     assert np.allclose(scene.cameras.viewmats[[0, -1]], right[[0, -1]])

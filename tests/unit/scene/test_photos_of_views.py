@@ -110,10 +110,10 @@ def test_a_photo_without_a_camera_is_named(folder: Path, truth: np.ndarray) -> N
     spare.with_name("spare.png").write_bytes(spare.read_bytes())
     loaded = load_scene(folder)
     assert right_ones(loaded, truth) == [True] * VIEWS
-    assert any(names(text, "photos without a camera", "1 of 5", "spare.png") for text in loaded.notes)
+    assert any(names(text, "no camera", "1 of 5", "spare.png") for text in loaded.notes)
     for number in range(VIEWS):
         spare.with_name(f"frame {number}.png").write_bytes(spare.read_bytes())
-    assert not any("without a camera" in text for text in load_scene(folder).notes)
+    assert not any("no camera" in text for text in load_scene(folder).notes)
 
 
 def test_a_photo_of_something_else_has_a_camera(folder: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_photo_of_something_else_has_a_camera(folder: Path) -> None:
     Image.fromarray(stripes).save(other)
     notes = load_scene(folder).notes
     assert any(names(text, "1 of 4 views are left out", other.name, "shows something else") for text in notes)
-    assert not any("without a camera" in text for text in notes)
+    assert not any("no camera" in text for text in notes)
 
 
 def test_a_photo_in_a_format_that_is_not_read(folder: Path) -> None:
@@ -176,7 +176,7 @@ def test_one_photo_of_another_shape(folder: Path, truth: np.ndarray, sizes: str)
     assert np.abs(photos - truth[:3]).mean((1, 2, 3)).max() < 0.02
     assert loaded.left_out is not None
     assert names(loaded.left_out, "1 of 4 views", path.name)
-    assert not any("without a camera" in note for note in loaded.notes)
+    assert not any("no camera" in note for note in loaded.notes)
 
 
 def test_a_photo_of_another_shape_than_its_camera(folder: Path, truth: np.ndarray) -> None:
