@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsmerge.cameras import ESTIMATED, Alignment, AlignmentResult, Recovery, align, check_pixels
+import numpy as np
+
+from gsmerge.cameras import ESTIMATED, AlignmentResult, align, check_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
-from gsmerge.io.formats.arrays import FLAT_COMMENT, RESULT_COMMENT
-from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
+from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.read import GaussianFile, file_notes, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
-from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
+from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
 from gsmerge.photos.assign import Assignment
 from gsmerge.photos.grid_fit import GridFit
@@ -46,13 +47,13 @@ from gsmerge.photos.scene_photos import (
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import (
     NO_HINTS,
-    Exporter,
     ReadHints,
     choose_exporters,
     find_cameras_of_model,
     find_exporter,
     make_hints,
 )
+from gsmerge.scene.loaded import Loaded
 from gsmerge.scene.rows import read_rotations, take_gaussians
 from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
@@ -61,63 +62,6 @@ from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """A scene, with all facts about its files and how they were read."""
-
-    scene: Scene  # with pixels if the rows have them
-    info: FileInfo
-    files: SceneFiles
-    # the cameras as stored in their file, in the order of the views; None without cameras, or if they do not fit
-    cameras: CameraFile | None
-    exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
-    notes: tuple[str, ...]  # adapted or unusual content, one sentence each, without a full stop
-    # how well every view's Gaussians project into their own pixels; None if rows have no pixels
-    alignment: Alignment | None = None
-    recovery: Recovery | None = None  # the layout of rows that fits best, and by how much; None without pixels
-    problem: str | None = None  # why the rows have no pixels, in one sentence; None if they have
-    # how far each camera was moved to its Gaussians; empty if none was moved
-    moves: Sequence[dict[str, Any]] = ()
-    joined: Sequence[dict[str, Any]] = ()  # where each of several joined scenes lies; empty for one scene
-    left_out: str | None = None  # the note on files beside the scene that do not belong to it
-
-    def pixel_scene(self) -> Scene:
-        """Return the scene; SceneError with the reason if it does not have one Gaussian per pixel."""
-        if self.scene.has_own_pixels:
-            return self.scene
-        raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
-
-    def without_photos(self) -> Loaded:
-        """Return a copy without the photos inside the camera file, which frees memory; the scene keeps its own."""
-        return replace(self, cameras=None if self.cameras is None else replace(self.cameras, images=()))
-
-    def with_left_out(self, notes: Sequence[str]) -> Loaded:
-        """Return a copy with notes on files that were found beside the scene and are not used."""
-        left_out = "; ".join(filter(None, (self.left_out, *notes))) or None
-        return replace(self, notes=(*self.notes, *notes), left_out=left_out) if notes else self
-
-    @property
-    def comments(self) -> tuple[str, ...]:
-        """Comments of the file's header that a result copies; not the comment on 2D Gaussians, since results are 3D."""
-        return tuple(comment for comment in kept_comments(self.info) if comment != FLAT_COMMENT)
-
-    @property
-    def recognised(self) -> dict[str, Any]:
-        """Facts about the input for a report."""
-        cameras, recovery, info = self.scene.cameras, self.recovery, self.info
-        facts: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
-        facts |= {"num_photos": len(self.scene.photo_views)}
-        facts |= {"exporters": [entry.name for entry in self.exporters], "rows": recovery and recovery.description}
-        facts |= {"moved_cameras": list(self.moves), "bytes": info.file_bytes}
-        if self.files.parts:
-            facts["parts"] = [str(path) for path in self.files.parts]
-        if self.joined:
-            num_bytes = sum(os.stat(file["path"]).st_size for file in self.joined if file["joined"])
-            facts |= {"files": list(self.joined), "bytes": num_bytes}
-        facts |= {"layout": info.layout, "sh_degree": info.sh_degree, "opacity_encoding": info.opacity_encoding}
-        return facts | {"num_nonfinite": info.num_nonfinite, "left_out": self.left_out}
 
 
 @check_arguments
@@ -236,7 +180,7 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
     Cameras and photos that were found beside the scene and do not belong to it are left out, with a note. SceneError as
     in :func:`read_scene`. ``photos=False``: search no photos.
     """
-    answer = _read_views(ply, files, hints, photos=photos)
+    answer = _choose_cameras(ply, files, hints, photos=photos)
     if isinstance(answer, Loaded):
         return answer
     if "cameras" not in files.named and files.cameras not in (None, files.ply) and not _is_named(files, answer):
@@ -250,6 +194,44 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
     options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
     read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
     raise SceneError(answer.path, answer.problem, "; ".join(filter(None, (answer.remedy, read_alone))))
+
+
+def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
+    """Read the views of the first cameras that fit, or fit best, with a note if there are others; or return why not."""
+    best: tuple[float, Loaded | SceneError, Path | None] | None = None
+    for choice in files.choices:
+        answer = _read_views(ply, choice, hints, photos=photos)
+        rank = _rank_cameras(ply, answer, files)
+        best = (rank, answer, choice.cameras) if best is None or rank > best[0] else best
+        if rank >= 1:
+            break
+    assert best is not None
+    rank, answer, cameras = best
+    if isinstance(answer, SceneError) or rank < 0:
+        return answer
+    return replace(answer, notes=(*files.describe_choice(cameras), *answer.notes))
+
+
+def _rank_cameras(ply: GaussianFile, answer: Loaded | SceneError, files: SceneFiles) -> float:
+    """Rank how well cameras fit: from 0 if photos show it, from 1 beyond doubt; below 0 if nothing shows it.
+
+    Beyond doubt are pixels, and cameras that fit as they are stored, with colours nearer to those of the photos than to
+    those of random pixels. Cameras in a folder below the scene's are of no use if no photo shows that they fit.
+    """
+    if isinstance(answer, SceneError):
+        return -2.0
+    scene, is_below = answer.scene, answer.files.cameras in files.others and files.below
+    if scene.images is None and (files.below or (answer.left_out is not None and not scene.has_own_pixels)):
+        return -2.0 if is_below else -1.0
+    if not files.others or scene.images is None or scene.has_own_pixels:
+        return 1.0
+    from gsmerge.cameras import check_cameras  # few scenes need it
+
+    views, stored = list(scene.photo_views), read_scene_cameras(ply, answer.files)
+    valid, images = np.ones(len(scene.gaussians), bool), photo_array(scene.images)[views]
+    score = check_cameras(scene.gaussians, valid, scene.cameras[views], images).score
+    is_moved = not (stored and answer.cameras and np.array_equal(stored.viewmats, answer.cameras.viewmats))
+    return score if is_moved or score < 0.5 else 1 + score
 
 
 def _answer(read: Callable[[], T]) -> T | SceneError:
@@ -291,6 +273,8 @@ def _align(
     against the cameras.
     """
     proposal = _answer(partial(propose_photos, files, camera_file)) if photos else None
+    if isinstance(proposal, Proposal) and proposal.searched:
+        files = replace(files, images=proposal.folder)
     inside = _answer(partial(photos_inside, files, camera_file)) if photos and proposal is None else ()
     unread = next((answer for answer in (proposal, inside) if isinstance(answer, SceneError)), None)
     if unread is not None and ("images" in files.named or files.images == files.cameras):

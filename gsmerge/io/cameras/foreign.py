@@ -34,13 +34,14 @@ _REALITY = "RealityScan or RealityCapture", "export its registration as COLMAP, 
 _OPENMVS = "{}InterfaceCOLMAP of OpenMVS make a COLMAP model of it"
 _ODM = "ODM", "name its opensfm/reconstruction.json"
 _OPENMVG = "OpenMVG", "openMVG_main_openMVG2Colmap makes a COLMAP model of it"
-# The first existing place is read. A COLMAP model directly in the folder comes last, because Depth Anything 3 puts a
-# model there at the photos' own size
+# The first existing place is read; of the COLMAP models that match a pattern, the one with the most images. A model
+# directly in the folder comes last, because Depth Anything 3 puts a model there at the photos' own size
 CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
-    "cameras.json", "camera_params.json", "sparse/0", "sparse", "colmap/sparse/0", "colmap", "exports/npz/results.npz",
-    "exports/mini_npz/results.npz", "results.npz", "cameras.npz", "camera_poses.txt", "keyframes/corrected_cameras",
-    "keyframes/cameras", "reconstruction.json", "opensfm/reconstruction.json", "cameras.xml", "0", ".",
+    "cameras.json", "camera_params.json", "sparse/*", "sparse", "colmap/sparse/*", "colmap",
+    "distorted/sparse/*", "exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "cameras.npz",
+    "camera_poses.txt", "keyframes/corrected_cameras", "keyframes/cameras", "reconstruction.json",
+    "opensfm/reconstruction.json", "cameras.xml", "[0-9]*", ".",
 )  # fmt: skip
 PROGRAMS = (
     Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
