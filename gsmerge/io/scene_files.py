@@ -116,7 +116,7 @@ class SceneFiles:
     def describe_choice(self, cameras: Path | None) -> list[str]:
         """Note which cameras are read if others were tried before, or are COLMAP models beside them; name those."""
         paths = list(filter(None, (self.cameras, *self.others)))
-        if cameras is None or len(paths) == 1 - self.below:
+        if cameras is None or not self.others:
             return []
 
         def is_beside(path: Path) -> bool:
@@ -124,12 +124,13 @@ class SceneFiles:
 
         place = paths.index(cameras)
         shown = [cameras, *paths[:place], *filter(is_beside, paths[place + 1 :])]
-        names = [
-            os.path.relpath(path, self.root) + (f" ({n} images)" if (n := count_images(path)) else "") for path in shown
-        ]
-        rest = f", not from {', '.join(names[1:])}" if names[1:] else ""
-        text = f"cameras are read from {names[0]}, since they fit the Gaussians{rest}; --cameras names others"
-        return [text] if rest or self.below else []
+        if len(shown) == 1 and not self.below:
+            return []
+        first, *rest = (os.path.relpath(path, self.root) + f" ({count_images(path)} images)" for path in shown)
+        text = f"cameras are read from {first}, since they fit the Gaussians" + (
+            f", not from {', '.join(rest)}" if rest else ""
+        )
+        return [f"{text.replace(' (0 images)', '')}; --cameras names others"]
 
     @property
     def is_state(self) -> bool:

@@ -59,9 +59,8 @@ def list_photos(cameras: Path) -> list[Path]:
     names = () if camera_file is None else camera_file.names
     named = [root / name for name in names if (root / name).is_file()]
     found = None if named or camera_file is None else find_named_photos([capture_folder(cameras)], camera_file, 0)
-    return (
-        named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()] or list(found[1] if found else ())
-    )
+    folders = [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
+    return named or folders or ([] if found is None else found[1])
 
 
 def try_cameras(path: Path) -> CameraFile | None:

@@ -434,11 +434,15 @@ def _combine(
     left_out, place = list[str](), (camera_file, photos, size, result.transform, result.cameras)
     found = _answer(lambda: find_larger_and_masks(files, *place))
     if isinstance(found, SceneError):
-        if "masks" in files.named or files.masks is None or not Path(found.path).is_relative_to(files.masks):
+        path, is_protect = (
+            Path(found.path),
+            files.protect is not None and Path(found.path).is_relative_to(files.protect),
+        )
+        if "masks" in files.named or path in photos.paths or is_protect:
             raise found
         remedy = found.remedy or f"pass --masks FOLDER, or --masks {NONE}"
-        left_out = [f"the masks in {files.masks} are left out: {found.path}: {found.problem}; {remedy}"]
-        found = find_larger_and_masks(replace(files, masks=None), *place)
+        left_out = [f"the masks in {path.parent} are left out: {found.path}: {found.problem}; {remedy}"]
+        found = find_larger_and_masks(replace(files, masks=None, named=files.named | {"masks"}), *place)
     large, masks, mask_notes = found
     load = _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
     return load.with_left_out(left_out)
