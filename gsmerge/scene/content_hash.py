@@ -53,14 +53,15 @@ def list_files(files: SceneFiles) -> list[Path]:
 
 
 def list_photos(cameras: Path) -> list[Path]:
-    """List the photos of a camera file: the files that it names, or image folders beside it, or files by its names."""
+    """List the photos of a camera file: the files that it names, or image folders, or files by its names; and masks."""
     camera_file = try_cameras(cameras)
     root = cameras if cameras.is_dir() else cameras.parent
     names = () if camera_file is None else camera_file.names
     named = [root / name for name in names if (root / name).is_file()]
     found = None if named or camera_file is None else find_named_photos([capture_folder(cameras)], camera_file, 0)
     folders = [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
-    return named or folders or ([] if found is None else found[1])
+    masks = () if camera_file is None else camera_file.masks.values()
+    return [*(named or folders or (found or ([], []))[1]), *(root / name for name in masks if (root / name).is_file())]
 
 
 def try_cameras(path: Path) -> CameraFile | None:

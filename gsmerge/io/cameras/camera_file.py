@@ -346,7 +346,8 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
             raise SceneError(path, f"expected cameras of one image size, found {sizes}")
         size = stored[0]
         if 0 in size or size == (1, 1):
-            raise SceneError(path, "expected the image size (w, h) of the cameras, found none")
+            remedy = "add it, or give one photo for each camera, with its name or in the same order"
+            raise SceneError(path, "expected the image size (w, h) of the cameras, found none", remedy)
     check_pixels(path, *size)
     sides = np.stack([camera_file.widths, camera_file.heights], 1)
     has_size = (sides > 0).all(1, keepdims=True)

@@ -52,7 +52,7 @@ def test_columns_are_refused_before_missing_ones(tmp_path: Path) -> None:
         (MOTION, (*MOTION[:6], "3 more", "motion")),
         (("t",), ("t", "time")),
         (("albedo_0", "roughness", "Metallic"), ("albedo_0", "roughness", "Metallic", "materials")),
-        (("beta",), ("beta", "primitives")),
+        (("nu",), ("nu", "primitives")),
         (("nu_degree", "omega_0"), ("nu_degree", "primitives", "omega_0", "motion")),
         (("opacity_2", "foo"), ("opacity_2", "foo", "unknown")),
     ],
