@@ -118,19 +118,17 @@ class SceneFiles:
         paths = list(filter(None, (self.cameras, *self.others)))
         if cameras is None or not self.others:
             return []
-
-        def is_beside(path: Path) -> bool:
-            return path.parent == cameras.parent and is_colmap(path) and is_colmap(cameras)
-
-        place = paths.index(cameras)
-        shown = [cameras, *paths[:place], *filter(is_beside, paths[place + 1 :])]
+        place, models = (
+            paths.index(cameras),
+            {path for path in filter(is_colmap, paths) if path.parent == cameras.parent},
+        )
+        shown = [cameras, *paths[:place], *(path for path in paths[place + 1 :] if {path, cameras} <= models)]
         if len(shown) == 1 and not self.below:
             return []
         first, *rest = (os.path.relpath(path, self.root) + f" ({count_images(path)} images)" for path in shown)
-        text = f"cameras are read from {first}, since they fit the Gaussians" + (
-            f", not from {', '.join(rest)}" if rest else ""
-        )
-        return [f"{text.replace(' (0 images)', '')}; --cameras names others"]
+        others = f", not from {', '.join(rest)}" if rest else ""
+        text = f"cameras are read from {first}, since they fit the Gaussians{others}; --cameras names others"
+        return [text.replace(" (0 images)", "")]
 
     @property
     def is_state(self) -> bool:
@@ -469,9 +467,8 @@ def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | Non
                 return []
             inner = [entry.name for entry in entries if entry.is_dir(follow_symlinks=links)]
             found.append((place, [entry.name for entry in entries if entry.is_file()]))
-            other = _OTHER_PICTURES if links else ()
-            shown = [name for name in inner if name[0] != "." and name not in other] if depth < _MAX_DEPTH else []
-            places += [(place / name, depth + 1) for name in shown]
+            shown = {name for name in inner if name[0] != "."} - _OTHER_PICTURES if depth < _MAX_DEPTH else ()
+            places += [(place / name, depth + 1) for name in sorted(shown)]
     return found
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -187,14 +186,13 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
 
 
 def _find_listed(camera_file: CameraFile) -> tuple[list[Path | None], list[str]]:
-    """Find the masks that a camera file names, for each view; return them and a note on files that are not there."""
-    path, masks, missing = Path(camera_file.path), list[Path | None](), list[str]()
-    for name in (camera_file.masks.get(image, "") for image in camera_file.names):
-        mask = None
-        with suppress(SceneError):  # of a file outside the folder
-            mask = find_image(path.parent, name, path) if name else None
-        masks.append(mask)
-        missing += [name] if name and mask is None else []
+    """Find the masks that a camera file names, for each view; return them and a note on files that are not there.
+
+    SceneError for a file outside the folder of the cameras.
+    """
+    path, names = Path(camera_file.path), [camera_file.masks.get(image, "") for image in camera_file.names]
+    masks = [find_image(path.parent, name, path, option="--masks") if name else None for name in names]
+    missing = [name for name, mask in zip(names, masks, strict=True) if name and mask is None]
     problem = f"{len(missing)} of {len(masks)} masks that {path.name} names are not in its folder"
     remedy = f"correct these paths, or name the masks' folder with --masks: {list_some(missing)}"
     return masks, [f"{problem}; {remedy}"] if missing else []

@@ -67,7 +67,8 @@ PROGRAMS = (
     Foreign("pose/*.txt poses/*.txt", "ScanNet, NSVF or SRN", _WRITE, rf"\A({_NUMBER}\s+){{3,15}}{_NUMBER}\s*$"),
     Foreign("*.txt", "TUM, ORB-SLAM or MonST3R", "its timestamps may be those of no photo: keep the pose nearest in"
             " time to each photo, with associate.py of TUM, and turn these with `evo_traj tum` of evo and its option"
-            " save_as_kitti into lines of 12 numbers, which are read with one photo for each", rf"\A(#.*\n)*({_NUMBER}[ \t]+){{7}}{_NUMBER}\s*$"),
+            " save_as_kitti into lines of 12 numbers, which are read with one photo for each",
+            rf"\A(#.*\n)*({_NUMBER}[ \t]+){{7}}{_NUMBER}\s*$"),
     Foreign("*.txt", "RealEstate10K", _WRITE, rf"\Ahttps?:.*\n({_NUMBER}[ \t]+){{18}}{_NUMBER}\s*$"),
     Foreign("*.log", "Open3D or Tanks and Temples", _WRITE, r"\A\d+[ \t]+\d+[ \t]+\d+\s*$"),
     Foreign("*.traj", "ARKitScenes", _WRITE), Foreign("*.jgz", "CO3D", _WRITE),
