@@ -38,6 +38,7 @@ from gsmerge.io.formats.table import (
 )
 from gsmerge.io.image_names import check_photo_folder, list_images, natural_order
 from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.runtime.record import list_some
 from gsmerge.settings.reading import NONE
 from gsmerge.types import StrPath
 
@@ -126,7 +127,7 @@ class SceneFiles:
         if len(shown) == 1 and not self.below:
             return []
         first, *rest = (os.path.relpath(path, self.root) + f" ({count_images(path)} images)" for path in shown)
-        others = f", not from {', '.join(rest)}" if rest else ""
+        others = f", not from {list_some(rest)}" if rest else ""
         text = f"cameras are read from {first}, since they fit the Gaussians{others}; --cameras names others"
         return [text.replace(" (0 images)", "")]
 
@@ -444,8 +445,8 @@ def _scenes_below(folder: Path) -> list[Path]:
 def list_folders(folder: Path) -> list[tuple[Path, list[str]]]:
     """List a folder and those below it, down to a limited depth, with the names of their files, the nearest first.
 
-    Folders that have Gaussians, and belong to those, are left out, and masks and held-out views. Empty if there are too
-    many entries.
+    Folders that have Gaussians, and belong to those, are left out, and masks, held-out views, and folders of too many
+    entries.
     """
     return [(place, names) for place, names in _walk_down(folder, links=True) if names is not None]
 
@@ -453,7 +454,7 @@ def list_folders(folder: Path) -> list[tuple[Path, list[str]]]:
 def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | None]]:
     """Walk down from a folder as :func:`list_folders`; None in place of the names for a folder that is a scene.
 
-    ``links``: follow links to folders.
+    ``links``: follow links to folders. Without them, nothing is found if there are too many entries.
     """
     found, places, num_entries = list[tuple[Path, list[str] | None]](), [(folder, 0)], 0
     for place, depth in places:  # the loop appends to this list
@@ -461,10 +462,12 @@ def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | Non
             if depth and _plys_in(place):
                 found.append((place, None))
                 continue
-            entries = sorted(islice(scan, _MAX_ENTRIES + 1), key=lambda entry: entry.name)
-            num_entries += len(entries)
-            if num_entries > _MAX_ENTRIES:
+            entries = sorted(islice(scan, _MAX_ENTRIES + 1 - num_entries), key=lambda entry: entry.name)
+            if num_entries + len(entries) > _MAX_ENTRIES and not links:
                 return []
+            if num_entries + len(entries) > _MAX_ENTRIES:
+                continue
+            num_entries += len(entries)
             inner = [entry.name for entry in entries if entry.is_dir(follow_symlinks=links)]
             found.append((place, [entry.name for entry in entries if entry.is_file()]))
             shown = {name for name in inner if name[0] != "."} - _OTHER_PICTURES if depth < _MAX_DEPTH else ()

@@ -421,16 +421,17 @@ def name_by_photos(
 
 
 def _inside(path: Path, proposal: Proposal) -> str:
-    """Return the path of a file inside the folder of photos, or its name."""
+    """Return the path of a file inside the folder of photos, or its name with the name of its folder."""
     folder = proposal.folder
-    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else f"{path.parent.name}/{path.name}"
 
 
 def describe_assignment(
     proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile
 ) -> tuple[list[str], list[str]]:
     """Describe where the assignment of photos differs from their names; return notes, and notes on missing photos."""
-    by_names = f"photos are read from {proposal.folder}, whose files have the names of the cameras"
+    folders = dict.fromkeys(str(proposal.pool[assignment.photo].parent) for assignment in chosen if assignment)
+    by_names = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
     count, notes = len(chosen), [by_names] if proposal.searched else []
     changes: dict[str, list[str]] = {"turned": [], "mirrored": []}
     for assignment in chosen:

@@ -70,9 +70,10 @@ def count_images(folder: Path) -> int:
     with suppress(OSError, ValueError, struct.error, SceneError):
         if (folder / "images.bin").is_file():
             (count,) = struct.unpack("<Q", read_start(folder / "images.bin", 8))
-            return int(count) if count <= MAX_VIEWS else 0
-        stated = re.search(rb"# Number of images: (\d{1,18}),", read_start(folder / "images.txt"))
-        return int(stated[1]) if stated else len(read_colmap(CameraSource(folder), ".txt").views)
+        else:
+            stated = re.search(rb"# Number of images: (\d{1,18}),", read_start(folder / "images.txt"))
+            count = int(stated[1]) if stated else len(read_colmap(CameraSource(folder), ".txt").views)
+        return int(count) if count <= MAX_VIEWS else 0
     return 0
 
 
