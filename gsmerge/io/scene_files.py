@@ -112,7 +112,8 @@ class SceneFiles:
     @property
     def choices(self) -> list[SceneFiles]:
         """The files with each of the cameras that may belong to the scene, in the order in which they are tried."""
-        return [self, *(replace(self, cameras=path, above=()) for path in self.others)]
+        images = None if self.images == self.cameras else self.images  # those inside the cameras' file belong to it
+        return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
 
     def describe_choice(self, cameras: Path | None) -> list[str]:
         """Note which cameras are read if others were tried before, or are COLMAP models beside them; name those."""

@@ -85,7 +85,8 @@ def read_scene(
         cameras: Camera file or folder, or "none". None: search beside the ``.ply``, and warn if the cameras do not fit.
         images: Folder of images, an ``.npz`` that holds images, or "none". None: search as for cameras.
         masks: Folder of images with the names of the photos, dark where a photo does not count, or "none". None: use
-            the folder ``masks`` beside the photos, and the photos' transparency. Lighter greys are weights in a fit.
+            those that ``transforms.json`` names, or the folder ``masks`` beside the photos, and the photos'
+            transparency. Lighter greys are weights in a fit.
         protect: Folder of images with the names of the photos, white where a text or a face has to stay sharp; see
             :attr:`Scene.importance`.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
@@ -207,7 +208,7 @@ def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, p
             break
     assert best is not None
     rank, answer, cameras = best
-    if isinstance(answer, SceneError) or rank < 0:
+    if isinstance(answer, SceneError) or (rank < 0 and cameras == files.cameras):
         return answer
     return replace(answer, notes=(*files.describe_choice(cameras), *answer.notes))
 
