@@ -111,7 +111,12 @@ class SceneFiles:
 
     @property
     def choices(self) -> list[SceneFiles]:
-        """The files with each of the cameras that may belong to the scene, in the order in which they are tried."""
+        """The files with each of the cameras that may belong to the scene, in the order in which they are tried.
+
+        Cameras below are those of one folder; if several have cameras, these may be of other scenes.
+        """
+        if self.below and len({Path(os.path.relpath(path, self.root)).parts[0] for path in self.others}) > 1:
+            return [self]
         images = None if self.images == self.cameras else self.images  # those inside the cameras' file belong to it
         return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
 
@@ -155,8 +160,11 @@ class SceneFiles:
             words = shlex.join(word for option, path in self.above for word in (f"--{option}", str(path)))
             notes.append(f"{kinds} outside the scene's folder are not read; to read them, pass {words}")
         if self.below and self.cameras not in self.others:
-            paths, option = ", ".join(map(str, self.others)), shlex.join(["--cameras", str(self.others[0])])
-            notes.append(f"no photo shows that cameras in folders below fit ({paths}); to read them, pass {option}")
+            paths, option = list_some([*map(str, self.others)]), shlex.join(["--cameras", str(self.others[0])])
+            reason = (
+                "since no photo shows that they fit" if len(self.choices) > 1 else "since several folders have some"
+            )
+            notes.append(f"cameras in folders below are not read, {reason}: {paths}; to read them, pass {option}")
         return tuple(notes)
 
 

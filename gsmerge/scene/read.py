@@ -546,6 +546,8 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
     ``photos``: read photos, and raise SceneError if named ones cannot be read; False: leave photos out. SceneError if
     named cameras have no size.
     """
+    chosen = _choose_cameras(ply, files, hints, photos=True) if files.others else None
+    files = replace(chosen.files, others=(), below=False) if isinstance(chosen, Loaded) else files
     camera_file = _answer(partial(read_scene_cameras, ply, files))
     if camera_file is None:
         return _without_cameras(ply, files, hints)

@@ -155,6 +155,8 @@ def test_cameras_below_that_no_photo_confirms_are_named(tmp_path: Path) -> None:
     assert loaded.files.cameras is None
     assert len(loaded.scene) == 0
     assert noted(loaded.notes, "no photo shows", f"--cameras {tmp_path}/COLMAP/sparse/0")
+    write_colmap_text(tmp_path / "another/sparse/0", flat())
+    assert noted(load_scene(tmp_path).notes, "several folders", f"--cameras {tmp_path}/COLMAP/sparse/0")
 
 
 def test_one_model_in_its_place_has_no_note(tmp_path: Path) -> None:
