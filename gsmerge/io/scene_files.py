@@ -225,7 +225,7 @@ def find_scene_files(
     if images is None:
         image_path = _find_image_path(ply, camera_path, roots)
     if masks is None:
-        mask_path = find_mask_path(image_path, roots)
+        mask_path = _find_mask_path(image_path, roots)
     parts = tuple(plys) if len(plys) > 1 else ()
     pictures = image_path, mask_path, protect
     files = SceneFiles(
@@ -273,7 +273,7 @@ def _is_other_scene(folder: Path, ply: Path) -> bool:
     return bool(_plys_in(folder)) and all(photo.parent != folder for photo in list_images(folder))
 
 
-def find_mask_path(images: Path | None, roots: Sequence[Path]) -> Path | None:
+def _find_mask_path(images: Path | None, roots: Sequence[Path]) -> Path | None:
     """Find the folder of masks beside the images, or else in the searched folders ``roots``; None without."""
     image_folder = [] if images is None else [images.parent]
     candidates = (root / place for root in (*image_folder, *roots) for place in MASK_PLACES)

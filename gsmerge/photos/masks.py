@@ -109,9 +109,9 @@ def read_masks(
     paths, names = photos.paths, list(camera_file.names)
     if paths:
         names = [path.as_posix() for path in paths if path is not None]
-    listed, listed_notes = ([], []) if "masks" in files.named else _find_listed(camera_file)
-    masks, notes = ([None] * len(names), []) if any(listed) else _match_masks(files, names)
-    notes += listed_notes
+    of_cameras, more = ([], []) if "masks" in files.named else _find_masks_of_cameras(camera_file)
+    masks, notes = ([None] * len(names), []) if any(of_cameras) else _match_masks(files, names)
+    notes += more
     protecting: Sequence[Path | None] = [None] * len(names)
     if files.protect is not None:
         protecting, unused = match_masks(files.protect, names, "--protect")
@@ -124,8 +124,8 @@ def read_masks(
             return [None if path is None else pictures[index_of_photo[path]] for path in paths]
 
         masks, protecting = spread(masks), spread(protecting)
-    if any(listed):
-        masks = [None if paths and paths[view] is None else mask for view, mask in enumerate(listed)]
+    if any(of_cameras):
+        masks = [None if paths and paths[view] is None else mask for view, mask in enumerate(of_cameras)]
     turns = photos.turns or (0,) * len(masks)
     mask_files = MaskFiles(tuple(paths), turns, masks, protecting, stored, cut, cameras)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
@@ -185,7 +185,7 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
     return f"protect: {share:.1f} % of the photos' pixels have a weight of {weight}, by the pictures of {photos}"
 
 
-def _find_listed(camera_file: CameraFile) -> tuple[list[Path | None], list[str]]:
+def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], list[str]]:
     """Find the masks that a camera file names, for each view; return them and a note on files that are not there.
 
     SceneError for a file outside the folder of the cameras.

@@ -86,7 +86,7 @@ class Proposal:
     named: tuple[int | None, ...]  # for each camera, the index of its file in the pool; None without a proposed file
     exact: bool  # True: names propose the files; False: their order does
     faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None without a reason
-    searched: bool = False  # whether the folder was found by the names of its files
+    by_names: bool = False  # whether the folder was found by the names of its files
 
     @cached_property
     def tags(self) -> Sequence[int]:
@@ -431,8 +431,8 @@ def describe_assignment(
 ) -> tuple[list[str], list[str]]:
     """Describe where the assignment of photos differs from their names; return notes, and notes on missing photos."""
     folders = dict.fromkeys(str(proposal.pool[assignment.photo].parent) for assignment in chosen if assignment)
-    by_names = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
-    count, notes = len(chosen), [by_names] if proposal.searched else []
+    text = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
+    count, notes = len(chosen), [text] if proposal.by_names else []
     changes: dict[str, list[str]] = {"turned": [], "mirrored": []}
     for assignment in chosen:
         if assignment is not None and assignment.orientation != (tag := proposal.tags[assignment.photo]):

@@ -274,7 +274,7 @@ def _align(
     against the cameras.
     """
     proposal = _answer(partial(propose_photos, files, camera_file)) if photos else None
-    if isinstance(proposal, Proposal) and proposal.searched:
+    if isinstance(proposal, Proposal) and proposal.by_names:
         files = replace(files, images=proposal.folder)
     inside = _answer(partial(photos_inside, files, camera_file)) if photos and proposal is None else ()
     unread = next((answer for answer in (proposal, inside) if isinstance(answer, SceneError)), None)
@@ -288,7 +288,7 @@ def _align(
             answer = _assign(ply, files, cameras_left, photos_left, hints)
             load = answer.with_left_out(left_out) if isinstance(answer, Loaded) else load
         if isinstance(load, SceneError):
-            return _without_photos(ply, files, camera_file, hints, load, searched=proposal.searched)
+            return _without_photos(ply, files, camera_file, hints, load, by_names=proposal.by_names)
         return _prefer_resized(load, ply, files, proposal, camera_file, hints)
     pictures = ScenePhotos(() if isinstance(inside, SceneError) else inside)
     load = _answer(partial(_combine, ply, files, camera_file, pictures, hints))
@@ -388,17 +388,17 @@ def _without_photos(
     hints: ReadHints,
     cause: SceneError,
     *,
-    searched: bool,
+    by_names: bool,
 ) -> Loaded | SceneError:
     """Leave out photos that show no view, with a note; return why if they were named, or the cameras are in doubt.
 
     ``cause``: why photos and cameras do not fit each other. Without photos, cameras of another scene may see these
-    Gaussians as well, unless rows are their pixels, or the photos were ``searched`` by their names.
+    Gaussians as well, unless rows are their pixels, or the photos were found ``by_names``.
     """
     bare = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
     is_of_photos = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(files.images)
     are_named = "images" in files.named or _is_named(files, cause)
-    if isinstance(bare, SceneError) or are_named or not (bare.scene.has_own_pixels or is_of_photos or searched):
+    if isinstance(bare, SceneError) or are_named or not (bare.scene.has_own_pixels or is_of_photos or by_names):
         return cause
     return _note_left_out(bare, files, [f"the photos in {files.images or files.ply.parent}"], cause)
 
