@@ -8,9 +8,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from zipfile import BadZipFile
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
+from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import read_budget, read_lines
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import STATE_ENDING, may_hold_gaussians
@@ -124,9 +126,19 @@ class _Search:
             omitted = SCENE_PARTS if is_scene else ()
             folders[:] = natural_order(name for name in folders if not name.startswith(".") and name not in omitted)
             scenes = [current] if is_scene else _other_scenes(current, names)
+            scenes += [current / name for name in natural_order(files) if not is_scene and _is_packed(current / name)]
             self.num_empty = 0 if scenes else self.num_empty
             yield from ((scene, top) for scene in scenes)
         yield from unreadable
+
+
+def _is_packed(path: Path) -> bool:
+    """Return whether a file is a zip archive with Gaussians, which counts as a scene so that its reader refuses it."""
+    if path.suffix != ".zip" or path.with_suffix("").exists():  # it is unpacked already
+        return False
+    with suppress(OSError, SceneError, BadZipFile), open_archive(path) as archive:
+        return any(name.endswith(SCENE_SUFFIXES) for name in archive.namelist())
+    return False
 
 
 def _other_scenes(folder: Path, names: list[str]) -> list[Path]:

@@ -9,14 +9,22 @@ import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.foreign import check_program, find_unread
-from gsmerge.io.cameras.read import find_cameras, find_other_cameras, holds_images, read_cameras, read_sharp_camera
-from gsmerge.io.cameras.table import CHUNK
+from gsmerge.io.cameras.read import (
+    count_images,
+    find_cameras,
+    find_other_cameras,
+    holds_images,
+    list_cameras,
+    read_cameras,
+    read_sharp_camera,
+)
+from gsmerge.io.cameras.table import CHUNK, is_colmap
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.ply import header_content, header_counts, is_file_from_gsmerge
 from gsmerge.io.formats.table import (
@@ -30,6 +38,7 @@ from gsmerge.io.formats.table import (
 )
 from gsmerge.io.image_names import check_photo_folder, list_images, natural_order
 from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.runtime.record import list_some
 from gsmerge.settings.reading import NONE
 from gsmerge.types import StrPath
 
@@ -46,6 +55,7 @@ IMAGE_PLACES = (
     "keyframes/images",
 )  # fmt: skip
 MASK_PLACES = ("masks",)
+_OTHER_PICTURES = {*MASK_PLACES, "targets"}  # folders of pictures that are no photos of the scene's views
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
@@ -61,6 +71,7 @@ _PACKED = {*SCENE_SUFFIXES} - {".ply"}
 _MAX_HEADERS = 1_000  # headers of a folder's files that are read; further files count as scenes
 _MAX_DEPTH = 3  # of the folders that are searched below a folder without a scene
 _MAX_ENTRIES = 10_000  # largest number of files and folders in these folders
+_MAX_CAMERAS, _MAX_FOLDERS = 8, 100  # cameras that are tried in turn; folders in which they are searched below a scene
 
 
 @dataclass(frozen=True)
@@ -83,6 +94,9 @@ class SceneFiles:
     photo_option: str = "--images"  # names the folder of ``images``
     # Photos and cameras in the folder above or in its folders, if the scene has none, by option; never read
     above: tuple[tuple[str, Path], ...] = ()
+    others: tuple[Path, ...] = ()  # further cameras, which are tried in turn if ``cameras`` do not fit
+    below: bool = False  # whether they are in folders below, and are read only if photos show that they fit
+    root: Path | None = None  # the scene's own folder
 
     @property
     def plys(self) -> tuple[Path, ...]:
@@ -92,8 +106,36 @@ class SceneFiles:
     @property
     def paths(self) -> tuple[Path, ...]:
         """Paths of all files and folders that the scene is read from: Gaussians, cameras and pictures."""
-        beside = (self.cameras, self.images, self.masks, self.protect)
+        beside = (self.cameras, self.images, self.masks, self.protect, *self.others)
         return (*self.plys, *(path for path in beside if path is not None))
+
+    @property
+    def choices(self) -> list[SceneFiles]:
+        """The files with each of the cameras that may belong to the scene, in the order in which they are tried.
+
+        Cameras below are those of one folder; if several have cameras, these may be of other scenes.
+        """
+        if self.below and len({Path(os.path.relpath(path, self.root)).parts[0] for path in self.others}) > 1:
+            return [self]
+        images = None if self.images == self.cameras else self.images  # those inside the cameras' file belong to it
+        return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
+
+    def describe_choice(self, cameras: Path | None) -> list[str]:
+        """Note which cameras are read if others were tried before, or are COLMAP models beside them; name those."""
+        paths = list(filter(None, (self.cameras, *self.others)))
+        if cameras is None or not self.others:
+            return []
+        place, models = (
+            paths.index(cameras),
+            {path for path in filter(is_colmap, paths) if path.parent == cameras.parent},
+        )
+        shown = [cameras, *paths[:place], *(path for path in paths[place + 1 :] if {path, cameras} <= models)]
+        if len(shown) == 1 and not self.below:
+            return []
+        first, *rest = (os.path.relpath(path, self.root) + f" ({count_images(path)} images)" for path in shown)
+        others = f", not from {list_some(rest)}" if rest else ""
+        text = f"cameras are read from {first}, since they fit the Gaussians{others}; --cameras names others"
+        return [text.replace(" (0 images)", "")]
 
     @property
     def is_state(self) -> bool:
@@ -117,6 +159,12 @@ class SceneFiles:
             kinds = " and ".join({"images": "photos"}.get(option, option) for option, _ in self.above)
             words = shlex.join(word for option, path in self.above for word in (f"--{option}", str(path)))
             notes.append(f"{kinds} outside the scene's folder are not read; to read them, pass {words}")
+        if self.below and self.cameras not in self.others:
+            paths, option = list_some([*map(str, self.others)]), shlex.join(["--cameras", str(self.others[0])])
+            reason = (
+                "since no photo shows that they fit" if len(self.choices) > 1 else "since several folders have some"
+            )
+            notes.append(f"cameras in folders below are not read, {reason}: {paths}; to read them, pass {option}")
         return tuple(notes)
 
 
@@ -137,11 +185,13 @@ def find_scene_files(
     - the folder of the ``.ply``, and the folder of the file to which it links;
     - the folder above it if its own is ``gs_ply/``, ``ply/`` or ``gaussians/``, or the folder two above it if its own
       is ``point_cloud/iteration_n/``;
-    - the folders above it up to ``within``, by default up to the given folder.
+    - the folders above it up to ``within``, by default up to the given folder;
+    - for cameras, if these have none, the folders below the first of them that have no Gaussians.
 
     In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
     their order. The cameras of a result, ``NAME.cameras.json``, take precedence over all others, but come last if they
-    may not be its own. Cameras inside the ``.ply`` precede those beside it. If no place has cameras,
+    may not be its own. Of COLMAP's models in one place, the one with the most images comes first. Cameras inside the
+    ``.ply`` precede those beside it. If no place has cameras,
     the only file of any name that holds cameras is taken. Without it, cameras of a program whose files are not read are
     taken, so that the reader says so. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder,
     because the model saw these. A result of gsmerge is taken as the scene only if a folder has nothing else.
@@ -169,25 +219,37 @@ def find_scene_files(
         if part.suffix.lower() in SEVERAL_USES:
             _CHECK_SCENE_FILE(part)
     roots = _search_roots(path, ply, within)
+    others, below = list[Path](), False
     if cameras is None:
-        camera_path = _find_camera_path(ply, roots)
+        camera_path, others, below = _find_camera_paths(ply, roots)
     if images is None:
         image_path = _find_image_path(ply, camera_path, roots)
     if masks is None:
         mask_path = _find_mask_path(image_path, roots)
     parts = tuple(plys) if len(plys) > 1 else ()
     pictures = image_path, mask_path, protect
-    files = SceneFiles(ply, camera_path, *pictures, parts=parts, num_copies=num_copies, named=named)
+    files = SceneFiles(
+        ply, camera_path, *pictures, parts=parts, num_copies=num_copies, named=named, others=tuple(others),
+        below=below, root=roots[0],
+    )  # fmt: skip
     return files if within is not None else replace(files, above=_find_above(files, roots))
 
 
-def _find_camera_path(ply: Path, roots: Sequence[Path]) -> Path | None:
-    """Find the cameras of a scene, in the order of precedence of :func:`find_scene_files`; None without."""
+def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, list[Path], bool]:
+    """Find the cameras of a scene, in the order of precedence of :func:`find_scene_files`; None without.
+
+    Also list others beside the scene, or if there are none, in the folders below, and return whether these are below.
+    """
     of_result = result_cameras(ply)
     if of_result is not None and _count_signs(ply) == 2:
-        return of_result
-    searched = (find(root) for find in (find_cameras, find_other_cameras, find_unread) for root in roots)
-    return next((path for path in searched if path is not None), of_result)
+        return of_result, [], False
+    known = dict.fromkeys(path for root in roots for path in list_cameras(root))
+    cameras = [*islice(known, _MAX_CAMERAS)] or [*filter(None, map(find_other_cameras, roots))][:1]
+    if cameras:
+        return cameras[0], cameras[1:], False
+    folders = list_folders(roots[0])[:_MAX_FOLDERS]
+    below = dict.fromkeys(path for folder, _ in folders for path in list_cameras(folder))
+    return next(filter(None, map(find_unread, roots)), of_result), [*islice(below, _MAX_CAMERAS)], bool(below)
 
 
 def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
@@ -386,19 +448,40 @@ def _plys_in(folder: Path) -> list[Path]:
 
 def _scenes_below(folder: Path) -> list[Path]:
     """List the folders of scenes below a folder, down to a limited depth; empty if there are too many entries."""
-    scenes, places, num_entries = [], [(folder, 0)], 0
+    return natural_order(place for place, names in _walk_down(folder, links=False) if names is None)
+
+
+def list_folders(folder: Path) -> list[tuple[Path, list[str]]]:
+    """List a folder and those below it, down to a limited depth, with the names of their files, the nearest first.
+
+    Folders that have Gaussians, and belong to those, are left out, and masks, held-out views, and folders of too many
+    entries.
+    """
+    return [(place, names) for place, names in _walk_down(folder, links=True) if names is not None]
+
+
+def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | None]]:
+    """Walk down from a folder as :func:`list_folders`; None in place of the names for a folder that is a scene.
+
+    ``links``: follow links to folders. Without them, nothing is found if there are too many entries.
+    """
+    found, places, num_entries = list[tuple[Path, list[str] | None]](), [(folder, 0)], 0
     for place, depth in places:  # the loop appends to this list
-        with suppress(OSError), os.scandir(place) as entries:
+        with suppress(OSError), os.scandir(place) as scan:
             if depth and _plys_in(place):
-                scenes.append(place)
+                found.append((place, None))
                 continue
-            for entry in entries:
-                num_entries += 1
-                if num_entries > _MAX_ENTRIES:
-                    return []
-                if depth < _MAX_DEPTH and entry.name[0] != "." and entry.is_dir(follow_symlinks=False):
-                    places.append((place / entry.name, depth + 1))
-    return natural_order(scenes)
+            entries = sorted(islice(scan, _MAX_ENTRIES + 1 - num_entries), key=lambda entry: entry.name)
+            if num_entries + len(entries) > _MAX_ENTRIES and not links:
+                return []
+            if num_entries + len(entries) > _MAX_ENTRIES:
+                continue
+            num_entries += len(entries)
+            inner = [entry.name for entry in entries if entry.is_dir(follow_symlinks=links)]
+            found.append((place, [entry.name for entry in entries if entry.is_file()]))
+            shown = {name for name in inner if name[0] != "."} - _OTHER_PICTURES if depth < _MAX_DEPTH else ()
+            places += [(place / name, depth + 1) for name in sorted(shown)]
+    return found
 
 
 def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:

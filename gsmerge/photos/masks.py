@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.image_names import match_masks
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.image_names import find_image, match_masks
 from gsmerge.io.photo_files import Size, decode_alpha, decode_levels, decode_small, image_size, same_shape
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import turn_picture
@@ -95,7 +96,7 @@ class MaskFiles:
 
 def read_masks(
     files: SceneFiles,
-    names: Sequence[str],
+    camera_file: CameraFile,
     photos: ScenePhotos,
     stored: Size,
     cut: Callable[[int, np.ndarray], np.ndarray],
@@ -103,12 +104,14 @@ def read_masks(
 ) -> tuple[Masks, list[str]]:
     """Read the masks of photos whose upright size is ``stored``; return them and notes.
 
-    ``names``: names of the views, used if their photos are inside another file. ``cut``: as in :class:`MaskFiles`.
+    Masks that the cameras' file names come before those beside the scene. ``cut``: as in :class:`MaskFiles`.
     """
-    paths = photos.paths
+    paths, names = photos.paths, list(camera_file.names)
     if paths:
         names = [path.as_posix() for path in paths if path is not None]
-    masks, notes = _match_masks(files, names)
+    of_cameras, more = ([], []) if "masks" in files.named else _find_masks_of_cameras(camera_file)
+    masks, notes = ([None] * len(names), []) if any(of_cameras) else _match_masks(files, names)
+    notes += more
     protecting: Sequence[Path | None] = [None] * len(names)
     if files.protect is not None:
         protecting, unused = match_masks(files.protect, names, "--protect")
@@ -121,6 +124,8 @@ def read_masks(
             return [None if path is None else pictures[index_of_photo[path]] for path in paths]
 
         masks, protecting = spread(masks), spread(protecting)
+    if any(of_cameras):
+        masks = [None if paths and paths[view] is None else mask for view, mask in enumerate(of_cameras)]
     turns = photos.turns or (0,) * len(masks)
     mask_files = MaskFiles(tuple(paths), turns, masks, protecting, stored, cut, cameras)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
@@ -180,6 +185,19 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
     return f"protect: {share:.1f} % of the photos' pixels have a weight of {weight}, by the pictures of {photos}"
 
 
+def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], list[str]]:
+    """Find the masks that a camera file names, for each view; return them and a note on files that are not there.
+
+    SceneError for a file outside the folder of the cameras.
+    """
+    path, names = Path(camera_file.path), [camera_file.masks.get(image, "") for image in camera_file.names]
+    masks = [find_image(path.parent, name, path, option="--masks") if name else None for name in names]
+    missing = [name for name, mask in zip(names, masks, strict=True) if name and mask is None]
+    problem = f"{len(missing)} of {len(masks)} masks that {path.name} names are not in its folder"
+    remedy = f"correct these paths, or name the masks' folder with --masks: {list_some(missing)}"
+    return masks, [f"{problem}; {remedy}"] if missing else []
+
+
 def _match_masks(files: SceneFiles, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
     """Find the masks of photos; return them and notes. SceneError if a folder that the user named has none of them."""
     if files.masks is None:
@@ -202,11 +220,8 @@ def check_masks(masks: Masks, files: SceneFiles) -> tuple[Masks, list[str]]:
         count = int((~counts.all((1, 2))).sum())
         pixels = f"{100 * share:.0f} % of the photos' pixels"
         return masks, [f"masks leave out {pixels}; {count} of {len(counts)} photos have a mask"]
-    if files.masks is None:
-        return NO_MASKS, [
-            "the photos' transparency is not used as a mask, since they are transparent nearly everywhere"
-        ]
     problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % of their pixels dark"
-    if "masks" not in files.named:
-        return NO_MASKS, [f"masks are not used: {files.masks}: {problem}; name them with --masks"]
+    if "masks" not in files.named or files.masks is None:
+        where = files.masks or "transparency, or masks that the cameras' file names"
+        return NO_MASKS, [f"masks are not used: {where}: {problem}; name them with --masks"]
     raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")

@@ -41,6 +41,7 @@ from gsmerge.kernels.pictures import is_mirrored, turn_picture
 from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
 from gsmerge.photos.grid_fit import GridFit, choose_fit, list_fits
 from gsmerge.photos.offsets import SIDE, correlate_parts
+from gsmerge.photos.photo_folders import capture_folder, count_pixels, find_named_photos
 from gsmerge.photos.pictures import ViewPictures, show_views
 from gsmerge.photos.scores import stands_out
 from gsmerge.raster.photos import row_pictures
@@ -48,9 +49,7 @@ from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
-_MODEL_FOLDERS = ("0", "sparse", "colmap")  # names of COLMAP models in a scene's folder, which may also be one itself
 UNNAMED = "view 0"  # name of the first camera if the format, or rows without cameras, have no names
-_REDUCED = "images_*"  # folders of smaller copies; their names end with the factor
 SEEN_PLACE = "images_resized"  # WorldMirror writes its input photos there; tall photos in "images" are squeezed
 
 
@@ -87,6 +86,7 @@ class Proposal:
     named: tuple[int | None, ...]  # for each camera, the index of its file in the pool; None without a proposed file
     exact: bool  # True: names propose the files; False: their order does
     faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None without a reason
+    by_names: bool = False  # whether the folder was found by the names of its files
 
     @cached_property
     def tags(self) -> Sequence[int]:
@@ -124,9 +124,14 @@ def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | Non
         folder, pool, named = _find_near_cameras(files, camera_file)
     elif files.images is not None and files.images.is_dir():
         folder, pool = files.images, list_images(files.images)
-        named = propose_images(folder, pool, names, _count_pixels)
+        named = propose_images(folder, pool, names, count_pixels)
     else:
         return None
+    found = None
+    if "images" not in files.named and len(known := {*named} - {None}) < len(names) and names[0] != UNNAMED:
+        roots = dict.fromkeys(path.absolute() for path in (capture_folder(Path(camera_file.path)), files.root) if path)
+        found = find_named_photos([*roots], camera_file, len(known))
+        folder, pool, named = found or (folder, pool, named)
     exact = any(named) and camera_file.source != ESTIMATED
     if not any(named) and len(pool) == len(names):
         named = list(pool)
@@ -136,36 +141,22 @@ def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | Non
         _describe_missing(folder, name) if exact and path is None else None
         for name, path in zip(names, named, strict=True)
     )
-    return _drop_unreadable(Proposal(folder, tuple(pool), (), exact, faults), named)
+    return _drop_unreadable(Proposal(folder, tuple(pool), (), exact, faults, found is not None), named)
 
 
 def _find_near_cameras(files: SceneFiles, camera_file: CameraFile) -> tuple[Path, list[Path], list[Path | None]]:
-    """Find photos near the camera file: the files that it names, smaller copies of them, or files beside the ``.ply``.
+    """Find photos near the camera file: the files that it names, or files beside the ``.ply``.
 
     Returns their folder, all files, and the file that belongs to each camera by its name; None without.
     """
     path, names = Path(camera_file.path), camera_file.names
-    folder = path if path.is_dir() and path.name not in _MODEL_FOLDERS else path.parent
+    folder = capture_folder(path)
     named = [find_image(folder, name, path, option=files.photo_option) for name in names]
     pool = list(dict.fromkeys(path for path in named if path is not None))
-    if not pool:
-        pool, named = _find_reduced(folder, names)
-        named = named or [None] * len(names)
     is_nameless = all(name.removeprefix("view ").isdecimal() for name in names)
     if not pool and is_nameless:
         folder, pool = files.ply.parent, images_beside(files.ply)  # AnySplat writes its Gaussians among the photos
     return folder, pool, named
-
-
-def _find_reduced(folder: Path, names: Sequence[str]) -> tuple[list[Path], list[Path | None]]:
-    """Find photos in the first folder of smaller copies, ``images_2`` and so on, that has any with these names."""
-    reduced = [place for place in folder.glob(_REDUCED) if place.name.rpartition("_")[2].isdecimal() and place.is_dir()]
-    for place in natural_order(reduced):
-        pool = list_images(place)
-        named = propose_images(place, pool, names, _count_pixels)
-        if any(named):
-            return pool, named
-    return [], []
 
 
 def _describe_missing(folder: Path, name: str) -> str:
@@ -198,15 +189,6 @@ def _drop_unreadable(proposal: Proposal, named: Sequence[Path | None], *, decode
     ids = {path: number for number, path in enumerate(pool)}
     photos = tuple(None if path is None else ids.get(path) for path in named)
     return replace(proposal, pool=pool, named=photos, faults=camera_faults)
-
-
-def _count_pixels(path: Path) -> int:
-    """Count the pixels of an image file; 0 where it cannot be read."""
-    try:
-        width, height = image_size(path)
-    except SceneError:
-        return 0
-    return width * height
 
 
 def _find_fault(path: Path, *, decode: bool = False) -> str | None:
@@ -439,9 +421,9 @@ def name_by_photos(
 
 
 def _inside(path: Path, proposal: Proposal) -> str:
-    """Return the path of a file inside the folder of photos, or its name."""
+    """Return the path of a file inside the folder of photos, or its name with the name of its folder."""
     folder = proposal.folder
-    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else f"{path.parent.name}/{path.name}"
 
 
 def describe_assignment(
@@ -451,7 +433,9 @@ def describe_assignment(
 
     ``are_pixels``: the rows are pixels of the views, so no view lacks its camera.
     """
-    count, notes = len(chosen), list[str]()
+    folders = dict.fromkeys(str(proposal.pool[assignment.photo].parent) for assignment in chosen if assignment)
+    text = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
+    count, notes = len(chosen), [text] if proposal.by_names else []
     changes: dict[str, list[str]] = {"turned": [], "mirrored": []}
     for assignment in chosen:
         if assignment is not None and assignment.orientation != (tag := proposal.tags[assignment.photo]):

@@ -15,6 +15,7 @@ from gsmerge.io.cameras.dataparser import DATAPARSER
 from gsmerge.io.cameras.foreign import INTRINSICS
 from gsmerge.io.cameras.long_lrm import FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
+from gsmerge.photos.photo_folders import capture_folder, find_named_photos
 from gsmerge.photos.scene_photos import images_beside
 
 EXTRA_FILES = (DATAPARSER, INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files
@@ -43,21 +44,24 @@ def content_hash(files: Sequence[Path]) -> str:
 def list_files(files: SceneFiles) -> list[Path]:
     """List all files and folders from which a scene is read, each once."""
     paths = list(files.paths)
-    if files.cameras is not None:
-        root = files.cameras if files.cameras.is_dir() else files.cameras.parent
-        folders = (root, files.cameras.parent, files.ply.parent)
+    for cameras in filter(None, (files.cameras, *files.others)):
+        root = cameras if cameras.is_dir() else cameras.parent
+        folders = (root, cameras.parent, files.ply.parent)
         paths += [folder / name for folder in folders for name in EXTRA_FILES if (folder / name).exists()]
-        paths += list_photos(files.cameras) or ([] if files.images else images_beside(files.ply))
+        paths += list_photos(cameras) or ([] if files.images else images_beside(files.ply))
     return list(dict.fromkeys(paths))
 
 
 def list_photos(cameras: Path) -> list[Path]:
-    """List the photos of a camera file: the files that it names, otherwise image folders beside it."""
+    """List the photos of a camera file: the files that it names, or image folders, or files by its names; and masks."""
     camera_file = try_cameras(cameras)
     root = cameras if cameras.is_dir() else cameras.parent
     names = () if camera_file is None else camera_file.names
     named = [root / name for name in names if (root / name).is_file()]
-    return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
+    found = None if named or camera_file is None else find_named_photos([capture_folder(cameras)], camera_file, 0)
+    folders = [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
+    masks = () if camera_file is None else camera_file.masks.values()
+    return [*(named or folders or (found or ([], []))[1]), *(root / name for name in masks if (root / name).is_file())]
 
 
 def try_cameras(path: Path) -> CameraFile | None:

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsmerge.cameras import ESTIMATED, NO_CAMERAS_USED, Alignment, AlignmentResult, Recovery, align, check_pixels
+import numpy as np
+
+from gsmerge.cameras import ESTIMATED, NO_CAMERAS_USED, AlignmentResult, align, check_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
-from gsmerge.io.formats.arrays import FLAT_COMMENT, RESULT_COMMENT
-from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
+from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.read import GaussianFile, file_notes, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
-from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
+from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
 from gsmerge.photos.assign import Assignment
 from gsmerge.photos.grid_fit import GridFit
@@ -47,13 +48,13 @@ from gsmerge.photos.scene_photos import (
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import (
     NO_HINTS,
-    Exporter,
     ReadHints,
     choose_exporters,
     find_cameras_of_model,
     find_exporter,
     make_hints,
 )
+from gsmerge.scene.loaded import Loaded
 from gsmerge.scene.rows import read_rotations, take_gaussians
 from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
@@ -62,64 +63,6 @@ from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """A scene, with all facts about its files and how they were read."""
-
-    scene: Scene  # with pixels if the rows have them
-    info: FileInfo
-    files: SceneFiles
-    # the cameras as stored in their file, in the order of the views; None without cameras, or if they do not fit
-    cameras: CameraFile | None
-    exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
-    notes: tuple[str, ...]  # adapted or unusual content, one sentence each, without a full stop
-    # how well every view's Gaussians project into their own pixels; None if rows have no pixels
-    alignment: Alignment | None = None
-    recovery: Recovery | None = None  # the layout of rows that fits best, and by how much; None without pixels
-    problem: str | None = None  # why the rows have no pixels, in one sentence; None if they have
-    # how far each camera was moved to its Gaussians; empty if none was moved
-    moves: Sequence[dict[str, Any]] = ()
-    joined: Sequence[dict[str, Any]] = ()  # where each of several joined scenes lies; empty for one scene
-    left_out: str | None = None  # the note on files beside the scene that do not belong to it
-    own_views: int = 0  # views of the grid that rows without pixels here form by themselves; 0 if they form none
-
-    def pixel_scene(self) -> Scene:
-        """Return the scene; SceneError with the reason if it does not have one Gaussian per pixel."""
-        if self.scene.has_own_pixels:
-            return self.scene
-        raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
-
-    def without_photos(self) -> Loaded:
-        """Return a copy without the photos inside the camera file, which frees memory; the scene keeps its own."""
-        return replace(self, cameras=None if self.cameras is None else replace(self.cameras, images=()))
-
-    def with_left_out(self, notes: Sequence[str]) -> Loaded:
-        """Return a copy with notes on files that were found beside the scene and are not used."""
-        left_out = "; ".join(filter(None, (self.left_out, *notes))) or None
-        return replace(self, notes=(*self.notes, *notes), left_out=left_out) if notes else self
-
-    @property
-    def comments(self) -> tuple[str, ...]:
-        """Comments of the file's header that a result copies; not the comment on 2D Gaussians, since results are 3D."""
-        return tuple(comment for comment in kept_comments(self.info) if comment != FLAT_COMMENT)
-
-    @property
-    def recognised(self) -> dict[str, Any]:
-        """Facts about the input for a report."""
-        cameras, recovery, info = self.scene.cameras, self.recovery, self.info
-        facts: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
-        facts |= {"num_photos": len(self.scene.photo_views)}
-        facts |= {"exporters": [entry.name for entry in self.exporters], "rows": recovery and recovery.description}
-        facts |= {"moved_cameras": list(self.moves), "bytes": info.file_bytes}
-        if self.files.parts:
-            facts["parts"] = [str(path) for path in self.files.parts]
-        if self.joined:
-            num_bytes = sum(os.stat(file["path"]).st_size for file in self.joined if file["joined"])
-            facts |= {"files": list(self.joined), "bytes": num_bytes}
-        facts |= {"layout": info.layout, "sh_degree": info.sh_degree, "opacity_encoding": info.opacity_encoding}
-        return facts | {"num_nonfinite": info.num_nonfinite, "left_out": self.left_out}
 
 
 @check_arguments
@@ -143,7 +86,8 @@ def read_scene(
         cameras: Camera file or folder, or "none". None: search beside the ``.ply``, and warn if the cameras do not fit.
         images: Folder of images, an ``.npz`` that holds images, or "none". None: search as for cameras.
         masks: Folder of images with the names of the photos, dark where a photo does not count, or "none". None: use
-            the folder ``masks`` beside the photos, and the photos' transparency. Lighter greys are weights in a fit.
+            those that ``transforms.json`` names, or the folder ``masks`` beside the photos, and the photos'
+            transparency. Lighter greys are weights in a fit.
         protect: Folder of images with the names of the photos, white where a text or a face has to stay sharp; see
             :attr:`Scene.importance`.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
@@ -238,7 +182,7 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
     Cameras and photos that were found beside the scene and do not belong to it are left out, with a note. SceneError as
     in :func:`read_scene`. ``photos=False``: search no photos.
     """
-    answer = _read_views(ply, files, hints, photos=photos)
+    answer = _choose_cameras(ply, files, hints, photos=photos)
     lacks_views = isinstance(answer, Loaded) and answer.own_views > len(answer.scene)
     if isinstance(answer, Loaded) and not lacks_views:
         return answer
@@ -263,6 +207,44 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
     options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
     read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
     raise SceneError(answer.path, answer.problem, "; ".join(filter(None, (answer.remedy, read_alone))))
+
+
+def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
+    """Read the views of the first cameras that fit, or fit best, with a note if there are others; or return why not."""
+    best: tuple[float, Loaded | SceneError, Path | None] | None = None
+    for choice in files.choices:
+        answer = _read_views(ply, choice, hints, photos=photos)
+        rank = _rank_cameras(ply, answer, files)
+        best = (rank, answer, choice.cameras) if best is None or rank > best[0] else best
+        if rank >= 1:
+            break
+    assert best is not None
+    rank, answer, cameras = best
+    if isinstance(answer, SceneError) or (rank < 0 and cameras == files.cameras):
+        return answer
+    return replace(answer, notes=(*files.describe_choice(cameras), *answer.notes))
+
+
+def _rank_cameras(ply: GaussianFile, answer: Loaded | SceneError, files: SceneFiles) -> float:
+    """Rank how well cameras fit: from 0 if photos show it, from 1 beyond doubt; below 0 if nothing shows it.
+
+    Beyond doubt are pixels, and cameras that fit as they are stored, with colours nearer to those of the photos than to
+    those of random pixels. Cameras in a folder below the scene's are of no use if no photo shows that they fit.
+    """
+    if isinstance(answer, SceneError):
+        return -2.0
+    scene, is_below = answer.scene, answer.files.cameras in files.others and files.below
+    if scene.images is None and (files.below or (answer.left_out is not None and not scene.has_own_pixels)):
+        return -2.0 if is_below else -1.0
+    if not files.others or scene.images is None or scene.has_own_pixels:
+        return 1.0
+    from gsmerge.cameras import check_cameras  # few scenes need it
+
+    views, stored = list(scene.photo_views), read_scene_cameras(ply, answer.files)
+    valid, images = np.ones(len(scene.gaussians), bool), photo_array(scene.images)[views]
+    score = check_cameras(scene.gaussians, valid, scene.cameras[views], images).score
+    is_moved = not (stored and answer.cameras and np.array_equal(stored.viewmats, answer.cameras.viewmats))
+    return score if is_moved or score < 0.5 else 1 + score
 
 
 def _answer(read: Callable[[], T]) -> T | SceneError:
@@ -304,6 +286,8 @@ def _align(
     against the cameras.
     """
     proposal = _answer(partial(propose_photos, files, camera_file)) if photos else None
+    if isinstance(proposal, Proposal) and proposal.by_names:
+        files = replace(files, images=proposal.folder)
     inside = _answer(partial(photos_inside, files, camera_file)) if photos and proposal is None else ()
     unread = next((answer for answer in (proposal, inside) if isinstance(answer, SceneError)), None)
     if unread is not None and ("images" in files.named or files.images == files.cameras):
@@ -316,7 +300,7 @@ def _align(
             answer = _assign(ply, files, cameras_left, photos_left, hints)
             load = answer.with_left_out(left_out) if isinstance(answer, Loaded) else load
         if isinstance(load, SceneError):
-            return _without_photos(ply, files, camera_file, hints, load)
+            return _without_photos(ply, files, camera_file, hints, load, by_names=proposal.by_names)
         return _prefer_resized(load, ply, files, proposal, camera_file, hints)
     pictures = ScenePhotos(() if isinstance(inside, SceneError) else inside)
     load = _answer(partial(_combine, ply, files, camera_file, pictures, hints))
@@ -410,17 +394,23 @@ def _combine_chosen(
 
 
 def _without_photos(
-    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints, cause: SceneError
+    ply: GaussianFile,
+    files: SceneFiles,
+    camera_file: CameraFile,
+    hints: ReadHints,
+    cause: SceneError,
+    *,
+    by_names: bool,
 ) -> Loaded | SceneError:
     """Leave out photos that show no view, with a note; return why if they were named, or the cameras are in doubt.
 
     ``cause``: why photos and cameras do not fit each other. Without photos, cameras of another scene may see these
-    Gaussians as well, unless rows are their pixels.
+    Gaussians as well, unless rows are their pixels, or the photos were found ``by_names``.
     """
     bare = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
     is_of_photos = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(files.images)
     are_named = "images" in files.named or _is_named(files, cause)
-    if isinstance(bare, SceneError) or are_named or not (bare.scene.has_own_pixels or is_of_photos):
+    if isinstance(bare, SceneError) or are_named or not (bare.scene.has_own_pixels or is_of_photos or by_names):
         return cause
     return _note_left_out(bare, files, [f"the photos in {files.images or files.ply.parent}"], cause)
 
@@ -463,11 +453,15 @@ def _combine(
     left_out, place = list[str](), (camera_file, photos, size, result.transform, result.cameras)
     found = _answer(lambda: find_larger_and_masks(files, *place))
     if isinstance(found, SceneError):
-        if "masks" in files.named or files.masks is None or not Path(found.path).is_relative_to(files.masks):
+        path, is_protect = (
+            Path(found.path),
+            files.protect is not None and Path(found.path).is_relative_to(files.protect),
+        )
+        if "masks" in files.named or path in photos.paths or is_protect:
             raise found
         remedy = found.remedy or f"pass --masks FOLDER, or --masks {NONE}"
-        left_out = [f"the masks in {files.masks} are left out: {found.path}: {found.problem}; {remedy}"]
-        found = find_larger_and_masks(replace(files, masks=None), *place)
+        left_out = [f"the masks in {path.parent} are left out: {found.path}: {found.problem}; {remedy}"]
+        found = find_larger_and_masks(replace(files, masks=None, named=files.named | {"masks"}), *place)
     large, masks, mask_notes = found
     load = _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
     return load.with_left_out(left_out)
@@ -565,6 +559,8 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
     ``photos``: read photos, and raise SceneError if named ones cannot be read; False: leave photos out. SceneError if
     named cameras have no size.
     """
+    chosen = _choose_cameras(ply, files, hints, photos=True) if files.others else None
+    files = replace(chosen.files, others=(), below=False) if isinstance(chosen, Loaded) else files
     camera_file = _answer(partial(read_scene_cameras, ply, files))
     if camera_file is None:
         return _without_cameras(ply, files, hints)

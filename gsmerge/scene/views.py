@@ -110,7 +110,7 @@ def find_larger_and_masks(
     if window.is_larger:
         width, height = (pixels.stop - pixels.start for pixels in (window.columns, window.rows))
         large = LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
-    return large, *read_masks(files, camera_file.names, photos, stored, cut, cameras)
+    return large, *read_masks(files, camera_file, photos, stored, cut, cameras)
 
 
 @dataclass(frozen=True, eq=False)

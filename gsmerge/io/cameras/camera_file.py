@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -83,6 +83,7 @@ class CameraFile:
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty if the file holds no images
     order: str = "auto"  # order of the Gaussians' rows; "auto" if the file does not name it
     lenses: tuple[Lens | None, ...] = ()  # of each camera, None for a pinhole; empty if all are pinholes
+    masks: Mapping[str, str] = field(default_factory=dict)  # names of images -> of their masks, if the file has them
     has_intrinsics: bool = True  # False if the file has poses alone; `Ks` are then placeholders
     # Size of the photos, and the transform of these photos to the cameras' size; None before the photos are known
     photo_map: tuple[Size, PhotoTransform] | None = None
@@ -125,6 +126,7 @@ class StoredView(NamedTuple):
     K: np.ndarray | None
     size: tuple[int, int] = (0, 0)  # (width, height), pixels; 0 where unknown
     lens: Lens | None = None  # None for a pinhole
+    mask: str = ""  # name of its image's mask
 
 
 def make_pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
@@ -177,6 +179,7 @@ def make_camera_file(
         images=images,
         order=order,
         lenses=lenses if any(lenses) else (),
+        masks={view.name: view.mask for view in views if view.mask},
         has_intrinsics=not lacks_intrinsics,
     )
 
@@ -343,7 +346,8 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
             raise SceneError(path, f"expected cameras of one image size, found {sizes}")
         size = stored[0]
         if 0 in size or size == (1, 1):
-            raise SceneError(path, "expected the image size (w, h) of the cameras, found none")
+            remedy = "add it, or give one photo for each camera, with its name or in the same order"
+            raise SceneError(path, "expected the image size (w, h) of the cameras, found none", remedy)
     check_pixels(path, *size)
     sides = np.stack([camera_file.widths, camera_file.heights], 1)
     has_size = (sides > 0).all(1, keepdims=True)

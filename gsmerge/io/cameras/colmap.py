@@ -6,6 +6,7 @@ import os
 import re
 import struct
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,9 +14,10 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rotation_entries
-from gsmerge.io.bounds import MAX_MODEL_BYTES, read_lines
+from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, read_lines
 from gsmerge.io.cameras.camera_file import StoredView, check_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
+from gsmerge.io.first_bytes import read_start
 
 # Number of parameters of each model, in the order of the models' ids; the first are focal lengths and principal point
 _NUM_PARAMS = {
@@ -61,6 +63,18 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})") from error
     return StoredCameras([cameras[camera]._replace(name=name, pose=pose) for name, camera, pose in images])
+
+
+def count_images(folder: Path) -> int:
+    """Count the images of a COLMAP model by its header, or by its lines if text has no header; 0 if it is damaged."""
+    with suppress(OSError, ValueError, struct.error, SceneError):
+        if (folder / "images.bin").is_file():
+            (count,) = struct.unpack("<Q", read_start(folder / "images.bin", 8))
+        else:
+            stated = re.search(rb"# Number of images: (\d{1,18}),", read_start(folder / "images.txt"))
+            count = int(stated[1]) if stated else len(read_colmap(CameraSource(folder), ".txt").views)
+        return int(count) if count <= MAX_VIEWS else 0
+    return 0
 
 
 def _numbers(file: BinaryIO, form: str) -> tuple[Any, ...]:

@@ -34,13 +34,14 @@ _REALITY = "RealityScan or RealityCapture", "export its registration as COLMAP, 
 _OPENMVS = "{}InterfaceCOLMAP of OpenMVS make a COLMAP model of it"
 _ODM = "ODM", "name its opensfm/reconstruction.json"
 _OPENMVG = "OpenMVG", "openMVG_main_openMVG2Colmap makes a COLMAP model of it"
-# The first existing place is read. A COLMAP model directly in the folder comes last, because Depth Anything 3 puts a
-# model there at the photos' own size
+# The first existing place is read; of the COLMAP models that match a pattern, the one with the most images. A model
+# directly in the folder comes last, because Depth Anything 3 puts a model there at the photos' own size
 CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
-    "cameras.json", "camera_params.json", "sparse/0", "sparse", "colmap/sparse/0", "colmap", "exports/npz/results.npz",
-    "exports/mini_npz/results.npz", "results.npz", "cameras.npz", "camera_poses.txt", "keyframes/corrected_cameras",
-    "keyframes/cameras", "reconstruction.json", "opensfm/reconstruction.json", "cameras.xml", "0", ".",
+    "cameras.json", "camera_params.json", "sparse/*", "sparse", "colmap/sparse/*", "colmap",
+    "distorted/sparse/*", "exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "cameras.npz",
+    "camera_poses.txt", "keyframes/corrected_cameras", "keyframes/cameras", "reconstruction.json",
+    "opensfm/reconstruction.json", "cameras.xml", "[0-9]*", ".",
 )  # fmt: skip
 PROGRAMS = (
     Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
@@ -64,8 +65,10 @@ PROGRAMS = (
     Foreign("*.vrs *_loop_trajectory.csv", "Project Aria", _NERFSTUDIO.format("aria")),
     Foreign("*.sens", "ScanNet", _WRITE),
     Foreign("pose/*.txt poses/*.txt", "ScanNet, NSVF or SRN", _WRITE, rf"\A({_NUMBER}\s+){{3,15}}{_NUMBER}\s*$"),
-    Foreign("*.txt", "TUM, ORB-SLAM or MonST3R", "`evo_traj tum` of evo, with its option save_as_kitti, makes"
-            " lines of 12 numbers of it, which are read", rf"\A(#.*\n)*({_NUMBER}[ \t]+){{7}}{_NUMBER}\s*$"),
+    Foreign("*.txt", "TUM, ORB-SLAM or MonST3R", "its timestamps may be those of no photo: keep the pose nearest in"
+            " time to each photo, with associate.py of TUM, and turn these with `evo_traj tum` of evo and its option"
+            " save_as_kitti into lines of 12 numbers, which are read with one photo for each",
+            rf"\A(#.*\n)*({_NUMBER}[ \t]+){{7}}{_NUMBER}\s*$"),
     Foreign("*.txt", "RealEstate10K", _WRITE, rf"\Ahttps?:.*\n({_NUMBER}[ \t]+){{18}}{_NUMBER}\s*$"),
     Foreign("*.log", "Open3D or Tanks and Temples", _WRITE, r"\A\d+[ \t]+\d+[ \t]+\d+\s*$"),
     Foreign("*.traj", "ARKitScenes", _WRITE), Foreign("*.jgz", "CO3D", _WRITE),

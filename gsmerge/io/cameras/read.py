@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from gsmerge.errors import SceneError
@@ -12,6 +13,7 @@ from gsmerge.io.cameras.camera_source import CameraSource, check_objects
 from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program
 from gsmerge.io.cameras.table import CAMERA_ENDINGS, CAMERA_FORMATS, CHUNK, KEYFRAME, SHARP_PLY, is_colmap, is_keyframes
 from gsmerge.io.cameras.viewer_cameras import ENDING
+from gsmerge.io.image_names import natural_order
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.types import StrPath
 from gsmerge.values.arguments import check_arguments
@@ -19,18 +21,27 @@ from gsmerge.values.arguments import check_arguments
 _lazy = lazy_functions(__package__)
 holds_images = _lazy("npz_files.holds_images")
 _holds_poses = _lazy("npz_files.holds_poses")
+count_images = _lazy("colmap.count_images")
 _MAX_CANDIDATES = 16  # files in a folder that are searched for cameras
 _CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt")
 
 
 def find_cameras(folder: Path) -> Path | None:
-    """Find the first known camera file below a folder, or its only ``.torch`` chunk."""
+    """Find the first of :func:`list_cameras`; None without."""
+    return next(list_cameras(folder), None)
+
+
+def list_cameras(folder: Path) -> Iterator[Path]:
+    """Yield the known camera files below a folder, the one to prefer first, and its only ``.torch`` chunk."""
     for place in CAMERA_PLACES:
         candidate = folder / place
-        if candidate.is_file() or (candidate.is_dir() and _is_camera_folder(candidate)):
-            return candidate
+        if "*" in place:
+            models = natural_order(path for path in folder.glob(place) if is_colmap(path))
+            yield from sorted(models, key=lambda path: -count_images(path)) if len(models) > 1 else models
+        elif candidate.is_file() or (candidate.is_dir() and _is_camera_folder(candidate)):
+            yield candidate
     chunks = [chunk for chunk in folder.glob(f"*{CHUNK}") if chunk.is_file()]
-    return chunks[0] if len(chunks) == 1 else None
+    yield from chunks if len(chunks) == 1 else []
 
 
 def _is_camera_folder(folder: Path) -> bool:

@@ -56,7 +56,7 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
                 values = _with_size(path, name, layout, values, size_of)
             size = round(values.get("w", 0)), round(values.get("h", 0))
             K = _intrinsics(path, name, layout, values) if has_intrinsics else None
-            views.append(StoredView(name, pose, K, size, lens))
+            views.append(StoredView(name, pose, K, size, lens, values.get("mask", "")))
     return StoredCameras(views if layout.finish is None else layout.finish(source, views))
 
 
@@ -99,7 +99,7 @@ def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None
 def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:
     """Convert the intrinsics, size and lens in the values of a view, or of the object that views share.
 
-    The result has the keys of ``number_keys``, "K" for a matrix, and for a lens "model", "is_fisheye",
+    The result has the keys of ``number_keys``, "K" for a matrix, "mask", and for a lens "model", "is_fisheye",
     "distortion_params" and the coefficients, as far as the file has them. Errors as in :func:`convert`.
     """
     keys = layout.number_keys | ({name: name for name in _COEFFICIENTS} if layout.lens else {})
@@ -112,6 +112,8 @@ def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, A
         camera["h"], camera["w"] = convert(_two_numbers, layout.size, values[layout.size])
     if isinstance(layout.K, Matrix) and values.get(layout.K.key) is not None:
         camera["K"] = layout.K.read(values)
+    if values.get(layout.mask):
+        camera["mask"] = str(values[layout.mask])
     if not layout.lens:
         return camera
     if values.get(layout.lens) is not None:

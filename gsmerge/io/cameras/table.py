@@ -79,6 +79,7 @@ _TRANSFORMS = ViewLayout(
     pose=Matrix("transform_matrix"),  # applied_transform is not applied: poses are in the Gaussians' world
     K=Pinhole("fl_x", "fl_y", "cx", "cy", angle_x="camera_angle_x", angle_y="camera_angle_y"),
     size=("w", "h"),
+    mask="mask_path",
     lens="camera_model",
     optional=("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model"),
 )

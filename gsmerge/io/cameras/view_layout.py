@@ -133,6 +133,7 @@ class ViewLayout:
         models: The program's names of camera models -> COLMAP's names; equal names are left out.
         optional: Keys that a view may lack. Without a size, the size of the image counts. If no view of the file has a
             focal length, it is estimated later.
+        mask: Key of the name of the image's mask; "" if there is none.
         finish: A function that completes the views from other content of the file or folder; None: nothing to add.
     """
 
@@ -146,6 +147,7 @@ class ViewLayout:
     lens: str = ""
     models: Mapping[str, str] = field(default_factory=dict)
     optional: Sequence[Key] = ()
+    mask: str = ""
     finish: Callable[[CameraSource, list[StoredView]], list[StoredView]] | None = None
 
     @property

@@ -45,6 +45,11 @@ COLUMN_KINDS = (
         remedy="save the Gaussians of that network as .ply",
     ),
     ColumnKind(
+        "the kernels of Beta splats",
+        r"beta|sb_(params|number).*|betas?_\d+",
+        remedy="train 3D Gaussians on the photos, since no Gaussian has the shape of these kernels",
+    ),
+    ColumnKind(
         "time and motion",
         r"t|t_?\d+|time(stamp)?|(mu|mean|center)_t|motion.*|omega.*|rot_?[lr](_\d+)?|(angular_)?(velocity|vel|acceleration"
         r"|acc).*|v[xyz]|(delta|d|deform|dynamic|traj|flow|poly|fourier|control|keyframe)_.*|[xyz]_?t?\d+"
@@ -60,8 +65,8 @@ COLUMN_KINDS = (
     ),
     ColumnKind(
         "the shape of other primitives than Gaussians",
-        r"(beta|nu|degree|shape|kernel|sharpness|gamma|exponent|epsilon|eps|inverse_deviation|nd|hermite|sites?|skew"
-        r"|dof|hardness|edge|cutoff|truncat)(_.*)?|nu_?degree|negative.*|sb_.*",
+        r"(nu|degree|shape|kernel|sharpness|gamma|exponent|epsilon|eps|inverse_deviation|nd|hermite|sites?|skew"
+        r"|dof|hardness|edge|cutoff|truncat)(_.*)?|nu_?degree|negative.*",
         "they are drawn as Gaussians",
     ),
     ColumnKind(
@@ -114,8 +119,9 @@ def _check_types(path: Path, row: np.dtype[np.void]) -> None:
         is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
         if is_used and dtype.kind != "f" and not is_color_byte:
             type_name = _NUMBERS[dtype.kind][dtype.itemsize // 2]
-            problem = f"expected {name} as float, found {type_name}, which may be half floats or indices of a codebook"
-            raise SceneError(path, problem, "export it with floats")
+            whole = "values of 0 to 255" if dtype.itemsize == 1 else "half floats"
+            problem = f"expected {name} as float, found {type_name}, which may be {whole} or indices of a codebook"
+            raise SceneError(path, problem, "export it with floats, opacities as logits or in [0, 1]")
 
 
 def describes_places(name: str) -> bool:

@@ -157,11 +157,12 @@ def _vertex_rows(path: Path, data: PlyData) -> tuple[np.ndarray, str]:
 def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
     """Return rows without the prefix before the names of the columns, and this prefix; "" if there is none.
 
-    CloudCompare writes "scalar_" before names that are not its own, and "scalar_scal_" if it writes the file again.
+    Columns ``rotation_0`` to ``rotation_3`` are renamed, too. CloudCompare writes "scalar_" before names that are not
+    its own, and "scalar_scal_" if it writes the file again.
     """
     names, known_name = tuple(rows.dtype.names or ()), arrays.QUATS[0]
     prefix = next((name.removesuffix(known_name) for name in names if name.endswith(known_name)), "")
-    stripped = [name.removeprefix(prefix) for name in names]
+    stripped = [re.sub(r"^rotation_(?=[0-3]$)", "rot_", name.removeprefix(prefix)) for name in names]
     if known_name in names or rows.dtype.hasobject or len(set(stripped)) < len(names):
         return rows, ""
     types = [rows.dtype[name] for name in names]
@@ -377,6 +378,9 @@ def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
         if bytes_left < -1:  # the last row of a text may end without a new line
             expected = f"element '{element.name}' with {element.count} rows"
             raise _truncated(path, expected, bytes_before // row_bytes, "early end of file")
+    if is_text and "," in start[end + len(last_line) :].split(newline, 1)[0].decode("latin-1"):
+        problem = "expected numbers with decimal points and spaces between them, found commas in the first row"
+        raise SceneError(path, problem, "export it again with decimal points, or as binary")
     return end + len(last_line), is_text
 
 
@@ -409,6 +413,10 @@ def _check_element(budget: ReadBudget, element: _Element) -> None:
         raise SceneError(path, f"expected a number of rows, found {count} rows of element '{name}'", _AGAIN)
     if count and not num_columns:
         raise SceneError(path, f"expected columns, found element '{name}' of {count} rows without any", _AGAIN)
+    unknown = sorted({words[0] for words in element.properties if len(words) == 1} - _SIZES.keys())
+    if unknown:
+        problem = f"expected columns of float or another type of PLY, found {unknown[0]!r:.40} in element '{name}'"
+        raise SceneError(path, problem, "export it again with columns of float")
     if has_lists and name == "vertex":
         raise SceneError(path, "expected one number per column and vertex, found a list property", _AGAIN)
     if has_lists and count * num_columns > MAX_LIST_VALUES:

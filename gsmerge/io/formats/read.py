@@ -385,6 +385,12 @@ def _choose_encoding(
     values = opacities if len(empty) == 0 else opacities.copy()
     values[empty] = np.nan
     declared = _declared_encoding(paths, parts, values)
+    finite = values[np.isfinite(values)] if declared is None else values[:0]
+    if len(finite) and finite.min() >= 0 and finite.max() <= 255:
+        share = 100 * np.count_nonzero(finite > ply.MAX_LOGIT) / len(finite)
+        if share > 100 * arrays.MAX_STRAY:
+            problem = f"expected opacities as logits or in [0, 1], found 0 to 255: {share:.3g} % are above any logit"
+            raise SceneError(paths[0], problem, "divide them by 255, or for logits use --hint opacity=logit")
     return declared or _guess_encoding(values), declared is None
 
 

@@ -7,6 +7,7 @@ import pathlib
 import sys
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import pytest
 from batches import touch
@@ -52,6 +53,18 @@ def test_a_point_cloud_with_the_name_of_a_scene_is_a_scene_that_fails() -> None:
     assert actual("all/a") == ["all/a"]
     with refuses(SceneError, "all/d", "cloud.ply"):
         actual("all/d")
+
+
+def test_an_archive_with_gaussians_is_a_scene_that_fails() -> None:
+    """Unless it was unpacked beside it; an archive of photos is none."""
+    touch("all/a.ply", "all/done/scene.ply")
+    for name, member in (("new", "x/scene.ply"), ("done", "scene.ply"), ("photos", "1.jpg")):
+        with ZipFile(f"all/{name}.zip", "w") as archive:
+            archive.writestr(member, b"0")
+    Path("all/broken.zip").write_bytes(b"PK")
+    assert actual("all") == ["all/a.ply", "all/new.zip", "all/done"]
+    with refuses(SceneError, "all/new.zip", "zip archive", "unpack"):
+        find_scene_files("all/new.zip")
 
 
 def test_the_output_folder_is_not_searched() -> None:

@@ -52,7 +52,7 @@ def test_columns_are_refused_before_missing_ones(tmp_path: Path) -> None:
         (MOTION, (*MOTION[:6], "3 more", "motion")),
         (("t",), ("t", "time")),
         (("albedo_0", "roughness", "Metallic"), ("albedo_0", "roughness", "Metallic", "materials")),
-        (("beta",), ("beta", "primitives")),
+        (("nu",), ("nu", "primitives")),
         (("nu_degree", "omega_0"), ("nu_degree", "primitives", "omega_0", "motion")),
         (("opacity_2", "foo"), ("opacity_2", "foo", "unknown")),
     ],
@@ -96,4 +96,46 @@ def test_plain_colours_are_bytes_or_floats(kind: str, right: bool, tmp_path: Pat
         assert file_notes(read_ply(path).info) == ()
         return
     with refuses(SceneError, "a.ply", "red", "ushort"):
+        read_ply(path)
+
+
+def test_kernels_of_beta_splats_are_refused(tmp_path: Path) -> None:
+    with refuses(SceneError, "a.ply", "beta", "sb_params_0", "Beta splats"):
+        read_ply(with_columns(tmp_path / "a.ply", "beta", "sb_params_0"))
+
+
+def test_opacities_of_0_to_255_are_refused(tmp_path: Path) -> None:
+    """Unless the caller says that they are logits; logits of opaque Gaussians stay logits."""
+    rows = columns(300)
+    rows["opacity"] = np.arange(300) % 256
+    path = save(tmp_path / "a.ply", rows)
+    with refuses(SceneError, "a.ply", "0 to 255", "opacity=logit"):
+        read_ply(path)
+    assert read_ply(path, opacity="logit").info.opacity_encoding == "logit"
+    rows["opacity"] = np.linspace(0, 12, 300)
+    assert read_ply(save(tmp_path / "b.ply", rows)).info.opacity_encoding == "logit"
+    with refuses(SceneError, "c.ply", "opacity", "uchar", "0 to 255"):
+        read_ply(save(tmp_path / "c.ply", rows.astype([(n, "u1" if n == "opacity" else "<f4") for n in NAMES])))
+
+
+def test_rotations_of_another_name(tmp_path: Path) -> None:
+    rows = columns(6)
+    path = save(tmp_path / "a.ply", rows)
+    rows.dtype.names = tuple(name.replace("rot_", "rotation_") for name in NAMES)
+    other = read_ply(save(tmp_path / "b.ply", rows))
+    assert np.array_equal(other.gaussians.quats, read_ply(path).gaussians.quats)
+    assert other.info.extra_columns == ()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [(b"0.5", b"0,5", ("commas", "decimal points")), (b"float x", b"half x", ("'half'", "float"))],
+)
+def test_texts_that_no_ply_has(tmp_path: Path, old: bytes, new: bytes, said: tuple[str, ...]) -> None:
+    head = "".join(f"property float {name}\n" for name in NAMES)
+    text = f"ply\nformat ascii 1.0\nelement vertex 1\n{head}end_header\n{'0.5 ' * len(NAMES)}\n".encode()
+    (path := tmp_path / "a.ply").write_bytes(text)
+    assert len(read_ply(path).gaussians) == 1
+    path.write_bytes(text.replace(old, new))
+    with refuses(SceneError, "a.ply", *said):
         read_ply(path)

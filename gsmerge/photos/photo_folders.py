@@ -1,0 +1,77 @@
+"""Find the folders whose files have the names of a scene's cameras, whatever the folders are called."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.image_names import IMAGE_SUFFIXES, propose_images
+from gsmerge.io.photo_files import decode_small, image_size, same_shape
+from gsmerge.io.scene_files import list_folders
+from gsmerge.photos.offsets import SIDE
+
+_MAX_FOLDERS = 4  # folders whose photos are compared with the views
+_ROUNDING = 1 / 255  # mean difference of channels that rounding to 8 bits may cause
+_MODEL_FOLDERS = {"sparse", "colmap", "distorted"}  # names of folders that have COLMAP's models
+
+
+def capture_folder(cameras: Path) -> Path:
+    """Return the folder of a capture from its camera file or COLMAP model, which may also be that folder itself."""
+    if not cameras.is_dir():
+        return cameras.parent
+    places = cameras, *cameras.parents
+    return next(place for place in places if not {place.name, place.parent.name} & _MODEL_FOLDERS)
+
+
+def find_named_photos(
+    roots: Sequence[Path], camera_file: CameraFile, num_known: int
+) -> tuple[Path, list[Path], list[Path | None]] | None:
+    """Find the folder at or below ``roots`` in which most cameras, and more than ``num_known``, have a photo by name.
+
+    Of several, photos with the endings of the names come first; then those near the cameras, below the first root; then
+    those with colours, unlike masks and depths, with the size of the cameras, with their shape, and with more pixels.
+    Returns the folder, its photos and those of the next best folders, and the photo of each camera; None without.
+    """
+    pools = dict[Path, dict[Path, None]]()  # folder -> photos in it and below
+    for root in roots:
+        for folder, names in list_folders(root):
+            photos = [folder / name for name in names if PurePath(name).suffix.lower() in IMAGE_SUFFIXES]
+            for place in [folder, *(above for above in folder.parents if above.is_relative_to(root))]:
+                pools.setdefault(place, {}).update(dict.fromkeys(photos))
+
+    sizes = list(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True))
+    endings = {PurePath(name).name for name in camera_file.names}
+
+    def rank(folder: Path) -> tuple[Any, ...]:
+        found = propose_images(folder, list(pools[folder]), camera_file.names, count_pixels)
+        first, is_grey = next(filter(count_pixels, filter(None, found)), None), False
+        if first is None:
+            return 0, folder
+        own, size = sizes[found.index(first)], image_size(first)
+        with suppress(SceneError):
+            is_grey = bool(np.ptp(decode_small(first, SIDE), axis=-1).mean() <= _ROUNDING)
+        count, num_exact = len({*found} - {None}), sum(path.name in endings for path in filter(None, found))
+        look = is_grey, size != own, min(own) > 1 and not same_shape(own, size), -count_pixels(first)
+        nested = len(pools[folder]), -len(folder.parts), folder  # the folder itself rather than one above it
+        return -count, -num_exact, not folder.is_relative_to(roots[0]), *look, *nested
+
+    best = [folder for count, *_, folder in sorted(map(rank, pools)) if -count > num_known][:_MAX_FOLDERS]
+    if not best:
+        return None
+    pool = list(dict.fromkeys(path for folder in best for path in pools[folder]))
+    return best[0], pool, propose_images(best[0], list(pools[best[0]]), camera_file.names, count_pixels)
+
+
+def count_pixels(path: Path) -> int:
+    """Count the pixels of an image file; 0 where it cannot be read."""
+    try:
+        width, height = image_size(path)
+    except SceneError:
+        return 0
+    return width * height

@@ -1,0 +1,75 @@
+"""A scene as it was read, with all facts about its files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gsmerge.cameras import Alignment, Recovery
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.formats.arrays import FLAT_COMMENT
+from gsmerge.io.formats.read import FileInfo, kept_comments
+from gsmerge.io.scene_files import SceneFiles
+from gsmerge.scene.exporters import Exporter
+from gsmerge.types import Scene
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A scene, with all facts about its files and how they were read."""
+
+    scene: Scene  # with pixels if the rows have them
+    info: FileInfo
+    files: SceneFiles
+    # the cameras as stored in their file, in the order of the views; None without cameras, or if they do not fit
+    cameras: CameraFile | None
+    exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
+    notes: tuple[str, ...]  # adapted or unusual content, one sentence each, without a full stop
+    # how well every view's Gaussians project into their own pixels; None if rows have no pixels
+    alignment: Alignment | None = None
+    recovery: Recovery | None = None  # the layout of rows that fits best, and by how much; None without pixels
+    problem: str | None = None  # why the rows have no pixels, in one sentence; None if they have
+    # how far each camera was moved to its Gaussians; empty if none was moved
+    moves: Sequence[dict[str, Any]] = ()
+    joined: Sequence[dict[str, Any]] = ()  # where each of several joined scenes lies; empty for one scene
+    left_out: str | None = None  # the note on files beside the scene that do not belong to it
+    own_views: int = 0  # views of the grid that rows without pixels here form by themselves; 0 if they form none
+
+    def pixel_scene(self) -> Scene:
+        """Return the scene; SceneError with the reason if it does not have one Gaussian per pixel."""
+        if self.scene.has_own_pixels:
+            return self.scene
+        raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
+
+    def without_photos(self) -> Loaded:
+        """Return a copy without the photos inside the camera file, which frees memory; the scene keeps its own."""
+        return replace(self, cameras=None if self.cameras is None else replace(self.cameras, images=()))
+
+    def with_left_out(self, notes: Sequence[str]) -> Loaded:
+        """Return a copy with notes on files that were found beside the scene and are not used."""
+        left_out = "; ".join(filter(None, (self.left_out, *notes))) or None
+        return replace(self, notes=(*self.notes, *notes), left_out=left_out) if notes else self
+
+    @property
+    def comments(self) -> tuple[str, ...]:
+        """Comments of the file's header that a result copies; not the comment on 2D Gaussians, since results are 3D."""
+        return tuple(comment for comment in kept_comments(self.info) if comment != FLAT_COMMENT)
+
+    @property
+    def recognised(self) -> dict[str, Any]:
+        """Facts about the input for a report."""
+        cameras, recovery, info = self.scene.cameras, self.recovery, self.info
+        facts: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+        facts |= {"num_photos": len(self.scene.photo_views)}
+        facts |= {"exporters": [entry.name for entry in self.exporters], "rows": recovery and recovery.description}
+        facts |= {"moved_cameras": list(self.moves), "bytes": info.file_bytes}
+        if self.files.parts:
+            facts["parts"] = [str(path) for path in self.files.parts]
+        if self.joined:
+            num_bytes = sum(os.stat(file["path"]).st_size for file in self.joined if file["joined"])
+            facts |= {"files": list(self.joined), "bytes": num_bytes}
+        facts |= {"layout": info.layout, "sh_degree": info.sh_degree, "opacity_encoding": info.opacity_encoding}
+        return facts | {"num_nonfinite": info.num_nonfinite, "left_out": self.left_out}
