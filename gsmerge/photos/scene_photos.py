@@ -19,13 +19,15 @@ import numpy as np
 
 from gsmerge.cameras import ESTIMATED
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import CameraFile, select_views
+from gsmerge.io.cameras.camera_file import CameraFile, select_views, sizes_of
 from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.cameras.table import CHUNK
+from gsmerge.io.cameras.table import CHUNK, FFGS
 from gsmerge.io.first_bytes import CONVERT
 from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_order, propose_images
 from gsmerge.io.photo_files import (
+    WHOLE,
+    Part,
     PhotoArrays,
     Size,
     decode_image,
@@ -33,16 +35,20 @@ from gsmerge.io.photo_files import (
     decode_small,
     decode_views,
     image_size,
+    limit_size,
     orientation_turn,
+    part_size,
+    resize_to,
     same_shape,
 )
 from gsmerge.io.scene_files import SceneFiles
-from gsmerge.kernels.pictures import is_mirrored, turn_picture
+from gsmerge.kernels.pictures import count_bars, is_mirrored, turn_picture
 from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
-from gsmerge.photos.grid_fit import GridFit, choose_fit, list_fits
+from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits, list_parts, sharpen
 from gsmerge.photos.offsets import SIDE, correlate_parts
 from gsmerge.photos.pictures import ViewPictures, show_views
 from gsmerge.photos.scores import stands_out
+from gsmerge.photos.views import pick_views
 from gsmerge.raster.photos import row_pictures
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
@@ -50,6 +56,8 @@ from gsmerge.types import Scene
 
 _MODEL_FOLDERS = ("0", "sparse", "colmap")  # names of COLMAP models in a scene's folder, which may also be one itself
 UNNAMED = "view 0"  # name of the first camera if the format, or rows without cameras, have no names
+_COMPARED = 8  # most photos whose parts are compared with their views
+_BAR_SPREAD = 8  # largest range of a bar's colours, of 255
 _REDUCED = "images_*"  # folders of smaller copies; their names end with the factor
 SEEN_PLACE = "images_resized"  # WorldMirror writes its input photos there; tall photos in "images" are squeezed
 
@@ -61,7 +69,7 @@ class ScenePhotos:
     pictures: PhotoArrays = ()  # [h,w,3] uint8, black for a camera without a photo; empty without photos
     paths: tuple[Path | None, ...] = ()  # None for a camera without a photo; empty if the photos are inside a file
     turns: tuple[int, ...] = ()  # how each file is turned; see gsmerge.kernels.pictures.turn_picture
-    notes: tuple[str, ...] = ()  # how the photos were chosen, one sentence each
+    part: Part = WHOLE  # the part of each turned photo that is used
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -73,8 +81,9 @@ class ScenePhotos:
 
     @property
     def file_size(self) -> Size | None:
-        """Most frequent size of turned photos in their files, of two the larger one; None if they are in no files."""
-        sizes = [_turned_size(path, turn) for path, turn in zip(self.paths, self.turns, strict=True) if path]
+        """Most frequent size of what is used of turned photos, of two the larger one; None if they are in no files."""
+        files = [file for file in zip(self.paths, self.turns, strict=True) if file[0]]
+        sizes = [part_size(_turned_size(path, turn), self.part) for path, turn in files if path]
         return max(set(sizes), key=lambda size: (sizes.count(size), size[0] * size[1])) if sizes else None
 
 
@@ -87,6 +96,8 @@ class Proposal:
     named: tuple[int | None, ...]  # for each camera, the index of its file in the pool; None without a proposed file
     exact: bool  # True: names propose the files; False: their order does
     faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None without a reason
+    fit: PartFit = WHOLE_FIT  # what is used of each photo
+    notes: tuple[str, ...] = ()  # on what is used of the photos
 
     @cached_property
     def tags(self) -> Sequence[int]:
@@ -265,17 +276,19 @@ def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_
     """
     paths = tuple(None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen)
     turns = tuple(0 if assignment is None else assignment.orientation for assignment in chosen)
-    size = ScenePhotos((), paths, turns).file_size
+    photos = ScenePhotos((), paths, turns, proposal.fit.part)
+    size = photos.file_size
     if size is None:
         return ScenePhotos()
     if camera_file.source == SHARP:
         size = int(camera_file.widths[0]), int(camera_file.heights[0])
     for path, turn in zip(paths, turns, strict=True):
-        if path is not None and camera_file.source != SHARP and not same_shape(_turned_size(path, turn), size):
-            width, height = _turned_size(path, turn)
+        part = size if path is None else part_size(_turned_size(path, turn), photos.part)
+        if camera_file.source != SHARP and not same_shape(part, size):
+            width, height = part
             problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
             raise SceneError(proposal.folder, problem)
-    return ScenePhotos(decode_views(paths, turns, size), paths, turns)
+    return replace(photos, pictures=decode_views(paths, turns, proposal.fit.stretch(size), proposal.fit.part))
 
 
 def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:
@@ -343,6 +356,7 @@ def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
             small = decode_small(proposal.pool[photo], SIDE)
         except SceneError:  # an unreadable photo is black and fits no view
             small = np.zeros((SIDE, SIDE, 3), np.float32)
+        small = proposal.fit.cut(small)
         return small if fit is None else fit.cut(small)
 
     return Candidates(read, len(proposal.pool), proposal.tags)
@@ -356,7 +370,7 @@ def assign_to_views(
     read: bool,
     guessed: Sequence[int] = (),
     fit: GridFit | None = None,
-) -> list[Assignment | None]:
+) -> tuple[list[Assignment | None], bool]:
     """Assign files to the views of a scene, each with its camera; see :func:`gsmerge.photos.assign.assign_photos`.
 
     Args:
@@ -368,7 +382,7 @@ def assign_to_views(
         fit: How files are resized and cropped to the pixels of a grid.
 
     Returns:
-        The file of each camera with its turn; None without a photo.
+        The file of each camera with its turn, None without a photo; and whether the proposed photos explain most views.
     """
     views = [list(cameras).index(camera) for camera in dict.fromkeys(cameras)]  # layers of a camera have one photo
     named = [proposal.named[cameras[view]] for view in views]
@@ -383,11 +397,11 @@ def assign_to_views(
     def show(side: int) -> ViewPictures:
         return show_views(replace(scene, masks=masks), side)[views]
 
-    assigned = assign_photos(show, candidates, named, exact=proposal.exact, stored=stored)
+    assigned, are_alike = assign_photos(show, candidates, named, exact=proposal.exact, stored=stored)
     chosen = proposal.choice
     for view, assignment in zip(views, assigned, strict=True):
         chosen[cameras[view]] = assignment
-    return [None if camera in guessed else assignment for camera, assignment in enumerate(chosen)]
+    return [None if camera in guessed else assignment for camera, assignment in enumerate(chosen)], are_alike
 
 
 def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
@@ -408,6 +422,65 @@ def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
         scores = [float(correlate_parts(shown, view, simple.cut(photo)).mean()) for photo in photos]
         chosen.append(photos[int(np.argmax(scores))] if photos else None)
     return choose_fit(shown, chosen, (simple, *other_fits)) if any(photo is not None for photo in chosen) else simple
+
+
+def has_other_shape(proposal: Proposal, camera_file: CameraFile) -> bool:
+    """Return whether the proposed photos have another aspect ratio than all cameras of a file, and no known crop."""
+    photo, shapes = next((photo for photo in proposal.named if photo is not None), None), sizes_of(camera_file)
+    if photo is None or not shapes or camera_file.photo_map is not None or camera_file.source in (FFGS, SHARP):
+        return False
+    size = proposal.fit.stretch(part_size(image_size(proposal.pool[photo]), proposal.fit.part))
+    return not any(same_shape(shape, size) for shape in shapes)
+
+
+def has_bars(scene: Scene) -> bool:
+    """Return whether the first photo of a scene has bars on opposite sides."""
+    if scene.images is None:
+        return False
+    above, below, left, right = count_bars(scene.images[0], _BAR_SPREAD / 255)
+    return bool((above and below) or (left and right))
+
+
+def choose_part(
+    scene: Scene, proposal: Proposal, camera_file: CameraFile, grid_fit: GridFit | None = None
+) -> Proposal | None:
+    """Find the part of the proposed photos that shows the views; None if whole photos fit as well, or if no part does.
+
+    A part fits if it explains the views as a photo does (:meth:`Assigner.explain_most`). ``grid_fit``: how the whole
+    photos would fit a grid whose cameras were estimated.
+    """
+    named = [(view, photo) for view, photo in enumerate(proposal.named) if photo is not None]
+    views, photos = zip(*(named[i] for i in pick_views(len(named), _COMPARED)), strict=True) if named else ((), ())
+    sizes = [image_size(proposal.pool[photo]) for photo in photos]
+    shapes_differ = not all(same_shape(size, sizes[0]) for size in sizes)
+    if not photos or shapes_differ or any(proposal.tags[photo] for photo in photos):
+        return None
+
+    def read(photo: int) -> tuple[np.ndarray, np.ndarray]:
+        """Read a photo small, and the shares of its sides that bars have."""
+        with suppress(SceneError):
+            whole = decode_image(proposal.pool[photo], size := image_size(proposal.pool[photo]))
+            above, below, left, right = count_bars(whole, _BAR_SPREAD)
+            small = resize_to(size, limit_size(size, 4 * SIDE)).photos([whole])[0]
+            return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
+        return np.zeros((SIDE, SIDE, 3), np.float32), np.zeros(4)
+
+    pictures, bars = zip(*parallel_map(read, photos), strict=True)
+    left, above, right, below = np.median(bars, 0).tolist()
+    inner, shape = (left, above, 1 - right, 1 - below), (scene.cameras.width, scene.cameras.height)
+    shape = next(iter(sizes_of(camera_file)), shape)
+    fits: list[GridFit | PartFit] = [] if grid_fit is None else [grid_fit]
+    if grid_fit is None:
+        inner = sharpen(inner, sizes[0], shape)
+    fits += list_parts(sizes[0], shape if grid_fit is None else None, inner)
+    fit = choose_fit(show_views(scene, SIDE)[views], pictures, fits)
+    if isinstance(fit, GridFit) or fit == WHOLE_FIT:
+        return None
+    candidates = Candidates(lambda photo: fit.cut(pictures[photo]), len(photos), [0] * len(photos))
+    assigner = Assigner(lambda side: show_views(scene, side)[views], candidates)
+    is_right = assigner.explain_most([Assignment(photo, 0) for photo in range(len(photos))])
+    note = fit.describe(sizes[0], bars=fit.part == inner != WHOLE)
+    return replace(proposal, fit=fit, notes=(*proposal.notes, note)) if is_right else None
 
 
 def shows_better(scene: Scene, other: Scene) -> bool:
@@ -433,7 +506,7 @@ def name_by_photos(
         name if file is None else _inside(file, proposal) for name, file in zip(camera_file.names, files, strict=True)
     ]
     turns = [0 if assignment is None else assignment.orientation for assignment in chosen]
-    size = ScenePhotos((), tuple(files), tuple(turns)).file_size
+    size = ScenePhotos((), tuple(files), tuple(turns), proposal.fit.part).file_size
     named = replace(camera_file, names=tuple(names))
     return named if fit is None or size is None else fit.cameras(named, size)
 
@@ -519,9 +592,13 @@ def refuse_photos(
 def _describe_mismatch(proposal: Proposal, camera_file: CameraFile) -> str:
     """Say that no photo shows any view, and which photos are missing."""
     views = f"the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
+    found = "none that shows one of them"
+    if has_other_shape(proposal, camera_file) and camera_file.source != ESTIMATED:
+        width, height = image_size(next(proposal.pool[photo] for photo in proposal.named if photo is not None))
+        found = f"{width} x {height}, of which no part shows one of them"
     faults = [fault for fault in proposal.faults if fault is not None]
     reasons = f" ({list_some(faults, '; ')})" if faults else ""
-    return f"expected photos of {views}, found none that shows one of them{reasons}"
+    return f"expected photos of {views}, found {found}{reasons}"
 
 
 def without_photo(scene: Scene, views: Sequence[int]) -> Scene:
