@@ -44,12 +44,13 @@ from gsmerge.io.photo_files import (
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import count_bars, is_mirrored, turn_picture
 from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
+from gsmerge.photos.colors import cut_blocks
 from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits, list_parts, sharpen
 from gsmerge.photos.offsets import SIDE, correlate_parts
-from gsmerge.photos.pictures import ViewPictures, show_views
+from gsmerge.photos.pictures import Pairs, ViewPictures, show_views
 from gsmerge.photos.scores import stands_out
 from gsmerge.photos.views import pick_views
-from gsmerge.raster.photos import row_pictures
+from gsmerge.raster.photos import row_pictures, shrink_pictures
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
@@ -483,15 +484,22 @@ def choose_part(
     return replace(proposal, fit=fit, notes=(*proposal.notes, note)) if is_right else None
 
 
-def shows_better(scene: Scene, other: Scene) -> bool:
-    """Return whether the photos of ``scene`` match its Gaussians better than the photos of ``other`` match its own."""
+def shows_better(scene: Scene, other: Scene, *, colors: bool = False) -> bool:
+    """Return whether the photos of ``scene`` match its Gaussians better than the photos of ``other`` match its own.
+
+    With ``colors``, the colours themselves are compared; otherwise their local contrast.
+    """
     if len(scene) != len(other):
         return False
     scores = list[np.ndarray]()
     for scored in (scene, other):
         shown, images = show_views(scored, SIDE), scored.images
         assert images is not None
-        scores.append(np.concatenate([correlate_parts(shown, view, images[view]) for view in range(len(scored))]))
+        if colors:
+            photos = shrink_pictures(images, *shown.weights.shape[2:0:-1])
+            scores.append(-cut_blocks(Pairs(photos, shown)).errors())
+        else:
+            scores.append(np.concatenate([correlate_parts(shown, view, images[view]) for view in range(len(scored))]))
     return stands_out(scores[0] - scores[1])
 
 

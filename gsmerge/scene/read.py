@@ -10,9 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from gsmerge.cameras import ESTIMATED, Alignment, AlignmentResult, Recovery, align, check_pixels
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import move_views
+from gsmerge.geometry.transforms import move_views, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.formats.arrays import FLAT_COMMENT, RESULT_COMMENT
@@ -148,8 +150,8 @@ def read_scene(
         protect: Folder of images with the names of the photos, white where a text or a face has to stay sharp; see
             :attr:`Scene.importance`.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
-        **hints: ``exporter``, ``quats``, ``scales``, ``order``, ``scene_scale``, ``max_side``, see
-            :class:`gsmerge.settings.reading.ReadHints`.
+        **hints: ``exporter``, ``quats``, ``scales``, ``colors``, ``order``, ``scene_scale``, ``max_side``,
+            see :class:`gsmerge.settings.reading.ReadHints`.
 
     Returns:
         The scene; its ``pixels`` are None if the pixels of the rows are unknown.
@@ -229,7 +231,7 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
     # An exporter of raw opacities does not decide: they are recognised, and some of its versions write logits
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
         opacity = "logit"
-    encodings: dict[str, Any] = {"opacity": opacity, "scales": hints.scales}
+    encodings: dict[str, Any] = {"opacity": opacity, "scales": hints.scales, "colors": hints.colors}
     return read_parts(files.parts, **encodings) if files.parts else read_gaussians(files.ply, **encodings)
 
 
@@ -241,18 +243,32 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
     """
     answer = _read_views(ply, files, hints, photos=photos)
     if isinstance(answer, Loaded):
-        return answer
+        return _confirm_colors(answer)
     if "cameras" not in files.named and files.cameras not in (None, files.ply) and not _is_named(files, answer):
         fewer = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
         alone = _read_views(ply, fewer, hints, photos=photos)
         lacks_named = "images" in files.named and files.images is not None
         if isinstance(alone, Loaded) and not (lacks_named and alone.scene.images is None):
-            return _note_left_out(alone, files, [str(files.cameras)], answer)
+            return _confirm_colors(_note_left_out(alone, files, [str(files.cameras)], answer))
     if "cameras" not in files.named:
         _check_hints(ply, hints)
     options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
     read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
     raise SceneError(answer.path, answer.problem, "; ".join(filter(None, (answer.remedy, read_alone))))
+
+
+def _confirm_colors(load: Loaded) -> Loaded:
+    """Return a scene whose guessed RGB is read as harmonics if photos show that; the guess stays without photos."""
+    units, scene = load.info.color_units, load.scene
+    if units is None or not load.info.color_note or scene.images is None:
+        return load
+    rgb = sh0_to_rgb(scene.gaussians.sh0)
+    stored = np.asarray(units.black + (units.white - units.black) * rgb, np.float32)
+    as_harmonics = replace(scene, gaussians=replace(scene.gaussians, sh0=stored))
+    if not shows_better(as_harmonics, scene, colors=True):
+        return load
+    notes = tuple(text for text in load.notes if text != load.info.color_note)
+    return replace(load, scene=as_harmonics, info=replace(load.info, color_units=None, color_note=""), notes=notes)
 
 
 def _answer(read: Callable[[], T]) -> T | SceneError:
