@@ -51,8 +51,9 @@ def convert(args: opt.Args) -> None:
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.record import record_run
 
+    hints = args.hints()
     options = ConvertOptions(
-        inputs, output, args.cameras, images, args.opacity, args.hints().scales, args.hints().colors, cleaning, placement,
+        inputs, output, args.cameras, images, args.opacity, hints.scales, hints.colors, cleaning, placement,
         normals=writing.normals, full_columns=writing.columns == "full",
         overwrite=args.overwrite,
     )  # fmt: skip

@@ -45,8 +45,7 @@ def judge_colors(stored: np.ndarray, plain: np.ndarray | None) -> tuple[ColorUni
         rgb = units.rgb(stored)
         if plain is not None and (np.abs(rgb - plain / np.float32(255)) <= _ROUNDING).mean() > 1 - arrays.MAX_STRAY:
             return units, "the columns red, green and blue are the same"
-        low, high = np.quantile(rgb, (arrays.MAX_STRAY, 1 - arrays.MAX_STRAY))
-        if arrays.are_shares(rgb) and high - low > _MIN_SPREAD:
+        if arrays.are_shares(rgb) and np.ptp(np.quantile(rgb, (arrays.MAX_STRAY, 1 - arrays.MAX_STRAY))) > _MIN_SPREAD:
             return units, f"all lie in [{units.black:g}, {units.white:g}]"
     return None
 

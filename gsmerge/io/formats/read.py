@@ -168,10 +168,10 @@ def read_gaussians(
 ) -> GaussianFile:
     """Read a file of Gaussians; the ending of its name tells the format.
 
-    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2)and ``.glb``. The
-    finest level of a ``lod-meta.json`` is read; ``meta.json`` or its folder is a ``.sog`` without its zip. Everything
-    else is read by :func:`read_ply`; only this uses ``opacity``, ``scales`` and ``colors``. SceneError if the file cannot be read,
-    is damaged, or holds no finite Gaussian. ValueError for an unknown encoding.
+    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``. The finest level of a
+    ``lod-meta.json`` is read; ``meta.json`` or its folder is a ``.sog`` without its zip. Everything else is read by
+    :func:`read_ply`; only this uses ``opacity``, ``scales`` and ``colors``. SceneError if the file cannot be read, is
+    damaged, or holds no finite Gaussian. ValueError for an unknown encoding.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
