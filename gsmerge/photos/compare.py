@@ -124,7 +124,7 @@ def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
         weights = pairs.shown.weights[view][sample].reshape(-1)
         pair = (colors[view][sample].reshape(-1, 3) for colors in (pairs.photos, pairs.shown.pictures))
         photo, shown = (vary_in_hue(colors, weights) for colors in pair)
-        if shown > VISIBLE and photo < GREY * shown:
+        if photo < min(VISIBLE, GREY * shown) and shown > VISIBLE:
             shares[view] = photo / shown
     return shares
 

@@ -58,19 +58,14 @@ class PartFit:
 
     def describe(self, size: Size, *, bars: bool) -> str:
         """Describe in a note what is cut out of photos of a size."""
-        width, height = part_size(size, self.part)
-        new_width, new_height = self.stretch((width, height))
-        before, after = f"{size[0]} x {size[1]}", f"{width} x {height}"
+        before, part = "{} x {}".format(*size), part_size(size, self.part)
+        after, ratio = "{} x {}".format(*part), self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
         if bars:
             return f"bars around the photos are cut off: {before} pixels become {after}"
-        text = f"photos of {before} are resized"
-        if self.part != WHOLE:
-            left, top = (round(side * share) for side, share in zip(size, self.part, strict=False))
-            text = f"of the photos of {before} only {after} pixels from column {left} and line {top} on are used"
-        if self.shape is not None:
-            ratio = new_width * height / (width * new_height)
-            text += f", stretched to {max(ratio, 1 / ratio):.2f} times their {'width' if ratio > 1 else 'height'}"
-        return f"{text}, since this fits the Gaussians best"
+        corner = f"from column {round(size[0] * self.part[0])} and line {round(size[1] * self.part[1])} on"
+        stretched = f", stretched to {max(ratio, 1 / ratio):.2f} times their {'width' if ratio > 1 else 'height'}"
+        used = f"the {after} pixels {corner} of photos of {before} are used{stretched if self.shape else ''}"
+        return f"{used}, since they fit the Gaussians best"
 
 
 WHOLE_FIT = PartFit()

@@ -35,21 +35,18 @@ from gsmerge.io.photo_files import (
     decode_small,
     decode_views,
     image_size,
-    limit_size,
     orientation_turn,
     part_size,
-    resize_to,
     same_shape,
 )
 from gsmerge.io.scene_files import SceneFiles
-from gsmerge.kernels.pictures import count_bars, is_mirrored, turn_picture
+from gsmerge.kernels.pictures import is_mirrored, turn_picture
 from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
 from gsmerge.photos.colors import cut_blocks
-from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits, list_parts, sharpen
+from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
 from gsmerge.photos.offsets import SIDE, correlate_parts
 from gsmerge.photos.pictures import Pairs, ViewPictures, show_views
 from gsmerge.photos.scores import stands_out
-from gsmerge.photos.views import pick_views
 from gsmerge.raster.photos import row_pictures, shrink_pictures
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
@@ -57,8 +54,6 @@ from gsmerge.types import Scene
 
 _MODEL_FOLDERS = ("0", "sparse", "colmap")  # names of COLMAP models in a scene's folder, which may also be one itself
 UNNAMED = "view 0"  # name of the first camera if the format, or rows without cameras, have no names
-_COMPARED = 8  # most photos whose parts are compared with their views
-_BAR_SPREAD = 8  # largest range of a bar's colours, of 255
 _REDUCED = "images_*"  # folders of smaller copies; their names end with the factor
 SEEN_PLACE = "images_resized"  # WorldMirror writes its input photos there; tall photos in "images" are squeezed
 
@@ -434,56 +429,6 @@ def has_other_shape(proposal: Proposal, camera_file: CameraFile) -> bool:
     return not any(same_shape(shape, size) for shape in shapes)
 
 
-def has_bars(scene: Scene) -> bool:
-    """Return whether the first photo of a scene has bars on opposite sides."""
-    if scene.images is None:
-        return False
-    above, below, left, right = count_bars(scene.images[0], _BAR_SPREAD / 255)
-    return bool((above and below) or (left and right))
-
-
-def choose_part(
-    scene: Scene, proposal: Proposal, camera_file: CameraFile, grid_fit: GridFit | None = None
-) -> Proposal | None:
-    """Find the part of the proposed photos that shows the views; None if whole photos fit as well, or if no part does.
-
-    A part fits if it explains the views as a photo does (:meth:`Assigner.explain_most`). ``grid_fit``: how the whole
-    photos would fit a grid whose cameras were estimated.
-    """
-    named = [(view, photo) for view, photo in enumerate(proposal.named) if photo is not None]
-    views, photos = zip(*(named[i] for i in pick_views(len(named), _COMPARED)), strict=True) if named else ((), ())
-    sizes = [image_size(proposal.pool[photo]) for photo in photos]
-    shapes_differ = not all(same_shape(size, sizes[0]) for size in sizes)
-    if not photos or shapes_differ or any(proposal.tags[photo] for photo in photos):
-        return None
-
-    def read(photo: int) -> tuple[np.ndarray, np.ndarray]:
-        """Read a photo small, and the shares of its sides that bars have."""
-        with suppress(SceneError):
-            whole = decode_image(proposal.pool[photo], size := image_size(proposal.pool[photo]))
-            above, below, left, right = count_bars(whole, _BAR_SPREAD)
-            small = resize_to(size, limit_size(size, 4 * SIDE)).photos([whole])[0]
-            return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
-        return np.zeros((SIDE, SIDE, 3), np.float32), np.zeros(4)
-
-    pictures, bars = zip(*parallel_map(read, photos), strict=True)
-    left, above, right, below = np.median(bars, 0).tolist()
-    inner, shape = (left, above, 1 - right, 1 - below), (scene.cameras.width, scene.cameras.height)
-    shape = next(iter(sizes_of(camera_file)), shape)
-    fits: list[GridFit | PartFit] = [] if grid_fit is None else [grid_fit]
-    if grid_fit is None:
-        inner = sharpen(inner, sizes[0], shape)
-    fits += list_parts(sizes[0], shape if grid_fit is None else None, inner)
-    fit = choose_fit(show_views(scene, SIDE)[views], pictures, fits)
-    if isinstance(fit, GridFit) or fit == WHOLE_FIT:
-        return None
-    candidates = Candidates(lambda photo: fit.cut(pictures[photo]), len(photos), [0] * len(photos))
-    assigner = Assigner(lambda side: show_views(scene, side)[views], candidates)
-    is_right = assigner.explain_most([Assignment(photo, 0) for photo in range(len(photos))])
-    note = fit.describe(sizes[0], bars=fit.part == inner != WHOLE)
-    return replace(proposal, fit=fit, notes=(*proposal.notes, note)) if is_right else None
-
-
 def shows_better(scene: Scene, other: Scene, *, colors: bool = False) -> bool:
     """Return whether the photos of ``scene`` match its Gaussians better than the photos of ``other`` match its own.
 
@@ -603,7 +548,8 @@ def _describe_mismatch(proposal: Proposal, camera_file: CameraFile) -> str:
     found = "none that shows one of them"
     if has_other_shape(proposal, camera_file) and camera_file.source != ESTIMATED:
         width, height = image_size(next(proposal.pool[photo] for photo in proposal.named if photo is not None))
-        found = f"{width} x {height}, of which no part shows one of them"
+        shape = " (2 : 1 as 360-degree panoramas have)" if width == 2 * height else ""
+        found = f"{width} x {height}{shape}, of which no part shows one of them"
     faults = [fault for fault in proposal.faults if fault is not None]
     reasons = f" ({list_some(faults, '; ')})" if faults else ""
     return f"expected photos of {views}, found {found}{reasons}"

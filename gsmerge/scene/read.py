@@ -10,11 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from gsmerge.cameras import ESTIMATED, Alignment, AlignmentResult, Recovery, align, check_pixels
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import move_views, sh0_to_rgb
+from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.formats.arrays import FLAT_COMMENT, RESULT_COMMENT
@@ -23,19 +21,18 @@ from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
 from gsmerge.photos.assign import Assignment
-from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit
+from gsmerge.photos.grid_fit import WHOLE_FIT
 from gsmerge.photos.masks import NO_MASKS, Masks, check_masks
+from gsmerge.photos.parts import choose_part, has_bars
 from gsmerge.photos.scene_photos import (
     SEEN_PLACE,
     UNNAMED,
     Proposal,
     ScenePhotos,
     assign_to_views,
-    choose_part,
     describe_assignment,
     describe_unused,
     fit_to_grid,
-    has_bars,
     has_other_shape,
     list_guessed,
     name_by_photos,
@@ -58,7 +55,7 @@ from gsmerge.scene.exporters import (
     find_exporter,
     make_hints,
 )
-from gsmerge.scene.rows import read_rotations, take_gaussians
+from gsmerge.scene.rows import read_as_harmonics, read_rotations, take_gaussians
 from gsmerge.scene.views import find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, LargePhotos, Scene, StrPath
@@ -259,16 +256,11 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
 
 def _confirm_colors(load: Loaded) -> Loaded:
     """Return a scene whose guessed RGB is read as harmonics if photos show that; the guess stays without photos."""
-    units, scene = load.info.color_units, load.scene
-    if units is None or not load.info.color_note or scene.images is None:
-        return load
-    rgb = sh0_to_rgb(scene.gaussians.sh0)
-    stored = np.asarray(units.black + (units.white - units.black) * rgb, np.float32)
-    as_harmonics = replace(scene, gaussians=replace(scene.gaussians, sh0=stored))
-    if not shows_better(as_harmonics, scene, colors=True):
+    harmonics = read_as_harmonics(load.scene, load.info) if load.info.color_note else None
+    if harmonics is None or not shows_better(harmonics, load.scene, colors=True):
         return load
     notes = tuple(text for text in load.notes if text != load.info.color_note)
-    return replace(load, scene=as_harmonics, info=replace(load.info, color_units=None, color_note=""), notes=notes)
+    return replace(load, scene=harmonics, info=replace(load.info, color_units=None, color_note=""), notes=notes)
 
 
 def _answer(read: Callable[[], T]) -> T | SceneError:
@@ -361,14 +353,14 @@ def _assign(
     """
     is_grid = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED  # photos may have any size
     is_odd = not is_grid and has_other_shape(proposal, camera_file)
+    bare = partial(_combine, ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
     if is_odd:  # photos of another shape say nothing against cameras that see the Gaussians
-        bare = _answer(partial(_combine, ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints))
-        fitted = choose_part(bare.scene, proposal, camera_file) if isinstance(bare, Loaded) else None
+        alone = _answer(bare)
+        fitted = choose_part(alone.scene, proposal, camera_file) if isinstance(alone, Loaded) else None
         if fitted is not None:
             return _assign(ply, files, camera_file, fitted, hints)
     load: Loaded | None = None
     cause: SceneError | None = None
-    fit: GridFit | None = None
     while load is None and cause is None and not is_grid and any(photo is not None for photo in proposal.named):
         tried = _answer(partial(_combine_chosen, ply, files, camera_file, proposal, proposal.choice, hints))
         sound = None
@@ -380,16 +372,10 @@ def _assign(
             proposal = sound
         elif isinstance(tried, SceneError):
             cause = tried
-    base: Loaded | SceneError | None = load
-    if base is None:
-        pinholes = replace(camera_file, lenses=())
-        base = _answer(partial(_combine, ply, files, pinholes, ScenePhotos(), hints))
+    base = _answer(bare) if load is None else load
     if isinstance(base, SceneError):
         return cause or base
-    if is_odd:
-        cause = None
-    if is_grid and proposal.pool:
-        fit = fit_to_grid(base.scene, proposal)
+    fit = fit_to_grid(base.scene, proposal) if is_grid and proposal.pool else None
     guessed = list_guessed(base.scene, camera_file)
     proposal = proposal.without_views(guessed)
     views, is_read = range(len(base.scene)), load is not None
@@ -404,10 +390,10 @@ def _assign(
     if any(chosen) and (load is None or chosen != proposal.choice):
         named = name_by_photos(camera_file, proposal, chosen, fit)
         answer = _answer(partial(_combine_chosen, ply, files, named, proposal, chosen, hints))
-        if isinstance(answer, SceneError) and not is_odd:
-            return answer
+    if any(chosen) and isinstance(answer, SceneError) and not is_odd:
+        return answer
     if not any(chosen) or not isinstance(answer, Loaded):
-        refusal = refuse_photos(files, proposal, camera_file, cause)
+        refusal = refuse_photos(files, proposal, camera_file, None if is_odd and not camera_file.lenses else cause)
         if refusal is not None:
             return refusal
         alone = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmerge.io.formats import arrays
+from gsmerge.io.formats.scale_units import MIN_JUDGED
 
 RGB_NOTE = "f_dc_0 to f_dc_2 are read as {}, since {}; if they are harmonics, use --hint colors=sh"
-SAMPLES = 20_000  # rows whose colours are judged
-_MIN_JUDGED = 100  # least number of rows for a judgement
 _MIN_SPREAD = 0.5  # of the range from black to white, least part that RGB covers; faint scenes as harmonics cover less
 _ROUNDING = 1.5 / 255  # difference of two columns of one colour, of which one is a byte
 
@@ -41,7 +40,7 @@ def judge_colors(stored: np.ndarray, plain: np.ndarray | None) -> tuple[ColorUni
     ``plain [n,3]`` are the bytes of the file's columns red, green and blue. Harmonics of a scene go far below zero,
     where colours are darker than grey. RGB ends at black and at white.
     """
-    for units in _UNITS if len(stored) >= _MIN_JUDGED else ():
+    for units in _UNITS if len(stored) >= MIN_JUDGED else ():
         rgb = units.rgb(stored)
         if plain is not None and (np.abs(rgb - plain / np.float32(255)) <= _ROUNDING).mean() > 1 - arrays.MAX_STRAY:
             return units, "the columns red, green and blue are the same"

@@ -13,8 +13,8 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.color_units import RGB_NOTE, SAMPLES, ColorUnits, judge_colors, state_colors
-from gsmerge.io.formats.scale_units import LINEAR_NOTE, ScaleJudgement, judge_scales, log_of_scales
+from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits, judge_colors, state_colors
+from gsmerge.io.formats.scale_units import LINEAR_NOTE, SAMPLES, ScaleJudgement, judge_scales, log_of_scales
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.stored_rows import convert_rows
@@ -433,7 +433,7 @@ def _choose_encoding(
     values = opacities if len(empty) == 0 else opacities.copy()
     values[empty] = np.nan
     declared = _declared_encoding(paths, parts, values)
-    return declared or _guess_encoding(values), declared is None
+    return declared or ("raw" if arrays.are_shares(values) else "logit"), declared is None
 
 
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
@@ -447,7 +447,7 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
         values = opacities[start : start + len(part.rows)]
         start += len(values)
         is_clear = len(parts) > 1 and np.isfinite(values).sum() >= _MIN_JUDGED
-        encoding = part.encoding or (_guess_encoding(values) if is_clear else None)
+        encoding = part.encoding or (("raw" if arrays.are_shares(values) else "logit") if is_clear else None)
         if encoding is not None:
             part_names.setdefault(encoding, path.name)
         if len(part_names) > 1:
@@ -477,10 +477,6 @@ def _check_raw(path: Path, opacities: np.ndarray) -> None:
         share = 100 * outside.sum() / finite.sum()
         problem = f"expected opacities in [0, 1], as --hint opacity=raw says, found {share:.3g} % outside, like logits"
         raise SceneError(path, problem, "leave out --hint opacity=raw")
-
-
-def _guess_encoding(opacities: np.ndarray) -> str:
-    return "raw" if arrays.are_shares(opacities) else "logit"
 
 
 def _spread_low_degree(shN: np.ndarray) -> None:
