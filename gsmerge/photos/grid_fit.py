@@ -62,9 +62,10 @@ class PartFit:
         after, ratio = "{} x {}".format(*part), self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
         if bars:
             return f"bars around the photos are cut off: {before} pixels become {after}"
-        corner = f"from column {round(size[0] * self.part[0])} and line {round(size[1] * self.part[1])} on"
+        corner = f" from column {round(size[0] * self.part[0])} and line {round(size[1] * self.part[1])} on"
         stretched = f", stretched to {max(ratio, 1 / ratio):.2f} times their {'width' if ratio > 1 else 'height'}"
-        used = f"the {after} pixels {corner} of photos of {before} are used{stretched if self.shape else ''}"
+        what = "photos" if self.part == WHOLE else f"the {after} pixels{corner} of photos"
+        used = f"{what} of {before} are used{stretched if self.shape else ''}"
         return f"{used}, since they fit the Gaussians best"
 
 
