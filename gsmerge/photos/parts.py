@@ -43,6 +43,7 @@ def choose_part(
     A part fits if it explains the views as a photo does (:meth:`Assigner.explain_most`). ``grid_fit``: how the whole
     photos would fit a grid whose cameras were estimated.
     """
+    proposal = proposal.without_broken() or proposal
     named = [(view, photo) for view, photo in enumerate(proposal.named) if photo is not None]
     views, photos = zip(*(named[i] for i in pick_views(len(named), _COMPARED)), strict=True) if named else ((), ())
     sizes = [image_size(proposal.pool[photo]) for photo in photos]
