@@ -119,22 +119,20 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
 
 
 def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
-    """List the grids of photos brought to the size of the cameras, or of cameras cropped to the size of the photos.
+    """List the grids of photos at the size of the cameras, or of cameras cropped to another shape of the photos.
 
     ``size`` is the size of the photos. Empty without photos, and if cameras and photos have the same size.
     """
     sizes = sizes_of(camera_file)
     if size is None or len(sizes) != 1 or sizes[0] == size or camera_file.photo_map is not None:
         return []
-    (camera_size,), grids = sizes, []
-    cameras = to_cameras(camera_file, camera_size)
-    for transform in (resize_to(size, camera_size), resize_and_crop(size, camera_size)):
-        if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
-            continue  # the photos are previews, and a fit to them would blur the Gaussians
-        note = f"photos of {size[0]} x {size[1]} are {transform.description}, the cameras' and the Gaussian grid's size"
-        grids.append(Grid(camera_file, cameras, transform, (note,)))
+    (camera_size,) = sizes
+    cameras, transform = to_cameras(camera_file, camera_size), resize_to(size, camera_size)
     if not same_shape(camera_size, size):
-        for transform in (resize_to(camera_size, size), resize_and_crop(camera_size, size)):
-            note = f"cameras of {camera_size[0]} x {camera_size[1]} are {transform.description}, the images' size"
-            grids.append(Grid(camera_file, transform.cameras(cameras), None, (note,)))
-    return grids
+        transform = resize_and_crop(camera_size, size)
+        note = f"cameras of {camera_size[0]} x {camera_size[1]} are {transform.description}, the images' size"
+        return [Grid(camera_file, transform.cameras(cameras), None, (note,))]
+    if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
+        return []  # the photos are previews, and a fit to them would blur the Gaussians
+    note = f"photos of {size[0]} x {size[1]} are {transform.description}, the cameras' and the Gaussian grid's size"
+    return [Grid(camera_file, cameras, transform, (note,))]

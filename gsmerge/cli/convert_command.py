@@ -28,8 +28,8 @@ class PhotoOptions(Settings):
                  "lod-meta.json, or a folder."),
     opt.changed("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
-    opt.changed("hint", help="How the files store opacity and scales, if it is not recognised: opacity=logit or "
-                "raw, scales=log or linear."),
+    opt.changed("hint", help="How the files store opacity, scales and colours, if it is not recognised: "
+                "opacity=logit or raw, scales=log or linear, colors=sh or rgb."),
     opt.settings_option(FileOptions, PhotoOptions, CleanOptions, PlacementOptions, example="normals=false"),
     "up scale rotate translate sh_degree crop drop overwrite",
 )  # fmt: skip
@@ -51,8 +51,9 @@ def convert(args: opt.Args) -> None:
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.record import record_run
 
+    hints = args.hints()
     options = ConvertOptions(
-        inputs, output, args.cameras, images, args.opacity, args.hints().scales, cleaning, placement,
+        inputs, output, args.cameras, images, args.opacity, hints.scales, hints.colors, cleaning, placement,
         normals=writing.normals, full_columns=writing.columns == "full",
         overwrite=args.overwrite,
     )  # fmt: skip

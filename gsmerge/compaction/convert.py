@@ -31,7 +31,7 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.placement import PlacementOptions
-from gsmerge.settings.reading import NONE, OpacityChoice, ScaleChoice
+from gsmerge.settings.reading import NONE, ColorChoice, OpacityChoice, ScaleChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean, describe_counts
 from gsmerge.types import NO_CAMERAS, Gaussians, StrPath, make_scene
@@ -47,6 +47,7 @@ class ConvertOptions:
     images: StrPath | None = None  # Photos of these cameras, to find the sky
     opacity: OpacityChoice = "auto"
     scales: ScaleChoice = "auto"
+    colors: ColorChoice = "auto"
     clean: CleanOptions = field(default_factory=CleanOptions)
     placement: PlacementOptions = field(default_factory=PlacementOptions)
     normals: bool = True  # Write the three columns of zeros that some viewers expect in a ``.ply``
@@ -65,7 +66,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         files, steps = list[GaussianFile](), len(options.inputs) + 1
         for path in options.inputs:
             report_progress(f"convert: {path.name}", len(files), steps)
-            files.append(read_gaussians(path, opacity=options.opacity, scales=options.scales))
+            files.append(read_gaussians(path, opacity=options.opacity, scales=options.scales, colors=options.colors))
         gaussians = join_gaussians([file.gaussians[file.valid] for file in files])
         stored, unread = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)

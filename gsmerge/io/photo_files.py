@@ -33,7 +33,8 @@ _TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
 _MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of a file: four floats per pixel, and profiles or thumbnails
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
 _HALF_OPAQUE = 127
-ASPECT_TOLERANCE = 0.04  # of width over height, since backbones round each side to a multiple of 14 separately
+# Of width over height: what models change that round the shorter side of a picture to a multiple of 14: 7 of 350 pixels
+ASPECT_TOLERANCE = 0.02
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of a scan; a progressive JPEG has any number of scans
 _PIXELS_PER_STEP = 50_000  # of an empty scan, per step of a budget
@@ -57,6 +58,8 @@ _REDUCTIONS = {  # by which each side is divided -> OpenCV's flag
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
 Size = tuple[int, int]  # width, height, pixels
+Part = tuple[float, float, float, float]  # left, top, right, bottom of a part of a photo, in shares of its sides
+WHOLE: Part = (0.0, 0.0, 1.0, 1.0)
 _AT_ONCE = 128 << 20  # bytes of decoded photos in memory; if there are more, photos are decoded at each use
 
 
@@ -121,8 +124,8 @@ def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
         raise SceneError(paths[0].parent, f"{problem}, {found}", "reduce their size, or leave some out")
 
 
-def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size) -> PhotoArrays:
-    """Decode the photo of each view to ``[h,w,3]`` uint8, turned, and resized to one ``size``; black without a file.
+def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size, part: Part = WHOLE) -> PhotoArrays:
+    """Decode a part of the turned photo of each view to ``[h,w,3]`` uint8 of one ``size``; black without a file.
 
     If photos are large, they are decoded at each use; else a photo that several views have is decoded once. SceneError
     as in :func:`decode_images`.
@@ -135,7 +138,7 @@ def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size)
         path, turn = view
         if path is None:
             return np.zeros((size[1], size[0], 3), np.uint8)
-        photo = np.ascontiguousarray(turn_picture(decode_image(path, sizes[path]), turn))
+        photo = np.ascontiguousarray(cut_part(turn_picture(decode_image(path, sizes[path]), turn), part))
         photo_size = photo.shape[1], photo.shape[0]
         return photo if photo_size == size else resize_to(photo_size, size).photos([photo])[0]
 
@@ -211,6 +214,19 @@ def photo_size(photos: PhotoArrays) -> Size | None:
 def photo_array(images: np.ndarray | None) -> np.ndarray:
     """Return photos ``[c,h,w,3]`` unchanged, or an empty array if there are none."""
     return NO_IMAGES if images is None else images
+
+
+def part_size(size: Size, part: Part) -> Size:
+    """Return the size of a part of a photo."""
+    left, top, right, bottom = (round(side * share) for side, share in zip(size * 2, part, strict=True))
+    return max(1, right - left), max(1, bottom - top)
+
+
+def cut_part(photo: np.ndarray, part: Part) -> np.ndarray:
+    """Return a part of a photo ``[h,w,...]``."""
+    width, height = part_size(photo.shape[1::-1], part)
+    left, top = round(photo.shape[1] * part[0]), round(photo.shape[0] * part[1])
+    return photo[top : top + height, left : left + width]
 
 
 def same_shape(size: Size, other: Size) -> bool:

@@ -267,7 +267,8 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     """Read the scenes, and move the cameras into the frame of ``options.framing``."""
     files, framing, paths = options.files, options.framing, options.paths
     first_ply = read_gaussian_file(files, opacity=options.opacity, hints=options.hints)
-    plys = [read_gaussians(path, opacity=options.opacity, scales=options.hints.scales) for path in paths[1:]]
+    hints: dict[str, Any] = {"scales": options.hints.scales, "colors": options.hints.colors}
+    plys = [read_gaussians(path, opacity=options.opacity, **hints) for path in paths[1:]]
     same_file = framing.ply == files.ply
     framing_ply = first_ply if same_file else read_gaussian_file(framing, opacity="auto", hints=NO_HINTS)
     framing_load = move_cameras_to_scene(framing_ply, framing, hints=options.hints, photos=photos)

@@ -193,6 +193,15 @@ class Assigner:
                 confirmed[view] = bool(parts) or (is_clear and parts is None) or not self.has_contrast[view]
         return out, confirmed
 
+    def explain_most(self, assignments: Sequence[Assignment | None]) -> bool:
+        """Return True if photos explain :data:`MIN_EXPLAINED` of the variance of at least half of their views."""
+        pairs = [(view, pair) for view, pair in enumerate(assignments) if pair is not None and self.has_contrast[view]]
+        if not pairs:
+            return False
+        scores = self.score(pair.photo for _, pair in pairs)
+        correlations = [scores.correlations[view, scores.photos.index(photo), turn] for view, (photo, turn) in pairs]
+        return median(np.array(correlations)) > np.sqrt(MIN_EXPLAINED)
+
     def match_together(self, assignments: Sequence[Assignment | None]) -> bool:
         """Return True if assigned photos together match their views better than equally many wrong pairs would."""
         scores = self.score(self._correlations)
@@ -260,8 +269,8 @@ def assign_photos(
     *,
     exact: bool,
     stored: Candidates | None = None,
-) -> list[Assignment | None]:
-    """Assign a photo to each view; None where no photo shows the view.
+) -> tuple[list[Assignment | None], bool]:
+    """Assign a photo to each view, None where no photo shows it; return whether proposed photos explain most views.
 
     ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side. ``named`` is the photo that
     names or order propose for each view, or None. If names are ``exact`` and most of them prove right, a view whose
@@ -272,19 +281,20 @@ def assign_photos(
     out, confirmed = assigner.confirm(named, exact=exact)
     num_assigned = sum(assignment is not None for assignment in out)
     most_match = 2 * num_assigned > len(out) and assigner.match_together(out)
+    are_alike = assigner.explain_most(out)
     if exact and most_match:  # search only for the views whose proposed photo was rejected
         unknown = [view for view, photo in enumerate(named) if photo is not None and out[view] is None]
     else:
         unknown = [view for view, is_confirmed in enumerate(confirmed) if not is_confirmed]
     if not unknown:
-        return out
+        return out, are_alike
     used = {assigned.photo for view, assigned in enumerate(out) if assigned is not None and view not in unknown}
     if stored is not None:
         assigner = Assigner(show, stored)
     results = assigner.search(unknown, [photo for photo in range(candidates.count) if photo not in used])
     for view in unknown:
         out[view] = results.get(view) or (out[view] if most_match else None)
-    return out
+    return out, are_alike
 
 
 def _least_score(scores: np.ndarray) -> float:

@@ -98,6 +98,16 @@ def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
     return np.asarray((matmul(flat, matrix[:3]) + matrix[3]).reshape(photo.shape), np.float32)
 
 
+def vary_in_hue(colors: np.ndarray, weights: np.ndarray) -> float:
+    """Return the root mean square by which colours ``[n,3]`` differ from a curve of their brightness alone.
+
+    It is about 0 for grey photos, toned ones as well.
+    """
+    grey = colors.mean(1, keepdims=True).repeat(3, 1)
+    away = (colors - map_tones(fit_tones(grey, colors, weights), grey)) ** 2 * weights[:, None]
+    return float(np.sqrt(away.mean() / max(float(weights.mean()), 1e-9)))
+
+
 def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
     """Return blocks of photos after a tone curve for each group of views; see :func:`_cross_fit`."""
     toned = pairs.photos.copy()

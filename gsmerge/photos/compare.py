@@ -8,7 +8,7 @@ the Gaussians' colours are used instead.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from gsmerge.kernels.pictures import convolve
 from gsmerge.photos.assign import Assigner, Candidates
 from gsmerge.photos.colors import (
     STEP,
+    VISIBLE,
     cut_blocks,
     explains,
     fit_map,
@@ -28,9 +29,10 @@ from gsmerge.photos.colors import (
     map_tones,
     plain_blocks,
     tone_blocks,
+    vary_in_hue,
 )
 from gsmerge.photos.photo_change import PhotoChange, change_large
-from gsmerge.photos.pictures import SIDE, Pairs, ViewPictures, pair_photos, show_views
+from gsmerge.photos.pictures import SIDE, Pairs, ViewPictures, draw_views, pair_photos, show_views
 from gsmerge.photos.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.photos.scores import stands_out
 from gsmerge.photos.views import camera_kinds
@@ -46,6 +48,7 @@ from gsmerge.types import PicturedScene
 WINDOW = np.full(5, 1 / 5, np.float32)
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
+GREY = 0.25  # of the variation of the Gaussians' hues; photos whose hues vary less are grey
 MIDDLE_GREY = 128  # level of 255 at which notes report the change of tone
 LEAST_PERCENT = 1  # of a photo; no note says that less of it differs
 STRAY_PHOTOS = "do not show what the Gaussians show"  # said of photos that are not used
@@ -62,10 +65,17 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     if look != "auto" or not photo_views:
         return scene, tuple(photo_views) if look != "scene" else ()
     pairs = pair_photos(scene, scene.images)
+    grey = find_grey(pairs, photo_views)
+    if grey:
+        scene = _color_photos(scene, grey)
+        pairs = pair_photos(scene, scene.images)
     matching = find_matching_views(scene, photo_views, list(scene.images), pairs.shown)
     if _has_other_look(scene, pairs, matching or photo_views):
         problem = "the scene has another look than its photos, so it keeps its own colours"
-        note(f"{problem}; --set look=photos gives it the look of the photos")
+        if is_exchanged := are_exchanged(pairs[matching or photo_views]):
+            problem = "red and blue are exchanged between Gaussians and photos: either f_dc_0 and f_dc_2 of the file or"
+            problem += " the photos are in the order blue, green, red; the scene keeps its own colours"
+        note(f"{problem}; --set look=photos gives it the look of the photos", doubt=is_exchanged)
         return scene, ()
     stray = [view for view in photo_views if view not in matching]
     if stray and not _leave_out(scene, stray, photo_views):
@@ -79,7 +89,7 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     if scene.has_own_pixels:
         hidden, pictures = _find_hidden(scene, changes)
         _note_hidden(scene, hidden, matching)
-    changed = [view for view in matching if hidden[view].any() or changes[view]]
+    changed = [view for view in matching if hidden[view].any() or changes[view] or view in grey]
     if changed:
         choose(photos_changed=[scene.names[view] for view in changed])
     return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching)
@@ -105,6 +115,35 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
             for view in group:
                 curves[view] = curve
     return curves if is_clear else [None] * len(pairs)
+
+
+def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
+    """Find the ``views`` whose photos have no hues while their Gaussians have; return the share that photos have."""
+    shares, sample = dict[int, float](), (slice(2, None, 4), slice(2, None, 4))  # enough pixels
+    for view in views:
+        weights = pairs.shown.weights[view][sample].reshape(-1)
+        pair = (colors[view][sample].reshape(-1, 3) for colors in (pairs.photos, pairs.shown.pictures))
+        photo, shown = (vary_in_hue(colors, weights) for colors in pair)
+        if photo < min(VISIBLE, GREY * shown) and shown > VISIBLE:
+            shares[view] = photo / shown
+    return shares
+
+
+def _color_photos(scene: PicturedScene, grey: Mapping[int, float]) -> PicturedScene:
+    """Give grey photos the hues of the Gaussians, which keep the photos' brightness; note how grey they are."""
+    changes, views = [PhotoChange()] * len(scene), list(grey)
+    if scene.has_own_pixels:
+        colors = row_pictures(scene)[views]
+    else:
+        colors = draw_views(scene.gaussians, scene.cameras[views], max(scene.images.shape[1:3])).pictures
+    for view, picture in zip(views, colors, strict=True):
+        changes[view] = PhotoChange(cover=np.full(picture.shape[:2], True), colors=picture, bright=False)
+    note(
+        f"{len(grey)} of {len(scene.photo_views)} photos are grey or of one tint (their hues vary by"
+        f" {100 * max(grey.values()):.0f} % of the Gaussians' at most): only their brightness counts, and the Gaussians"
+        f" keep their hues; --set look=photos makes them grey: {list_some([scene.names[view] for view in grey])}"
+    )
+    return _apply(scene, changes)
 
 
 def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
@@ -174,6 +213,13 @@ def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) ->
     return _is_mapped(view_pairs.exchange()) and bool(
         find_matching_views(scene, views, list(scene.images), pairs.shown)
     )
+
+
+def are_exchanged(pairs: Pairs) -> bool:
+    """Return whether red and blue exchanged in the photos explain the pictures, and a linear map no better."""
+    stored, exchanged = cut_blocks(pairs), cut_blocks(pairs.with_photos(pairs.photos[..., ::-1]))
+    before, after = stored.errors(), exchanged.errors()
+    return explains(before, after) and not explains(after, map_blocks(stored).errors())
 
 
 def _is_mapped(pairs: Pairs) -> bool:
@@ -288,6 +334,11 @@ def _change_photos(
             covers = pictures[with_hidden]
         for view, colors in zip(with_hidden, covers, strict=True):
             changes[view] = replace(changes[view], cover=hidden[view], colors=colors)
+    return _apply(scene, changes)
+
+
+def _apply(scene: PicturedScene, changes: Sequence[PhotoChange]) -> PicturedScene:
+    """Change the photos of all views at both sizes."""
     images = np.stack([change(photo) for change, photo in zip(changes, scene.images, strict=True)])
     large = None if scene.large_photos is None else change_large(scene.large_photos, changes)
     return replace(scene, images=images, large_photos=large)

@@ -1,7 +1,8 @@
-"""Find how photos were resized to the grid of a file's rows, whose cameras were estimated.
+"""Find which part of the photos the views show, and how photos were resized to the grid of a file's rows.
 
-Models resize photos without their aspect ratio or crop them, and some cut a border off their output. Therefore photos
-of any size are compared with the pictures of a grid, which are the colours of its rows.
+Photos of another shape than their cameras may have bars, or show both eyes of a stereo camera or several pictures side
+by side. Where cameras were estimated, models resized photos without their aspect ratio or cropped them, and some cut a
+border off their output. The pictures of the Gaussians decide.
 """
 
 from __future__ import annotations
@@ -9,15 +10,104 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 
 from gsmerge.cameras import TRIMS
 from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.photo_files import PhotoTransform, Size, resize_and_crop, resize_to
+from gsmerge.io.photo_files import (
+    WHOLE,
+    Part,
+    PhotoTransform,
+    Size,
+    cut_part,
+    part_size,
+    resize_and_crop,
+    resize_to,
+    same_shape,
+)
 from gsmerge.photos.offsets import correlate_parts
 from gsmerge.photos.pictures import ViewPictures
 from gsmerge.photos.scores import stands_out
+
+_JPEG_BLOCK = 8  # pixels of a side
+_TILES = 4  # most pictures beside or below each other in a photo
+_HALVES: tuple[Part, ...] = ((0, 0, 0.5, 1), (0.5, 0, 1, 1), (0, 0, 1, 0.5), (0, 0.5, 1, 1))
+
+
+@dataclass(frozen=True)
+class PartFit:
+    """The part of each photo that its view shows."""
+
+    part: Part = WHOLE
+    shape: Size | None = None  # to whose aspect ratio the part is stretched, as in films that squeeze both eyes
+
+    def cut(self, photo: np.ndarray) -> np.ndarray:
+        """Cut the part out of an upright photo ``[h,w,3]``, and stretch it."""
+        part = cut_part(photo, self.part)
+        size, new_size = part.shape[1::-1], self.stretch(part.shape[1::-1])
+        return part if size == new_size else resize_to(size, new_size).photos([part])[0]
+
+    def stretch(self, size: Size) -> Size:
+        """Return the size that a part of a ``size`` is stretched to; the same size if it is not stretched."""
+        if self.shape is None:
+            return size
+        scale = max(size[0] / self.shape[0], size[1] / self.shape[1])
+        return round(scale * self.shape[0]), round(scale * self.shape[1])
+
+    def describe(self, size: Size, *, bars: bool) -> str:
+        """Describe in a note what is cut out of photos of a size."""
+        before, part = "{} x {}".format(*size), part_size(size, self.part)
+        after, ratio = "{} x {}".format(*part), self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
+        if bars:
+            return f"bars around the photos are cut off: {before} pixels become {after}"
+        corner = f" from column {round(size[0] * self.part[0])} and line {round(size[1] * self.part[1])} on"
+        stretched = f", stretched to {max(ratio, 1 / ratio):.2f} times their {'width' if ratio > 1 else 'height'}"
+        what = "photos" if self.part == WHOLE else f"the {after} pixels{corner} of photos"
+        used = f"{what} of {before} are used{stretched if self.shape else ''}"
+        return f"{used}, since they fit the Gaussians best"
+
+
+WHOLE_FIT = PartFit()
+
+
+def list_parts(size: Size, shape: Size | None, inner: Part) -> list[PartFit]:
+    """List the parts of photos of a size that views may show, likely ones first; ``inner`` is that inside of bars.
+
+    Views have the aspect ratio of ``shape``; None: models made them from parts of any. Parts of another one, which are
+    stretched, come last.
+    """
+    counts = product(range(1, _TILES + 1), repeat=2)
+    tiles = [(x / m, y / n, (x + 1) / m, (y + 1) / n) for m, n in counts for y, x in product(range(n), range(m))]
+    if shape is None:
+        return [PartFit(part) for part in dict.fromkeys([WHOLE, inner, *tiles])]
+    centre = resize_and_crop(size, shape)
+    margins = centre.left / (centre.scale_x * size[0]), centre.top / (centre.scale_y * size[1])
+    parts = dict.fromkeys([WHOLE, inner, *tiles, (*margins, 1 - margins[0], 1 - margins[1])])
+    fits = [PartFit(part) for part in parts if same_shape(part_size(size, part), shape)]
+    stretched = [part for part in (WHOLE, *_HALVES) if not same_shape(part_size(size, part), shape)]
+    return [*fits, *(PartFit(part, shape) for part in stretched)]
+
+
+def sharpen(inner: Part, size: Size, shape: Size) -> Part:
+    """Return the part inside of bars at the size of the cameras, or a multiple, if it may be only a block larger.
+
+    JPEG files mix the pixels of a block, so bars end up to a block before the photo begins.
+    """
+    width, height = part_size(size, inner)
+    times = max(1, round(width / shape[0]))
+    sides = times * shape[0], times * shape[1]
+    if (
+        max(abs(width - sides[0]), abs(height - sides[1])) > _JPEG_BLOCK
+        or max(sides[0] / size[0], sides[1] / size[1]) > 1
+    ):
+        return inner
+    left, top = (
+        round((whole * (low + high) - side) / 2) / whole
+        for whole, side, low, high in zip(size, sides, inner, inner[2:], strict=False)
+    )
+    return left, top, left + sides[0] / size[0], top + sides[1] / size[1]
 
 
 @dataclass(frozen=True)
@@ -63,6 +153,9 @@ def _da3_borders(side: int) -> list[int]:
     return [border for border in range(side) if int(8 / 256 * (side + 2 * border)) == border]
 
 
+FitT = TypeVar("FitT", bound=GridFit | PartFit)
+
+
 def list_fits(size: Size) -> list[GridFit]:
     """List how models resize and crop photos to a grid of a size, simple fits first."""
     trims = [(trim, trim) for trim in (0, *TRIMS)]
@@ -70,11 +163,11 @@ def list_fits(size: Size) -> list[GridFit]:
     return [GridFit(size, crops, trim) for crops in (False, True) for trim in dict.fromkeys(trims)]
 
 
-def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: Sequence[GridFit]) -> GridFit:
+def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: Sequence[FitT]) -> FitT:
     """Choose the fit with which photos ``[h,w,3]`` match the pictures of their views best; of equal fits the first."""
     views = [view for view, photo in enumerate(photos) if photo is not None]
 
-    def score(fit: GridFit) -> np.ndarray:
+    def score(fit: FitT) -> np.ndarray:
         return np.concatenate([
             correlate_parts(shown, view, fit.cut(photos[view]))  # type: ignore[arg-type]
             for view in views

@@ -12,7 +12,16 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import find_image, match_masks
-from gsmerge.io.photo_files import Size, decode_alpha, decode_levels, decode_small, image_size, same_shape
+from gsmerge.io.photo_files import (
+    Part,
+    Size,
+    cut_part,
+    decode_alpha,
+    decode_levels,
+    decode_small,
+    image_size,
+    same_shape,
+)
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.photos.offsets import SIDE
@@ -50,7 +59,8 @@ class MaskFiles:
     turns: Sequence[int]  # quarter turns from each photo's file to its upright picture
     masks: Sequence[Path | None]  # dark where a photo does not count
     protecting: Sequence[Path | None]  # white where a photo counts more
-    stored: Size  # of upright photos
+    part: Part  # of upright photos that is used
+    stored: Size  # of this part
     cut: Callable[[int, np.ndarray], np.ndarray]  # view, picture of the size ``stored`` -> the part that the view shows
     cameras: Cameras
 
@@ -59,7 +69,8 @@ class MaskFiles:
         photo, counts, importance = self.photos[view] if self.photos else None, None, None
         alpha = None if photo is None else decode_alpha(photo)
         if alpha is not None:
-            counts = self._reduce(turn_picture(alpha, self.turns[view]) * _WHITE, view) > _MASK_LEVEL
+            opaque = cut_part(turn_picture(alpha, self.turns[view]), self.part) * _WHITE
+            counts = self._reduce(opaque, view) > _MASK_LEVEL
         if (mask := self.masks[view]) is not None:
             levels = self._read_levels(mask, view)
             is_light = levels > _WHITE // 2
@@ -76,8 +87,12 @@ class MaskFiles:
         """Read the brightness of a mask, and turn it upright if it has the orientation of the photo's file."""
         photo = self.photos[view] if self.photos else None
         whole, turns = decode_levels(mask, photo), self.turns[view]
-        if photo is not None and turns % 2 and same_shape(image_size(photo), whole.shape[1::-1]):
-            whole = turn_picture(whole, turns)
+        if photo is not None:
+            size = image_size(photo)
+            if turns % 2 and same_shape(size, whole.shape[1::-1]):
+                whole = turn_picture(whole, turns)
+            if same_shape(size[::-1] if turns % 2 else size, whole.shape[1::-1]):
+                whole = cut_part(whole, self.part)
         if not same_shape(self.stored, whole.shape[1::-1]):
             (width, height), (columns, lines) = self.stored, whole.shape[1::-1]
             problem = (
@@ -102,7 +117,7 @@ def read_masks(
     cut: Callable[[int, np.ndarray], np.ndarray],
     cameras: Cameras,
 ) -> tuple[Masks, list[str]]:
-    """Read the masks of photos whose upright size is ``stored``; return them and notes.
+    """Read the masks of photos of which a part of the size ``stored`` is used; return them and notes.
 
     Masks that the cameras' file names come before those beside the scene. ``cut``: as in :class:`MaskFiles`.
     """
@@ -127,7 +142,7 @@ def read_masks(
     if any(of_cameras):
         masks = [None if paths and paths[view] is None else mask for view, mask in enumerate(of_cameras)]
     turns = photos.turns or (0,) * len(masks)
-    mask_files = MaskFiles(tuple(paths), turns, masks, protecting, stored, cut, cameras)
+    mask_files = MaskFiles(tuple(paths), turns, masks, protecting, photos.part, stored, cut, cameras)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
     shape = cameras.height, cameras.width
     result = Masks(_stack(counts, True, shape), _stack(importance, np.float32(1), shape))

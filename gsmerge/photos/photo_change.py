@@ -11,6 +11,7 @@ import numpy as np
 from gsmerge.photos.colors import map_tones
 from gsmerge.types import LargePhotos
 
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # brightness of red, green and blue (Rec. 601), as of grey JPEGs
 CLIPPED = 0.985  # a pixel may be clipped from this level on
 
 
@@ -21,6 +22,7 @@ class PhotoChange:
     tones: np.ndarray | None = None  # [3,256] float32, new value of each level of each channel
     cover: np.ndarray | None = None  # [h,w] bool, pixels that get `colors`
     colors: np.ndarray | None = None  # [h,w,3] sRGB in [0, 1]
+    bright: bool = True  # False: covered pixels get the hue of `colors` alone, and keep the photo's brightness
 
     def __bool__(self) -> bool:
         """Return whether the photo changes at all."""
@@ -34,6 +36,8 @@ class PhotoChange:
             cover, colors = self.cover, self.colors
             if cover.shape != photo.shape[:2]:
                 cover, colors = _enlarge(cover, photo.shape) > 0, _enlarge(colors, photo.shape)
+            if not self.bright:
+                colors = (colors + ((photo - colors) * LUMA).sum(-1, keepdims=True)).clip(0, 1)
             photo = np.where(cover[..., None], colors, photo)
         return np.ascontiguousarray(photo, np.float32)
 

@@ -19,13 +19,15 @@ import numpy as np
 
 from gsmerge.cameras import ESTIMATED
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import CameraFile, select_views
+from gsmerge.io.cameras.camera_file import CameraFile, select_views, sizes_of
 from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.cameras.table import CHUNK
+from gsmerge.io.cameras.table import CHUNK, FFGS
 from gsmerge.io.first_bytes import CONVERT
 from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_order, propose_images
 from gsmerge.io.photo_files import (
+    WHOLE,
+    Part,
     PhotoArrays,
     Size,
     decode_image,
@@ -34,17 +36,19 @@ from gsmerge.io.photo_files import (
     decode_views,
     image_size,
     orientation_turn,
+    part_size,
     same_shape,
 )
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import is_mirrored, turn_picture
 from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
-from gsmerge.photos.grid_fit import GridFit, choose_fit, list_fits
+from gsmerge.photos.colors import cut_blocks
+from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
 from gsmerge.photos.offsets import SIDE, correlate_parts
 from gsmerge.photos.photo_folders import capture_folder, count_pixels, find_named_photos
-from gsmerge.photos.pictures import ViewPictures, show_views
+from gsmerge.photos.pictures import Pairs, ViewPictures, show_views
 from gsmerge.photos.scores import stands_out
-from gsmerge.raster.photos import row_pictures
+from gsmerge.raster.photos import row_pictures, shrink_pictures
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
@@ -60,7 +64,7 @@ class ScenePhotos:
     pictures: PhotoArrays = ()  # [h,w,3] uint8, black for a camera without a photo; empty without photos
     paths: tuple[Path | None, ...] = ()  # None for a camera without a photo; empty if the photos are inside a file
     turns: tuple[int, ...] = ()  # how each file is turned; see gsmerge.kernels.pictures.turn_picture
-    notes: tuple[str, ...] = ()  # how the photos were chosen, one sentence each
+    part: Part = WHOLE  # the part of each turned photo that is used
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -72,8 +76,9 @@ class ScenePhotos:
 
     @property
     def file_size(self) -> Size | None:
-        """Most frequent size of turned photos in their files, of two the larger one; None if they are in no files."""
-        sizes = [_turned_size(path, turn) for path, turn in zip(self.paths, self.turns, strict=True) if path]
+        """Most frequent size of what is used of turned photos, of two the larger one; None if they are in no files."""
+        files = [file for file in zip(self.paths, self.turns, strict=True) if file[0]]
+        sizes = [part_size(_turned_size(path, turn), self.part) for path, turn in files if path]
         return max(set(sizes), key=lambda size: (sizes.count(size), size[0] * size[1])) if sizes else None
 
 
@@ -87,6 +92,8 @@ class Proposal:
     exact: bool  # True: names propose the files; False: their order does
     faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None without a reason
     by_names: bool = False  # whether the folder was found by the names of its files
+    fit: PartFit = WHOLE_FIT  # what is used of each photo
+    notes: tuple[str, ...] = ()  # on what is used of the photos
 
     @cached_property
     def tags(self) -> Sequence[int]:
@@ -247,17 +254,19 @@ def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_
     """
     paths = tuple(None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen)
     turns = tuple(0 if assignment is None else assignment.orientation for assignment in chosen)
-    size = ScenePhotos((), paths, turns).file_size
+    photos = ScenePhotos((), paths, turns, proposal.fit.part)
+    size = photos.file_size
     if size is None:
         return ScenePhotos()
     if camera_file.source == SHARP:
         size = int(camera_file.widths[0]), int(camera_file.heights[0])
     for path, turn in zip(paths, turns, strict=True):
-        if path is not None and camera_file.source != SHARP and not same_shape(_turned_size(path, turn), size):
-            width, height = _turned_size(path, turn)
+        part = size if path is None else part_size(_turned_size(path, turn), photos.part)
+        if camera_file.source != SHARP and not same_shape(part, size):
+            width, height = part
             problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
             raise SceneError(proposal.folder, problem)
-    return ScenePhotos(decode_views(paths, turns, size), paths, turns)
+    return replace(photos, pictures=decode_views(paths, turns, proposal.fit.stretch(size), proposal.fit.part))
 
 
 def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:
@@ -325,6 +334,7 @@ def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
             small = decode_small(proposal.pool[photo], SIDE)
         except SceneError:  # an unreadable photo is black and fits no view
             small = np.zeros((SIDE, SIDE, 3), np.float32)
+        small = proposal.fit.cut(small)
         return small if fit is None else fit.cut(small)
 
     return Candidates(read, len(proposal.pool), proposal.tags)
@@ -338,7 +348,7 @@ def assign_to_views(
     read: bool,
     guessed: Sequence[int] = (),
     fit: GridFit | None = None,
-) -> list[Assignment | None]:
+) -> tuple[list[Assignment | None], bool]:
     """Assign files to the views of a scene, each with its camera; see :func:`gsmerge.photos.assign.assign_photos`.
 
     Args:
@@ -350,7 +360,7 @@ def assign_to_views(
         fit: How files are resized and cropped to the pixels of a grid.
 
     Returns:
-        The file of each camera with its turn; None without a photo.
+        The file of each camera with its turn, None without a photo; and whether the proposed photos explain most views.
     """
     views = [list(cameras).index(camera) for camera in dict.fromkeys(cameras)]  # layers of a camera have one photo
     named = [proposal.named[cameras[view]] for view in views]
@@ -365,11 +375,11 @@ def assign_to_views(
     def show(side: int) -> ViewPictures:
         return show_views(replace(scene, masks=masks), side)[views]
 
-    assigned = assign_photos(show, candidates, named, exact=proposal.exact, stored=stored)
+    assigned, are_alike = assign_photos(show, candidates, named, exact=proposal.exact, stored=stored)
     chosen = proposal.choice
     for view, assignment in zip(views, assigned, strict=True):
         chosen[cameras[view]] = assignment
-    return [None if camera in guessed else assignment for camera, assignment in enumerate(chosen)]
+    return [None if camera in guessed else assignment for camera, assignment in enumerate(chosen)], are_alike
 
 
 def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
@@ -392,15 +402,31 @@ def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
     return choose_fit(shown, chosen, (simple, *other_fits)) if any(photo is not None for photo in chosen) else simple
 
 
-def shows_better(scene: Scene, other: Scene) -> bool:
-    """Return whether the photos of ``scene`` match its Gaussians better than the photos of ``other`` match its own."""
+def has_other_shape(proposal: Proposal, camera_file: CameraFile) -> bool:
+    """Return whether the proposed photos have another aspect ratio than all cameras of a file, and no known crop."""
+    photo, shapes = next((photo for photo in proposal.named if photo is not None), None), sizes_of(camera_file)
+    if photo is None or not shapes or camera_file.photo_map is not None or camera_file.source in (FFGS, SHARP):
+        return False
+    size = proposal.fit.stretch(part_size(image_size(proposal.pool[photo]), proposal.fit.part))
+    return not any(same_shape(shape, size) for shape in shapes)
+
+
+def shows_better(scene: Scene, other: Scene, *, colors: bool = False) -> bool:
+    """Return whether the photos of ``scene`` match its Gaussians better than the photos of ``other`` match its own.
+
+    With ``colors``, the colours themselves are compared; otherwise their local contrast.
+    """
     if len(scene) != len(other):
         return False
     scores = list[np.ndarray]()
     for scored in (scene, other):
         shown, images = show_views(scored, SIDE), scored.images
         assert images is not None
-        scores.append(np.concatenate([correlate_parts(shown, view, images[view]) for view in range(len(scored))]))
+        if colors:
+            photos = shrink_pictures(images, *shown.weights.shape[2:0:-1])
+            scores.append(-cut_blocks(Pairs(photos, shown)).errors())
+        else:
+            scores.append(np.concatenate([correlate_parts(shown, view, images[view]) for view in range(len(scored))]))
     return stands_out(scores[0] - scores[1])
 
 
@@ -415,7 +441,7 @@ def name_by_photos(
         name if file is None else _inside(file, proposal) for name, file in zip(camera_file.names, files, strict=True)
     ]
     turns = [0 if assignment is None else assignment.orientation for assignment in chosen]
-    size = ScenePhotos((), tuple(files), tuple(turns)).file_size
+    size = ScenePhotos((), tuple(files), tuple(turns), proposal.fit.part).file_size
     named = replace(camera_file, names=tuple(names))
     return named if fit is None or size is None else fit.cameras(named, size)
 
@@ -526,9 +552,14 @@ def refuse_photos(
 def _describe_mismatch(proposal: Proposal, camera_file: CameraFile) -> str:
     """Say that no photo shows any view, and which photos are missing."""
     views = f"the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
+    found = "none that shows one of them"
+    if has_other_shape(proposal, camera_file) and camera_file.source != ESTIMATED:
+        width, height = image_size(next(proposal.pool[photo] for photo in proposal.named if photo is not None))
+        shape = " (2 : 1 as 360-degree panoramas have)" if width == 2 * height else ""
+        found = f"{width} x {height}{shape}, of which no part shows one of them"
     faults = [fault for fault in proposal.faults if fault is not None]
     reasons = f" ({list_some(faults, '; ')})" if faults else ""
-    return f"expected photos of {views}, found none that shows one of them{reasons}"
+    return f"expected photos of {views}, found {found}{reasons}"
 
 
 def without_photo(scene: Scene, views: Sequence[int]) -> Scene:

@@ -22,8 +22,9 @@ from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
 from gsmerge.photos.assign import Assignment
-from gsmerge.photos.grid_fit import GridFit
+from gsmerge.photos.grid_fit import WHOLE_FIT
 from gsmerge.photos.masks import NO_MASKS, Masks, check_masks
+from gsmerge.photos.parts import choose_part, has_bars
 from gsmerge.photos.scene_photos import (
     SEEN_PLACE,
     UNNAMED,
@@ -34,6 +35,7 @@ from gsmerge.photos.scene_photos import (
     describe_missing,
     describe_unused,
     fit_to_grid,
+    has_other_shape,
     list_guessed,
     name_by_photos,
     photos_inside,
@@ -55,8 +57,8 @@ from gsmerge.scene.exporters import (
     make_hints,
 )
 from gsmerge.scene.loaded import Loaded
-from gsmerge.scene.rows import read_rotations, take_gaussians
-from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
+from gsmerge.scene.rows import read_as_harmonics, read_rotations, take_gaussians
+from gsmerge.scene.views import find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, LargePhotos, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
@@ -91,8 +93,8 @@ def read_scene(
         protect: Folder of images with the names of the photos, white where a text or a face has to stay sharp; see
             :attr:`Scene.importance`.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
-        **hints: ``exporter``, ``quats``, ``scales``, ``order``, ``scene_scale``, ``max_side``, see
-            :class:`gsmerge.settings.reading.ReadHints`.
+        **hints: ``exporter``, ``quats``, ``scales``, ``colors``, ``order``, ``scene_scale``, ``max_side``,
+            see :class:`gsmerge.settings.reading.ReadHints`.
 
     Returns:
         The scene; its ``pixels`` are None if the pixels of the rows are unknown.
@@ -172,7 +174,7 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
     # An exporter of raw opacities does not decide: they are recognised, and some of its versions write logits
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
         opacity = "logit"
-    encodings: dict[str, Any] = {"opacity": opacity, "scales": hints.scales}
+    encodings: dict[str, Any] = {"opacity": opacity, "scales": hints.scales, "colors": hints.colors}
     return read_parts(files.parts, **encodings) if files.parts else read_gaussians(files.ply, **encodings)
 
 
@@ -247,6 +249,15 @@ def _rank_cameras(ply: GaussianFile, answer: Loaded | SceneError, files: SceneFi
     return score if is_moved or score < 0.5 else 1 + score
 
 
+def _confirm_colors(load: Loaded) -> Loaded:
+    """Return a scene whose guessed RGB is read as harmonics if photos show that; the guess stays without photos."""
+    harmonics = read_as_harmonics(load.scene, load.info) if load.info.color_note else None
+    if harmonics is None or not shows_better(harmonics, load.scene, colors=True):
+        return load
+    notes = tuple(text for text in load.notes if text != load.info.color_note)
+    return replace(load, scene=harmonics, info=replace(load.info, color_units=None, color_note=""), notes=notes)
+
+
 def _answer(read: Callable[[], T]) -> T | SceneError:
     """Return what files give, or else why they give nothing: a file is damaged, or they do not fit each other."""
     try:
@@ -274,7 +285,10 @@ def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photo
     camera_file = _answer(partial(read_scene_cameras, ply, files))
     if camera_file is None:
         return _without_cameras(ply, files, hints)
-    return camera_file if isinstance(camera_file, SceneError) else _align(ply, files, camera_file, hints, photos=photos)
+    if isinstance(camera_file, SceneError):
+        return camera_file
+    answer = _align(ply, files, camera_file, hints, photos=photos)
+    return _confirm_colors(answer) if isinstance(answer, Loaded) else answer
 
 
 def _align(
@@ -338,47 +352,55 @@ def _assign(
     Notes name photos that cannot be read, and views without a photo. Returns why if photos and cameras do not fit.
     """
     is_grid = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED  # photos may have any size
+    is_odd = not is_grid and has_other_shape(proposal, camera_file)
+    bare = partial(_combine, ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
+    if is_odd:  # photos of another shape say nothing against cameras that see the Gaussians
+        alone = _answer(bare)
+        fitted = choose_part(alone.scene, proposal, camera_file) if isinstance(alone, Loaded) else None
+        if fitted is not None:
+            return _assign(ply, files, camera_file, fitted, hints)
     load: Loaded | None = None
     cause: SceneError | None = None
-    fit: GridFit | None = None
     while load is None and cause is None and not is_grid and any(photo is not None for photo in proposal.named):
-        answer = _answer(partial(_combine_chosen, ply, files, camera_file, proposal, proposal.choice, hints))
+        tried = _answer(partial(_combine_chosen, ply, files, camera_file, proposal, proposal.choice, hints))
         sound = None
-        if isinstance(answer, Loaded):
-            load = answer
-        elif answer.path in map(str, proposal.pool):
+        if isinstance(tried, Loaded):
+            load = tried
+        elif tried.path in map(str, proposal.pool):
             sound = proposal.without_broken()
         if sound is not None:
             proposal = sound
-        elif isinstance(answer, SceneError):
-            cause = answer
-    base: Loaded | SceneError | None = load
-    if base is None:
-        pinholes = replace(camera_file, lenses=())
-        base = _answer(partial(_combine, ply, files, pinholes, ScenePhotos(), hints))
+        elif isinstance(tried, SceneError):
+            cause = tried
+    base = _answer(bare) if load is None else load
     if isinstance(base, SceneError):
         return cause or base
-    if is_grid and proposal.pool:
-        fit = fit_to_grid(base.scene, proposal)
+    fit = fit_to_grid(base.scene, proposal) if is_grid and proposal.pool else None
     guessed = list_guessed(base.scene, camera_file)
     proposal = proposal.without_views(guessed)
     views, is_read = range(len(base.scene)), load is not None
-    chosen = assign_to_views(base.scene, views, proposal, read=is_read, guessed=guessed, fit=fit)
-    if not any(chosen):
-        refusal = refuse_photos(files, proposal, camera_file, cause)
+    chosen, are_alike = assign_to_views(base.scene, views, proposal, read=is_read, guessed=guessed, fit=fit)
+    if proposal.fit == WHOLE_FIT and not is_odd and (not are_alike or has_bars(base.scene)):
+        fitted = choose_part(base.scene, proposal, camera_file, fit)
+        if fitted is not None:
+            return _assign(ply, files, camera_file, fitted, hints)
+    answer: Loaded | SceneError | None = load
+    if is_odd and load is not None and not are_alike:  # a part of the cameras' pictures would have the photos' shape
+        chosen = []
+    if any(chosen) and (load is None or chosen != proposal.choice):
+        named = name_by_photos(camera_file, proposal, chosen, fit)
+        answer = _answer(partial(_combine_chosen, ply, files, named, proposal, chosen, hints))
+    if any(chosen) and isinstance(answer, SceneError) and not is_odd:
+        return answer
+    if not any(chosen) or not isinstance(answer, Loaded):
+        refusal = refuse_photos(files, proposal, camera_file, None if is_odd and not camera_file.lenses else cause)
         if refusal is not None:
             return refusal
         alone = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
         text = describe_unused(proposal, camera_file)
         return alone.with_left_out([text]) if isinstance(alone, Loaded) else alone
     described, unused = describe_assignment(proposal, chosen, camera_file, are_pixels=base.scene.has_own_pixels)
-    if load is None or chosen != proposal.choice:
-        camera_file = name_by_photos(camera_file, proposal, chosen, fit)
-        answer = _answer(partial(_combine_chosen, ply, files, camera_file, proposal, chosen, hints))
-        if isinstance(answer, SceneError):
-            return answer
-        load = answer
-    return replace(load, notes=(*load.notes, *described)).with_left_out(unused)
+    return replace(answer, notes=(*proposal.notes, *answer.notes, *described)).with_left_out(unused)
 
 
 def _combine_chosen(
@@ -428,8 +450,7 @@ def _combine(
     order = _choose_order(ply, camera_file, hints)
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
-    without_bars, bar_notes = cut_bars(pictures, camera_file)
-    limited, size_notes = limit_photo_size(without_bars, len(ply.gaussians), hints.max_side, unaligned=order == "none")
+    limited, size_notes = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
     if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians
         problem = "expected one Gaussian per pixel, found the Gaussians of a state"
         cameras = to_cameras(pinholes, photo_size(limited))
@@ -437,19 +458,16 @@ def _combine(
     else:
         frames = partial(read_dataparser, files.ply, files.cameras)
         result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, frames=frames)
-    notes += [*bar_notes, *size_notes, *result.notes]
+    notes += [*size_notes, *result.notes]
     if result.pixel_ids is None:
         _check_hints(ply, hints)
         cameras, images, size_notes = limit_view_size(result.cameras, result.images, hints.max_side)
         result = replace(result, cameras=cameras, images=images)
         notes += size_notes
-    size, had_bars = photo_size(limited), without_bars is not pictures
+    size = photo_size(limited)
     unused = [f"--{name}" for name in ("masks", "protect") if getattr(files, name) is not None]
-    if unused and (had_bars or not size):
-        reason = "the photos have bars, which are cut off" if size else "there are no photos"
-        notes.append(f"the pictures of {' and '.join(unused)} are not used, since {reason}")
-    if had_bars:  # photos with bars have neither larger files nor masks
-        return _make_load(ply, files, hints, result, notes, absent=photos.absent)
+    if unused and not size:
+        notes.append(f"the pictures of {' and '.join(unused)} are not used, since there are no photos")
     left_out, place = list[str](), (camera_file, photos, size, result.transform, result.cameras)
     found = _answer(lambda: find_larger_and_masks(files, *place))
     if isinstance(found, SceneError):

@@ -6,38 +6,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.io.cameras.camera_file import (
-    CameraFile,
-    drop_repeats,
-    missing_intrinsics,
-    sizes_of,
-    to_cameras,
-    undistort_photos,
-)
+from gsmerge.io.cameras.camera_file import CameraFile, drop_repeats, missing_intrinsics, to_cameras, undistort_photos
 from gsmerge.io.cameras.read import read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import (
     PhotoArrays,
     PhotoTransform,
     Size,
-    change_photos,
     decode_views,
     keep_photos,
     limit_size,
     photo_size,
     resize_to,
-    same_shape,
 )
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.matrices import matmul
-from gsmerge.kernels.pictures import count_bars
 from gsmerge.photos.masks import NO_MASKS, Masks, read_masks
 from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.types import Cameras, LargePhotos
 
 _MAX_BYTES = 2 << 30  # size of all photos as floats, up to which photos are not resized unless rows have no pixels
 _FLOAT_PIXEL = 12  # bytes of a pixel as three floats
-_BAR_SPREAD = 8  # largest range of a bar's colours, of 255
 _ROUNDING = 1e-6  # pixels
 
 
@@ -104,7 +93,7 @@ def find_larger_and_masks(
     def read(view: int) -> np.ndarray:
         if not paths:
             return cut(view, photos.pictures[view])
-        return cut(view, decode_views([paths[view]], [photos.turns[view]], stored)[0])
+        return cut(view, decode_views([paths[view]], [photos.turns[view]], stored, photos.part)[0])
 
     large = None
     if window.is_larger:
@@ -136,27 +125,6 @@ def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cam
     to_file[:2, 2] = corner / scale - first
     (left, top), (right, bottom) = first.tolist(), last.tolist()
     return _Window(slice(top, bottom), slice(left, right), to_file, bool((scale * reduction).max() < 1))
-
-
-def cut_bars(photos: PhotoArrays, camera_file: CameraFile) -> tuple[PhotoArrays, list[str]]:
-    """Cut off bars around photos if the rest has the cameras' aspect ratio; return a note, empty if nothing is cut."""
-    size = photo_size(photos)
-    shapes = sizes_of(camera_file)
-    if size is None or not shapes or camera_file.photo_map is not None:
-        return photos, []
-    if any(same_shape(shape, size) for shape in shapes):
-        return photos, []
-    counts = [count_bars(photos[view], _BAR_SPREAD) for view in range(len(photos))]
-    above, below, left, right = (int(count) for count in np.median(counts, 0))  # pixels of the bars
-    inner = size[0] - left - right, size[1] - above - below
-    if inner == size or not any(same_shape(shape, inner) for shape in shapes):
-        return photos, []
-
-    def cut(_: int, photo: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(photo[above : size[1] - below, left : size[0] - right])
-
-    note = f"bars around the photos are cut off: {size[0]} x {size[1]} pixels become {inner[0]} x {inner[1]}"
-    return keep_photos(change_photos(photos, cut, inner)), [note]
 
 
 def limit_photo_size(

@@ -184,6 +184,10 @@ def _focal(values: Mapping[str, float], axis: str, side: float) -> float:
     return 0.0
 
 
+_PANORAMAS = ("equirect", "spher", "panoram")  # parts of the names of 360-degree models
+_CUT_PANORAMAS = "cut pinhole pictures out of the 360-degree panoramas first, as nerfstudio's ns-process-data does"
+
+
 def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
     """Return the lens of a view, None for a pinhole."""
     model = values.get("model", "PINHOLE")
@@ -197,6 +201,7 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
         reason = f"lens distortion {ambiguous}, which formats understand differently"
         found = f"camera model {model}" if ambiguous is None else reason
         problem = f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {found}"
-        raise SceneError(path, problem, "undistort the images first")
+        is_panorama = any(part in model.lower() for part in _PANORAMAS)
+        raise SceneError(path, problem, _CUT_PANORAMAS if is_panorama else "undistort the images first")
     coefficients = [params[key] for key in ("k1", "k2", "p1", "p2", "k3")]
     return make_lens(model if model in _DISTORTED else "OPENCV", "perspective", coefficients)

@@ -40,6 +40,7 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of compressed PLYs
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
+SHARE_ROUNDING = 0.01  # by which shares that were rounded to half floats may exceed [0, 1]
 MAX_STRAY = 0.01  # share of a column's values that may contradict the rest, because of roundings and damage
 _EXACT = 1e-5  # largest rounding error of a whole number in a matrix that rotates harmonics
 _UNPACKING = 16_000_000  # bytes of all blocks that are unpacked at the same time
@@ -127,6 +128,19 @@ def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
     """Return the column names of the base colour: ``f_dc_*``, or plain colours if a file has no ``f_dc_*``."""
     plain = (colors for colors in PLAIN_COLORS if set(colors) <= set(names or ()))
     return SH0 if names is None or SH0[0] in names else next(plain, SH0)
+
+
+def are_shares(values: np.ndarray) -> bool:
+    """Return whether stored values are opacities or colours in [0, 1], except for roundings and damage.
+
+    The density of logits and of harmonics continues beyond 0 and 1, while that of shares ends there. Therefore values
+    are shares if hardly any value lies outside [0, 1], and more values lie inside, close to 0 or 1, than outside.
+    """
+    excess = np.abs(values[np.isfinite(values)] - 0.5) - 0.5  # distance outside [0, 1]; negative inside
+    num_outside = int(np.count_nonzero(excess > 0))
+    num_close = int(np.count_nonzero((excess <= 0) & (excess > -SHARE_ROUNDING)))
+    are_few = num_outside < num_close and num_outside < MAX_STRAY * len(excess)
+    return bool(len(excess)) and (are_few or num_outside == 0)
 
 
 def are_logarithms(scales: np.ndarray) -> bool:

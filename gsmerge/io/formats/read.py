@@ -13,13 +13,14 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.scale_units import LINEAR_NOTE, ScaleJudgement, judge_scales, log_of_scales
+from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits, judge_colors, state_colors
+from gsmerge.io.formats.scale_units import LINEAR_NOTE, SAMPLES, ScaleJudgement, judge_scales, log_of_scales
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.reading import OpacityChoice, ScaleChoice
+from gsmerge.settings.reading import ColorChoice, OpacityChoice, ScaleChoice
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
@@ -29,7 +30,6 @@ MIN_FINITE = 0.002  # least share of finite rows; a file with fewer is refused
 MAX_HARMONIC = 1e6  # larger harmonics are clipped, so that float32 can square and sum the rendered values
 FREED_ROWS = 1 << 17  # rows after which the memory of large columns is freed
 _MIN_JUDGED = 100  # least number of values for a judgement of encodings
-_RAW_ROUNDING = 0.01  # opacities that were rounded to half floats may exceed [0, 1] by this
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,8 @@ class FileInfo:
     num_zero_quats: int  # Gaussians with a zero quaternion, read as the identity
     # why the scales are likely wrong, one sentence without a full stop; empty if they are plausible
     odd_scales: str = ""
+    color_units: ColorUnits | None = None  # in which the file has RGB in the columns of harmonics; None if it has not
+    color_note: str = ""  # that these units were guessed, one sentence without a full stop
     adapted: tuple[str, ...] = ()  # how the content was adapted, one sentence each without a full stop
 
 
@@ -91,10 +93,11 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
         ("Gaussian", "with a zero quaternion, read as the identity"): info.num_zero_quats,
     }
     raw = ("opacities lie in [0, 1] and are read as such; if they are logits, use --hint opacity=logit",)
+    color_notes = (info.color_note,) if info.color_note else ()
     raw_notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
     scale_notes = (info.odd_scales,) if info.odd_scales else ()
     count_notes = (count_words(count, noun, rest) for (noun, rest), count in counted.items() if count)
-    return (*info.adapted, *raw_notes, *scale_notes, *count_notes)
+    return (*info.adapted, *color_notes, *raw_notes, *scale_notes, *count_notes)
 
 
 def degree_notes(info: FileInfo) -> tuple[str, ...]:
@@ -105,7 +108,9 @@ def degree_notes(info: FileInfo) -> tuple[str, ...]:
 
 
 @check_arguments
-def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto") -> GaussianFile:
+def read_ply(
+    path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto", colors: ColorChoice = "auto"
+) -> GaussianFile:
     """Read a PLY file of Gaussians, binary or ascii, with harmonics of any degree up to 4.
 
     Additional columns are not used. Without harmonics of degree 0, colours may be red, green and blue, or r, g and b
@@ -118,19 +123,27 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleCho
             as logits. Infinite logits are opacities of 0 and 1.
         scales: How scales are stored. "auto" reads them as logarithms, unless the size of the scene shows that
             they are linear.
+        colors: What ``f_dc_*`` hold. "auto" reads them as harmonics, unless they end at black and white as RGB does.
 
     Raises:
         SceneError: If the file cannot be read, lacks columns, or has fewer than 2 finite Gaussians in 1,000 rows.
-        ValueError: If ``opacity`` is not "auto", "logit" or "raw", or ``scales`` not "auto", "log" or "linear".
+        ValueError: If ``opacity`` is not "auto", "logit" or "raw", ``scales`` not "auto", "log" or "linear", or
+            ``colors`` not "auto", "sh" or "rgb".
 
     Example:
         >>> len(gsmerge.read_ply("demo/scene.ply").gaussians)
         7680
     """
-    return read_parts([Path(path)], opacity=opacity, scales=scales)
+    return read_parts([Path(path)], opacity=opacity, scales=scales, colors=colors)
 
 
-def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto") -> GaussianFile:
+def read_parts(
+    paths: Sequence[Path],
+    *,
+    opacity: OpacityChoice = "auto",
+    scales: ScaleChoice = "auto",
+    colors: ColorChoice = "auto",
+) -> GaussianFile:
     """Read files as one, in the given order: a PLY file or PLY files with equal columns.
 
     Errors are those of :func:`read_ply`.
@@ -139,22 +152,26 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto", scales
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     if scales not in ("auto", "log", "linear"):
         raise ValueError(f"scales: expected 'auto', 'log' or 'linear', got {scales!r}")
+    if colors not in ("auto", "sh", "rgb"):
+        raise ValueError(f"colors: expected 'auto', 'sh' or 'rgb', got {colors!r}")
     parts = parallel_map(ply.read_rows, paths)
     for path, part in zip(paths, parts, strict=True):
         if part.rows.dtype != parts[0].rows.dtype:
             problem = f"expected the same columns as in {paths[0].name}, found others, so these are no parts of a scene"
             raise SceneError(path, problem, "name one of the files")
-    return convert_files(paths, parts, opacity, scales)
+    return convert_files(paths, parts, opacity, scales, colors)
 
 
 @check_arguments
-def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto") -> GaussianFile:
+def read_gaussians(
+    path: StrPath, *, opacity: OpacityChoice = "auto", scales: ScaleChoice = "auto", colors: ColorChoice = "auto"
+) -> GaussianFile:
     """Read a file of Gaussians; the ending of its name tells the format.
 
-    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2)and ``.glb``. The
-    finest level of a ``lod-meta.json`` is read; ``meta.json`` or its folder is a ``.sog`` without its zip. Everything
-    else is read by :func:`read_ply`; only this uses ``opacity`` and ``scales``. SceneError if the file cannot be read,
-    is damaged, or holds no finite Gaussian. ValueError for an unknown ``opacity`` or ``scales``.
+    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``. The finest level of a
+    ``lod-meta.json`` is read; ``meta.json`` or its folder is a ``.sog`` without its zip. Everything else is read by
+    :func:`read_ply`; only this uses ``opacity``, ``scales`` and ``colors``. SceneError if the file cannot be read, is
+    damaged, or holds no finite Gaussian. ValueError for an unknown encoding.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
@@ -168,12 +185,16 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto", scales: Sc
         problem = f"expected one of {', '.join(READ_ENDINGS)}, found {format_.ending}, which is written and not read"
         raise SceneError(path, problem, "name the file that it was made from")
     if format_.read is ply.read_rows:
-        return read_ply(path, opacity=opacity, scales=scales)
+        return read_ply(path, opacity=opacity, scales=scales, colors=colors)
     return convert_files([path], [format_.read(path)], "auto")
 
 
 def convert_files(
-    paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice, scales: ScaleChoice = "auto"
+    paths: Sequence[Path],
+    parts: Sequence[StoredRows],
+    opacity: OpacityChoice,
+    scales: ScaleChoice = "auto",
+    colors: ColorChoice = "auto",
 ) -> GaussianFile:
     """Convert the rows of files to Gaussians, file by file; facts that are not sums are those of the first file."""
     path, stored, dtype = paths[0], parts[0], parts[0].rows.dtype
@@ -187,6 +208,9 @@ def convert_files(
         parts = [_with_linear_scales(part) for part in parts]
         num_clipped, num_zero_quats = _fill_arrays(paths, parts, out)
     empty = find_empty(path, out)
+    units, color_note = _choose_colors(parts[0], out, colors)
+    if units is not None:
+        out["sh0"][:] = rgb_to_sh0(units.rgb(out["sh0"]))
     encoding, is_guess = _choose_encoding(paths, parts, out["opacities"], empty, opacity)
     _activate(out["opacities"], out["valid"], encoding)
     num_nonfinite = clear_invalid(path, out)
@@ -215,6 +239,8 @@ def convert_files(
         num_clipped_scales=num_clipped,
         num_zero_quats=max(0, num_zero_quats - len(empty)),  # empty rows usually have zero quaternions
         odd_scales="" if judgement.linear else judgement.why,
+        color_units=units,
+        color_note=color_note,
         adapted=(*scale_notes, *stored.notes, *_describe_incomplete(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
@@ -265,6 +291,28 @@ def _judge_scales(
     if columns == arrays.PLAIN_COLORS[1] and not arrays.are_logarithms(log(out["scales"][:, 0])):
         return ScaleJudgement(True, "the columns are r, g and b and hardly any scale is negative")
     return judgement
+
+
+def _choose_colors(part: StoredRows, out: dict[str, np.ndarray], choice: ColorChoice) -> tuple[ColorUnits | None, str]:
+    """Choose the units of stored colours, None for harmonics; return them and a note.
+
+    Only rows of a PLY file may hold RGB in place of harmonics. Unless the caller states it, files that gsmerge wrote do
+    not.
+    """
+    names = part.rows.dtype.names or ()
+    is_stated = choice == "sh" or (choice == "auto" and part.encoding is not None)
+    if is_stated or not isinstance(part.rows, np.ndarray) or arrays.color_columns(names) != arrays.SH0:
+        return None, ""
+    rows = np.flatnonzero(out["valid"])
+    rows = rows[:: max(1, len(rows) // SAMPLES)]
+    stored = out["sh0"][rows, 0]
+    if choice == "rgb":
+        return state_colors(stored), ""
+    has_plain = all(name in names and part.rows.dtype[name] == np.uint8 for name in arrays.PLAIN_COLORS[0])
+    first = rows[rows < len(part.rows)]
+    plain = np.stack([part.rows[name][first] for name in arrays.PLAIN_COLORS[0]], 1) if has_plain else None
+    judged = judge_colors(stored[: len(first)], plain)
+    return (None, "") if judged is None else (judged[0], RGB_NOTE.format(judged[0].name, judged[1]))
 
 
 def _with_linear_scales(part: StoredRows) -> StoredRows:
@@ -391,7 +439,7 @@ def _choose_encoding(
         if share > 100 * arrays.MAX_STRAY:
             problem = f"expected opacities as logits or in [0, 1], found 0 to 255: {share:.3g} % are above any logit"
             raise SceneError(paths[0], problem, "divide them by 255, or for logits use --hint opacity=logit")
-    return declared or _guess_encoding(values), declared is None
+    return declared or ("raw" if arrays.are_shares(values) else "logit"), declared is None
 
 
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
@@ -405,7 +453,7 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
         values = opacities[start : start + len(part.rows)]
         start += len(values)
         is_clear = len(parts) > 1 and np.isfinite(values).sum() >= _MIN_JUDGED
-        encoding = part.encoding or (_guess_encoding(values) if is_clear else None)
+        encoding = part.encoding or (("raw" if arrays.are_shares(values) else "logit") if is_clear else None)
         if encoding is not None:
             part_names.setdefault(encoding, path.name)
         if len(part_names) > 1:
@@ -430,25 +478,11 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
 def _check_raw(path: Path, opacities: np.ndarray) -> None:
     """Raise SceneError if values that the caller declares as opacities in [0, 1] are logits."""
     finite = np.isfinite(opacities)
-    outside = (np.abs(opacities - 0.5) > 0.5 + _RAW_ROUNDING) & finite
+    outside = (np.abs(opacities - 0.5) > 0.5 + arrays.SHARE_ROUNDING) & finite
     if outside.sum() > arrays.MAX_STRAY * finite.sum():
         share = 100 * outside.sum() / finite.sum()
         problem = f"expected opacities in [0, 1], as --hint opacity=raw says, found {share:.3g} % outside, like logits"
         raise SceneError(path, problem, "leave out --hint opacity=raw")
-
-
-def _guess_encoding(opacities: np.ndarray) -> str:
-    """Return "raw" if the finite stored opacities lie in [0, 1], except for roundings and damage; else "logit".
-
-    The density of logits continues beyond 0 and 1, while the density of opacities ends there. Therefore values are
-    opacities if hardly any value lies outside [0, 1], and more values lie inside, close to 0 or 1, than outside.
-    """
-    finite = np.isfinite(opacities)
-    excess = np.abs(opacities[finite] - 0.5) - 0.5  # distance outside [0, 1]; negative inside
-    num_outside = int(np.count_nonzero(excess > 0))
-    num_close = int(np.count_nonzero((excess <= 0) & (excess > -_RAW_ROUNDING)))
-    are_few = num_outside < num_close and num_outside < arrays.MAX_STRAY * len(excess)
-    return "raw" if len(excess) and (are_few or num_outside == 0) else "logit"
 
 
 def _spread_low_degree(shN: np.ndarray) -> None:

@@ -14,7 +14,7 @@ from gsmerge.runtime.memory import gather
 
 MIN_JUDGED = 100  # least number of Gaussians for a judgement
 LINEAR_NOTE = "scales are read as linear, since {}; if they are logarithms, use --hint scales=log"
-_SAMPLES = 20_000  # Gaussians whose scales are judged
+SAMPLES = 20_000  # Gaussians whose scales and colours are judged
 _MAX_WIDTH = 0.25  # scales are wrong if half of the standard deviations exceed this share of the scene's width
 # Bounds on half of the standard deviations, in units of the scene's width divided by the square root of the number of
 # Gaussians. Sound files have 0.3 to 2. Files with linear scales, read as logarithms, have 10 to 1,000.
@@ -43,7 +43,7 @@ def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
     rows = range(len(valid)) if valid.all() else np.flatnonzero(valid)
     if len(rows) < MIN_JUDGED:
         return ScaleJudgement(False, "")
-    sample = np.asarray(rows[:: max(1, len(rows) // _SAMPLES)])
+    sample = np.asarray(rows[:: max(1, len(rows) // SAMPLES)])
     points, sizes = gather(out["means"], sample).astype(np.float64), gather(out["scales"], sample)
     low, high = quantiles(points, (0.05, 0.95))
     width, size = float((high - low).max()), median(sizes.max(1))

@@ -30,7 +30,7 @@ def assign(
     views: np.ndarray, pool: Sequence[np.ndarray], named: Named, *, exact: bool, tags: Sequence[int] | None = None
 ) -> list[Assignment | None]:
     candidates = Candidates(lambda photo: pool[photo], len(pool), tags or [0] * len(pool))
-    return assign_photos(lambda side: show(views, side), candidates, named, exact=exact)
+    return assign_photos(lambda side: show(views, side), candidates, named, exact=exact)[0]
 
 
 @pytest.fixture(scope="module")
@@ -175,5 +175,5 @@ def test_a_view_that_shows_nothing_contradicts_no_name(views: np.ndarray, photos
     for photo, expected in ((2, Assignment(2, 0)), (VIEWS, None)):
         candidates = Candidates(lambda photo: pool[photo], len(pool), [0] * len(pool))
         named = [0, 1, photo, 3, 4, 5]
-        chosen = assign_photos(lambda side: show(views, side, weights), candidates, named, exact=True)
+        chosen, _ = assign_photos(lambda side: show(views, side, weights), candidates, named, exact=True)
         assert chosen == [Assignment(0, 0), Assignment(1, 0), expected, *(Assignment(view, 0) for view in (3, 4, 5))]

@@ -20,7 +20,10 @@ from gsmerge.photos.colors import (
     map_tones,
     plain_blocks,
     tone_blocks,
+    vary_in_hue,
 )
+from gsmerge.photos.compare import are_exchanged, find_grey
+from gsmerge.photos.photo_change import LUMA, PhotoChange
 from gsmerge.photos.pictures import Pairs, ViewPictures
 
 Change = Callable[[np.ndarray], np.ndarray]
@@ -109,3 +112,43 @@ def test_faint_blocks_are_not_compared() -> None:
     errors = blocks.errors().reshape(blocks.solid.shape)
     assert np.isnan(errors[:, :4]).all()
     assert np.isfinite(errors[:, 5:]).all()
+
+
+def grey(photos: np.ndarray) -> np.ndarray:
+    return (photos * LUMA).sum(-1, keepdims=True).repeat(3, -1)
+
+
+def sepia(photos: np.ndarray) -> np.ndarray:
+    return (grey(photos) * np.array([1.35, 1.2, 0.94], np.float32)).clip(0, 1)
+
+
+def half_grey(photos: np.ndarray) -> np.ndarray:
+    return (grey(photos) + photos) / 2
+
+
+@pytest.mark.parametrize(("change", "is_grey"), [(grey, True), (sepia, True), (half_grey, False), (mix, False)])
+def test_grey_photos_are_those_without_hues(change: Change, is_grey: bool) -> None:
+    """Of the Gaussians, since grey Gaussians need no other photos."""
+    pairs = pair(lambda photos: photos)
+    photos = change(pairs.photos)
+    assert list(find_grey(pairs.with_photos(photos), range(4))) == ([0, 1, 2, 3] if is_grey else [])
+    assert not find_grey(pair(change).with_photos(photos), range(4))
+    weights = np.ones(photos[0].size // 3, np.float32)
+    assert (vary_in_hue(photos[0].reshape(-1, 3), weights) < 0.01) == is_grey
+
+
+def test_hues_are_taken_and_brightness_stays() -> None:
+    photos = shrunk(cut_views(1), 96) * np.float32(0.5) + np.float32(0.25)
+    dark = grey(photos[0]) * np.float32(0.9)
+    cover = np.full(dark.shape[:2], True)
+    cover[:5] = False
+    changed = PhotoChange(cover=cover, colors=photos[0], bright=False)(dark)
+    np.testing.assert_allclose(grey(changed), dark, atol=1e-4)
+    np.testing.assert_allclose((changed - grey(changed))[5:], (photos[0] - grey(photos[0]))[5:], atol=1e-4)
+    np.testing.assert_array_equal(changed[:5], dark[:5])
+
+
+def test_red_and_blue_that_are_exchanged_are_told_from_other_maps() -> None:
+    assert are_exchanged(pair(lambda photos: photos[..., ::-1], noise=0.02))
+    for change in (mix, gamma, half_grey):
+        assert not are_exchanged(pair(change, noise=0.02))

@@ -279,7 +279,7 @@ def test_lenses_are_read(
 @pytest.mark.parametrize(
     ("name", "old", "new", "place", "found"),
     [
-        ("transforms.json", '"fl_x"', '"camera_model": "EQUIRECTANGULAR", "fl_x"', "view 0.png", "EQUIRECTANGULAR"),
+        ("transforms.json", '"fl_x"', '"camera_model": "EQUIRECTANGULAR", "fl_x"', "EQUIRECTANGULAR", "360-degree"),
         ("transforms.json", '"fl_x"', '"k4": 0.1, "fl_x"', "view 0.png", "k4"),
         ("transforms.json", '"fl_x": 40.0', '"fl_x": -3', "view 0.png", -3),
         ("transforms.json", '"fl_x": 40.0', '"fl_x": "wide"', "expected numbers", "'wide'"),

@@ -20,7 +20,7 @@ from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.read import file_notes, read_parts
 from gsmerge.kernels import elementary
 from gsmerge.runtime.threads import use_threads
-from gsmerge.types import Gaussians
+from gsmerge.types import SH_C0, Gaussians
 
 NAMES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -291,6 +291,37 @@ def test_scales_that_are_no_logarithms_or_too_large_are_noted(
         rows[f"scale_{axis}"] = stored(factor * rng.uniform(0.01, 0.09, len(rows)))
     notes = [note for note in file_notes(read_ply(save(tmp_path / "a.ply", rows)).info) if "scale" in note]
     assert [part in note for note in notes] == [True] * bool(part)
+
+
+@pytest.mark.parametrize(
+    ("black", "white", "with_bytes", "is_rgb"),
+    [(0, 1, False, True), (-0.5, 0.5, False, True), (0, 255, False, True), (0, 1, True, True), (0.1, 0.4, True, False),
+     (0.1, 0.4, False, False), (-1.7, 1.7, False, False), (-1.7, 1.7, True, False)],
+)  # fmt: skip
+def test_rgb_in_the_place_of_harmonics_is_recognised(
+    tmp_path: Path, black: float, white: float, with_bytes: bool, is_rgb: bool
+) -> None:
+    """By where all values end; few colours, and colours darker than grey, are those of harmonics."""
+    rng = np.random.default_rng(0)
+    rgb, rows = rng.random((2000, 3)).astype(np.float32), columns(2000)
+    for channel in range(3):
+        rows[f"f_dc_{channel}"] = black + (white - black) * rgb[:, channel]
+    if with_bytes:
+        more = np.empty(len(rows), [*rows.dtype.descr, *((name, "u1") for name in ("red", "green", "blue"))])
+        for name in rows.dtype.names:
+            more[name] = rows[name]
+        for channel, name in enumerate(("red", "green", "blue")):
+            more[name] = np.round(255 * rgb[:, channel])
+        rows = more
+    stored = np.stack([rows[f"f_dc_{channel}"] for channel in range(3)], 1)
+    read = read_ply(save(tmp_path / "a.ply", rows))
+    assert noted(file_notes(read.info), "--hint colors=sh") == is_rgb
+    assert np.allclose(read.gaussians.sh0[:, 0], (rgb - 0.5) / SH_C0 if is_rgb else stored, atol=1e-4)
+    kept = read_ply(tmp_path / "a.ply", colors="sh")
+    assert np.array_equal(kept.gaussians.sh0[:, 0], stored)
+    assert not noted(file_notes(kept.info), "f_dc")
+    with refuses(ValueError, "colors", "raw"):
+        read_ply(tmp_path / "a.ply", colors="raw")
 
 
 @pytest.mark.parametrize("factor", [0.01, 1.0, 10.0])

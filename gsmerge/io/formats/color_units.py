@@ -1,0 +1,54 @@
+"""Judge whether the columns ``f_dc_*`` hold harmonics, as in most files, or RGB, by the values that occur."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmerge.io.formats import arrays
+from gsmerge.io.formats.scale_units import MIN_JUDGED
+
+RGB_NOTE = "f_dc_0 to f_dc_2 are read as {}, since {}; if they are harmonics, use --hint colors=sh"
+_MIN_SPREAD = 0.5  # of the range from black to white, least part that RGB covers; faint scenes as harmonics cover less
+_ROUNDING = 1.5 / 255  # difference of two columns of one colour, of which one is a byte
+
+
+@dataclass(frozen=True)
+class ColorUnits:
+    """The values of ``f_dc_*`` that stand for black and white."""
+
+    black: float
+    white: float
+    name: str  # in notes
+
+    def rgb(self, stored: np.ndarray) -> np.ndarray:
+        """Return stored values as RGB in [0, 1]."""
+        return (stored - np.float32(self.black)) / np.float32(self.white - self.black)
+
+
+_UNITS = (
+    ColorUnits(0, 1, "RGB in [0, 1]"),
+    ColorUnits(-0.5, 0.5, "RGB less a half"),
+    ColorUnits(0, 255, "RGB in [0, 255]"),
+)
+
+
+def judge_colors(stored: np.ndarray, plain: np.ndarray | None) -> tuple[ColorUnits, str] | None:
+    """Judge a sample of stored colours ``[n,3]``; return their units and a clause that says why; None for harmonics.
+
+    ``plain [n,3]`` are the bytes of the file's columns red, green and blue. Harmonics of a scene go far below zero,
+    where colours are darker than grey. RGB ends at black and at white.
+    """
+    for units in _UNITS if len(stored) >= MIN_JUDGED else ():
+        rgb = units.rgb(stored)
+        if plain is not None and (np.abs(rgb - plain / np.float32(255)) <= _ROUNDING).mean() > 1 - arrays.MAX_STRAY:
+            return units, "the columns red, green and blue are the same"
+        if arrays.are_shares(rgb) and np.ptp(np.quantile(rgb, (arrays.MAX_STRAY, 1 - arrays.MAX_STRAY))) > _MIN_SPREAD:
+            return units, f"all lie in [{units.black:g}, {units.white:g}]"
+    return None
+
+
+def state_colors(stored: np.ndarray) -> ColorUnits:
+    """Return the units of colours ``[n,3]`` that the caller calls RGB."""
+    return next((units for units in _UNITS if arrays.are_shares(units.rgb(stored))), _UNITS[0])

@@ -1,0 +1,78 @@
+"""Photos of another shape, or that do not show their views as a whole -> the part of each that shows its view.
+
+Bars are cut off, and one picture is taken out of both eyes of a stereo camera, or out of several side by side.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile, sizes_of
+from gsmerge.io.photo_files import WHOLE, decode_image, image_size, limit_size, resize_to, same_shape
+from gsmerge.kernels.pictures import count_bars
+from gsmerge.photos.assign import Assigner, Assignment, Candidates
+from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_parts, sharpen
+from gsmerge.photos.offsets import SIDE
+from gsmerge.photos.pictures import show_views
+from gsmerge.photos.scene_photos import Proposal
+from gsmerge.photos.views import pick_views
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Scene
+
+_COMPARED = 8  # most photos whose parts are compared with their views
+_BAR_SPREAD = 8  # largest range of a bar's colours, of 255
+
+
+def has_bars(scene: Scene) -> bool:
+    """Return whether the first photo of a scene has bars on opposite sides."""
+    if scene.images is None:
+        return False
+    above, below, left, right = count_bars(scene.images[0], _BAR_SPREAD / 255)
+    return bool((above and below) or (left and right))
+
+
+def choose_part(
+    scene: Scene, proposal: Proposal, camera_file: CameraFile, grid_fit: GridFit | None = None
+) -> Proposal | None:
+    """Find the part of the proposed photos that shows the views; None if whole photos fit as well, or if no part does.
+
+    A part fits if it explains the views as a photo does (:meth:`Assigner.explain_most`). ``grid_fit``: how the whole
+    photos would fit a grid whose cameras were estimated.
+    """
+    proposal = proposal.without_broken() or proposal
+    named = [(view, photo) for view, photo in enumerate(proposal.named) if photo is not None]
+    views, photos = zip(*(named[i] for i in pick_views(len(named), _COMPARED)), strict=True) if named else ((), ())
+    sizes = [image_size(proposal.pool[photo]) for photo in photos]
+    shapes_differ = not all(same_shape(size, sizes[0]) for size in sizes)
+    if not photos or shapes_differ or any(proposal.tags[photo] for photo in photos):
+        return None
+
+    def read(photo: int) -> tuple[np.ndarray, np.ndarray]:
+        """Read a photo small, and the shares of its sides that bars have."""
+        with suppress(SceneError):
+            whole = decode_image(proposal.pool[photo], size := image_size(proposal.pool[photo]))
+            above, below, left, right = count_bars(whole, _BAR_SPREAD)
+            small = resize_to(size, limit_size(size, 4 * SIDE)).photos([whole])[0]
+            return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
+        return np.zeros((SIDE, SIDE, 3), np.float32), np.zeros(4)
+
+    pictures, bars = zip(*parallel_map(read, photos), strict=True)
+    left, above, right, below = np.median(bars, 0).tolist()
+    inner, shape = (left, above, 1 - right, 1 - below), (scene.cameras.width, scene.cameras.height)
+    shape = next(iter(sizes_of(camera_file)), shape)
+    fits: list[GridFit | PartFit] = [] if grid_fit is None else [grid_fit]
+    if grid_fit is None:
+        inner = sharpen(inner, sizes[0], shape)
+    fits += list_parts(sizes[0], shape if grid_fit is None else None, inner)
+    fit = choose_fit(show_views(scene, SIDE)[views], pictures, fits)
+    if isinstance(fit, GridFit) or fit == WHOLE_FIT:
+        return None
+    candidates = Candidates(lambda photo: fit.cut(pictures[photo]), len(photos), [0] * len(photos))
+    assigner = Assigner(lambda side: show_views(scene, side)[views], candidates)
+    is_right = assigner.explain_most([Assignment(photo, 0) for photo in range(len(photos))])
+    note = fit.describe(sizes[0], bars=fit.part == inner != WHOLE)
+    return replace(proposal, fit=fit, notes=(*proposal.notes, note)) if is_right else None
