@@ -11,12 +11,14 @@ from network_fixtures import LAST
 
 pytest.importorskip("torch", reason="torch is not installed")
 
+import numpy as np
 import torch
 
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.research.training import Example, Shard, TrainOptions, write_shard
 from gsmerge.research.training.modules import Networks
+from gsmerge.research.training.windows import Box, Crop, Window
 
 TINY = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
 OPTIONS = TrainOptions(
@@ -48,6 +50,12 @@ def noisy_networks(options: NetworkOptions, scale: float = 0.3, seed: int = 0) -
             if name.split(".")[-2] in LAST and not bool(parameter.any()):
                 torch.nn.init.normal_(parameter, std=scale)
     return networks.eval().requires_grad_(False)
+
+
+def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
+    """A window of a whole photo, with all Feature Gaussians."""
+    height, width = example.images.shape[1:3]
+    return Window(photo, Box(0, 0, width, height), Crop(example, k, np.arange(len(example.features))))
 
 
 def written(example: Example, folder: Path) -> Shard:

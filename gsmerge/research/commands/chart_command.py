@@ -101,8 +101,7 @@ def _run_all(args: opt.Args, runs: Sequence[Run], measured: EvaluateOptions) -> 
     with stage_progress(quiet=args.silent) as progress:
         for i, (source, record, options) in enumerate(runs):
             name = f"{source.name}/{record.label}"
-            if progress is not None:
-                progress(name, i, len(runs))
+            progress(name, i, len(runs))
             try:
                 record = run_setting(source, record, options, measured)
             except Exception as error:  # a run that fails does not end the others

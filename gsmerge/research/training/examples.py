@@ -67,11 +67,6 @@ class Example:
         """Return the mask ``[h,w]`` of a photo's pixels that the views cover."""
         return covered_pixels(self.covers[:, photo])
 
-    def photo_ids(self, *, novel: bool) -> list[int]:
-        """List the photos of the views, or of ``novel`` views, that the views cover at least in part."""
-        span = range(len(self.cameras), len(self.photos)) if novel else range(len(self.cameras))
-        return [photo for photo in span if self.mask(photo).any()]
-
 
 def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, Callable[[], Example]]]:
     """Yield name and maker of each example of a scene; see :func:`make_example`.

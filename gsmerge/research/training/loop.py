@@ -25,7 +25,6 @@ from torch.nn import Parameter
 
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.measure.preview import save_picture, to_picture
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.corrections import LOGIT
 from gsmerge.photos.views import even_views
@@ -34,7 +33,7 @@ from gsmerge.research.training.losses import render_window, window_loss, window_
 from gsmerge.research.training.modules import Head, Networks
 from gsmerge.research.training.shards import Shard, read_shard
 from gsmerge.research.training.train_options import TrainOptions
-from gsmerge.research.training.windows import Window, sample_window, whole_photo
+from gsmerge.research.training.windows import Window, sample_window
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 VALIDATION = 2**32  # replaces the step in the seed of the random numbers of validation
@@ -45,20 +44,17 @@ FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
 
 
-def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions, out: Path) -> Row:
-    """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians.
-
-    For each scene ``validation-NAME.png`` shows a photo, its render without networks, and its render with networks.
-    """
-    scores = [window for i in range(len(shards)) for window in _score(networks, shards, i, options, out)]
+def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions) -> Row:
+    """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians."""
+    scores = [window for i, shard in enumerate(shards) for window in _score(networks, shard, i, options)]
     analytic, learned, matched = np.mean(scores, 0).tolist()
     return {"psnr_analytic": analytic, "psnr_learned": learned, "matched": matched}
 
 
-def _score(networks: Networks, shards: Sequence[Shard], number: int, options: TrainOptions, out: Path) -> Scores:
-    """Score a shard, and write a picture if it is the first shard of its scene."""
+def _score(networks: Networks, shard: Shard, number: int, options: TrainOptions) -> Scores:
+    """Score a shard on random windows, which depend on its ``number``."""
     rng = np.random.default_rng([options.seed, VALIDATION, number])
-    example = read_shard(shards[number])
+    example = read_shard(shard)
     windows = [
         sample_window(draw_views(example, options, rng), options.levels, options.window, options.most, 1, rng)
         for _ in range(options.validation_windows)
@@ -69,18 +65,7 @@ def _score(networks: Networks, shards: Sequence[Shard], number: int, options: Tr
         image, matched = render_window(window, networks, options)
         return window_psnr(window, plain), window_psnr(window, image), matched
 
-    if shards[number].scene not in {shard.scene for shard in shards[:number]}:
-        _write_picture(out / f"validation-{example.name}.png", networks, example, options)
     return parallel_map(score_window, windows)
-
-
-def _write_picture(path: Path, networks: Networks, example: Example, options: TrainOptions) -> None:
-    """Draw side by side a photo, of a novel view if there is one, and its renders without and with networks."""
-    ids = [*example.photo_ids(novel=True), *example.photo_ids(novel=False), 0]
-    window = whole_photo(example, ids[0], min(options.levels))
-    renders = [render_window(window, correcting, options)[0] for correcting in (None, networks)]
-    row = torch.cat([window.image, *renders], 1)
-    save_picture(path, to_picture(row.numpy()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,24 +103,20 @@ def train(
     options: TrainOptions | None = None,
     *,
     threads: int | None = None,
-    device: str = "cpu",
-    progress: OnStep | None = None,
+    progress: OnStep = lambda *_: None,
 ) -> TrainResult:
     """Train networks, or continue the run in the folder.
 
     Args:
         shards: At least one example.
         validation: Examples by which the best checkpoint is chosen; empty: other windows of ``shards``.
-        out: Folder for ``best.safetensors``, ``last.safetensors``, ``losses.csv``, ``state.safetensors`` and a picture
-            of each validation scene.
+        out: Folder for ``best.safetensors``, ``last.safetensors``, ``losses.csv`` and ``state.safetensors``.
         options: Settings.
         threads: Number of threads; None: all processors. The result does not depend on it.
-        device: Device of the networks, see :func:`choose_device`. Windows are rendered on the CPU. On CUDA a run
-            repeats up to rounding, not to the bit.
         progress: Called with (step, steps, loss) after every step.
 
     Raises:
-        ValueError: If there are no examples, or ``device`` is CUDA and torch finds none.
+        ValueError: If there are no examples.
         GsmergeError: If LPIPS has a weight in the loss, and its network weights are not installed.
         SceneError: If a shard is damaged, or the folder has another run or cannot be written.
     """
@@ -147,33 +128,15 @@ def train(
     validators = validation or shards
     ids = even_views(len(validators), min(len(validators), options.validation_examples))
     with use_threads(threads):
-        return _train(options, shards, [validators[i] for i in ids], out, choose_device(device), progress)
-
-
-def choose_device(name: str) -> str:
-    """Choose the torch device for ``"cpu"``, ``"cuda"`` or ``"auto"`` (CUDA if torch finds it).
-
-    Raises ValueError if the name is unknown, or if it is "cuda" and torch finds no CUDA device.
-    """
-    if name not in ("cpu", "cuda", "auto"):
-        raise ValueError(f'device: expected "cpu", "cuda" or "auto", got {name!r}')
-    has_cuda = name != "cpu" and torch.cuda.is_available()
-    if name == "cuda" and not has_cuda:
-        raise ValueError('device: expected a CUDA device, torch finds none; use "cpu"')
-    return "cuda" if has_cuda else "cpu"
+        return _train(options, shards, [validators[i] for i in ids], out, progress)
 
 
 def _train(
-    options: TrainOptions,
-    shards: Sequence[Shard],
-    validation: Sequence[Shard],
-    out: Path,
-    device: str,
-    progress: OnStep | None,
+    options: TrainOptions, shards: Sequence[Shard], validation: Sequence[Shard], out: Path, progress: OnStep
 ) -> TrainResult:
     with torch.random.fork_rng(devices=[]):  # new networks depend only on the seed
         torch.manual_seed(options.seed)
-        networks = Networks(options.network).to(device)
+        networks = Networks(options.network)
     optimizer = torch.optim.AdamW(networks.parameters(), lr=options.rate, weight_decay=options.decay)
     state = TrainingState(networks, deepcopy(networks).requires_grad_(False), optimizer)
     losses = list[Tensor]()
@@ -185,10 +148,9 @@ def _train(
     while step < options.steps:
         losses.append(_step(state, shards, read, options, step))
         step += 1
-        if progress:
-            progress(step, options.steps, float(losses[-1]))
+        progress(step, options.steps, float(losses[-1]))
         if step % options.save_every == 0 or step == options.steps:
-            scores = validate(state.smooth, validation, options, out)
+            scores = validate(state.smooth, validation, options)
             mean = float(torch.stack(losses).mean())
             rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
             losses = []
@@ -246,7 +208,7 @@ def _step(
             gradients = [torch.zeros_like(parameter) for parameter in parameters]
             if loss.requires_grad:
                 gradients = list(torch.autograd.grad(loss, parameters, materialize_grads=True))
-        loss = loss.detach().to(gradients[0])  # on the device of the networks
+        loss = loss.detach().to(gradients[0])  # LPIPS is float64
         return torch.cat([*(gradient.flatten() for gradient in gradients), loss[None]])
 
     mean = torch.stack(parallel_map(crop_gradients, range(options.crops))).sum(0) / options.crops
@@ -262,7 +224,7 @@ def _step(
     with torch.no_grad():
         for _, parameter, smooth in state.pairs():
             smooth.lerp_(parameter, 1 - share)
-    return loss[0].cpu()
+    return loss[0]
 
 
 def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:
@@ -271,7 +233,7 @@ def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> No
     for name, parameter, mean in state.pairs():
         moments = state.optimizer.state[parameter]
         named = {"weight": parameter, "mean": mean, "first": moments["exp_avg"], "second": moments["exp_avg_sq"]}
-        tensors |= {f"{kind}.{name}": tensor.detach().cpu() for kind, tensor in named.items()}
+        tensors |= {f"{kind}.{name}": tensor.detach() for kind, tensor in named.items()}
     with atomic_output(path, overwrite=True) as temporary:
         temporary.write_bytes(save(tensors, {FORMAT: json.dumps(dict(facts))}))
 
@@ -288,8 +250,7 @@ def load_state(path: Path, state: TrainingState) -> dict[str, Any]:
                 for name, parameter, mean in state.pairs():
                     parameter.copy_(file.get_tensor(f"weight.{name}"))
                     mean.copy_(file.get_tensor(f"mean.{name}"))
-                    moments = (file.get_tensor(f"{kind}.{name}") for kind in ("first", "second"))
-                    first, second = (moment.to(parameter.device) for moment in moments)
+                    first, second = (file.get_tensor(f"{kind}.{name}") for kind in ("first", "second"))
                     step = torch.tensor(float(facts["step"]))
                     state.optimizer.state[parameter] = {"step": step, "exp_avg": first, "exp_avg_sq": second}
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:

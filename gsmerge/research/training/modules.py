@@ -197,12 +197,10 @@ class Networks(nn.Module):
     in_parallel = False  # tables run one after another, for gradients
 
     def run(self, name: str, *inputs: Array) -> Tensor:
-        """Run a module as :meth:`NetworkWeights.run` does, on its own device, with gradients."""
-        module = self.get_submodule(name)
-        device = next(module.parameters()).device
-        outputs = module(*(as_tensor(values, device) for values in inputs))
+        """Run a module as :meth:`NetworkWeights.run` does, with gradients."""
+        outputs = self.get_submodule(name)(*map(as_tensor, inputs))
         raw = torch.cat(outputs, 1) if isinstance(outputs, tuple) else outputs
-        return torch.tanh(raw.nan_to_num()).flatten(1).cpu()
+        return torch.tanh(raw.nan_to_num()).flatten(1)
 
     def weights(self) -> NetworkWeights:
         """Return the weights as arrays, ready for use without torch."""

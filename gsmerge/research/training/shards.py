@@ -48,7 +48,7 @@ class Shard:
 
 
 def prepare_shards(
-    scenes: Sequence[Path], options: TrainOptions, folder: Path, report: Report | None = None
+    scenes: Sequence[Path], options: TrainOptions, folder: Path, report: Report = lambda *_: None
 ) -> list[Shard]:
     """Return the shards of all scenes in order; missing shards are made.
 
@@ -61,8 +61,7 @@ def prepare_shards(
         raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
     shards: list[Shard] = []
     for number, scene in enumerate(scenes):
-        if report:
-            report(f"examples: {scene_name(scene)}", number, len(scenes))
+        report(f"examples: {scene_name(scene)}", number, len(scenes))
         shards += _scene_shards(scene, options, folder)
     return shards
 

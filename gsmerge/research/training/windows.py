@@ -114,13 +114,6 @@ def _draw_photo(example: Example, novel: float, rng: np.random.Generator) -> tup
     return photo, pixels
 
 
-def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
-    """Return a window of a whole photo, with all Feature Gaussians."""
-    height, width = example.images.shape[1:3]
-    rows = np.arange(len(example.features))
-    return Window(photo, Box(0, 0, width, height), Crop(example, k, rows))
-
-
 def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
     """Find the ascending rows of the Feature Gaussians that reach into the window or close to it."""
     wide = Box(box.left - BORDER, box.top - BORDER, box.width + 2 * BORDER, box.height + 2 * BORDER)

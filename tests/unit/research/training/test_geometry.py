@@ -10,7 +10,7 @@ import pytest
 from network_fixtures import SMALL, Made, made
 from scenes import arc, make_scene, room
 from sweeps import sweep
-from training_runs import PAPER, TINY, noisy_networks, torch
+from training_runs import PAPER, TINY, noisy_networks, torch, whole_photo
 
 from gsmerge.geometry.pooling import feature_to_gaussians
 from gsmerge.networks import apply, tokens
@@ -28,7 +28,7 @@ from gsmerge.research.training.predict import (
     pool_tensors,
     predict,
 )
-from gsmerge.research.training.windows import Crop, whole_photo
+from gsmerge.research.training.windows import Crop
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, pool_runs
 from gsmerge.types import FeatureGaussians, Matches

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from messages import refuses
 from scenes import arc, make_scene, room
-from training_runs import OPTIONS, TINY, torch, written
+from training_runs import OPTIONS, TINY, written
 
 from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.networks.corrections import LOGIT
 from gsmerge.networks.options import Bounds
-from gsmerge.research.training import Example, Shard, TrainOptions, choose_device, make_example, preset_options, train
+from gsmerge.research.training import Example, Shard, TrainOptions, make_example, preset_options, train
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
 from gsmerge.settings.setting import change_settings
 from gsmerge.types import Scene
@@ -147,22 +147,3 @@ def test_what_holds_the_gaussians_fades() -> None:
     assert options.regularizer_weights(0) == (0.25, 1)
     assert options.regularizer_weights(5) == pytest.approx((0.125, 0.995))
     assert options.regularizer_weights(40) == pytest.approx((0, 0.96))
-
-
-def test_device_of_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    for there, expected in ((False, "cpu"), (True, "cuda")):
-        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
-        assert choose_device("cpu") == "cpu"
-        assert choose_device("auto") == expected
-    assert choose_device("cuda") == "cuda"
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    for expected, found in (("cuda", "torch"), ("tpu", "'tpu'")):
-        with refuses(ValueError, "device", found):
-            choose_device(expected)
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_training_on_cuda(shard: Shard, tmp_path: Path) -> None:
-    on_cpu, on_cuda = (train([shard], [], tmp_path / device, OPTIONS, device=device) for device in ("cpu", "cuda"))
-    assert on_cuda.loss == pytest.approx(on_cpu.loss, rel=0.05)
-    assert load_checkpoint(on_cuda.best).networks.num_parameters > 0
