@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import BeforeAfter, lpips_networks, read_before_after
@@ -16,12 +16,7 @@ from gsmerge.errors import UsageError
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.setting import Settings, setting
 
-if TYPE_CHECKING:
-    from gsmerge.measure.evaluate import Evaluation
-    from gsmerge.pages.data import Stills
-
-PAGE = ".html"
-SUFFIXES = (".json", ".csv", PAGE)
+SUFFIXES = (".json", ".csv")
 
 
 @dataclass(frozen=True)
@@ -42,8 +37,8 @@ class MeasuringOptions(Settings):
     opt.settings_option(EvaluateOptions, MeasuringOptions, example="context=false or photo_side=476"),
     *opt.panel(
         opt.OUTPUT,
-        opt.option("output", list[Path], "File to write: .json, .csv (a row for each result and view), or .html "
-                   "(the page of gsmerge view with these scores); may be repeated.", "--output", "-o"),
+        opt.option("output", list[Path], "File to write: .json, or .csv (a row for each result and view); may be "
+                   "repeated.", "--output", "-o"),
     ),
 )  # fmt: skip
 def evaluate(args: opt.Args) -> None:
@@ -58,9 +53,9 @@ def evaluate(args: opt.Args) -> None:
     if args.quiet and not (outputs or args.json):
         raise UsageError("--quiet: expected -o or --json with it, since otherwise nothing is shown or written")
     _check_files(args, outputs, input_files(files))
+    from gsmerge.measure.documents import to_json
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
-    from gsmerge.measure.scores import evaluation_document, evaluation_lines
-    from gsmerge.pages.data import still_keeper
+    from gsmerge.measure.scores import evaluation_csv, evaluation_document, evaluation_lines
 
     with stage_progress(quiet=args.silent) as progress:
         progress("read", 0, 0)
@@ -71,14 +66,13 @@ def evaluate(args: opt.Args) -> None:
             f"scores assume results of {len(pair.scene)} views; a result of more views has seen the held-out photos"
         )
     say_notes(notes, quiet=args.silent)
-    stills: Stills = {}
-    hooks = {"on_image": still_keeper(stills)} if any(path.suffix == PAGE for path in outputs) else {}
     with stage_progress(quiet=args.silent) as progress:
         evaluation = evaluate_scene(
-            pair.scene, pair.gaussians, pair.held_out, options, cameras=pair.cameras, progress=progress, **hooks
+            pair.scene, pair.gaussians, pair.held_out, options, cameras=pair.cameras, progress=progress
         )
     document = evaluation_document(evaluation, _facts(pair), notes)
-    _write(outputs, document, pair, evaluation, stills)
+    writers = {".json": to_json, ".csv": evaluation_csv}
+    write_texts({path: writers[path.suffix](document) for path in outputs})
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     say_notes(evaluation.notes, evaluation.doubts, quiet=args.silent)
@@ -88,7 +82,7 @@ def _check_files(args: opt.Args, outputs: Sequence[Path], inputs: Sequence[Path]
     """Raise UsageError if an output cannot be written."""
     for path in outputs:
         if path.suffix not in SUFFIXES:
-            raise UsageError(f"{path}: expected a name ending in {opt.join_words(SUFFIXES)}")
+            raise UsageError(f"{path}: expected a name ending in {opt.join_words(SUFFIXES)}; gsmerge view makes pages")
     check_outputs(outputs, (*inputs, *args.after, args.targets, args.target_images), overwrite=True)
     check_replaced(outputs)
 
@@ -102,25 +96,3 @@ def _facts(pair: BeforeAfter) -> dict[str, dict[str, Any]]:
         name: {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
         for name, info in infos.items()
     }
-
-
-def _write(
-    outputs: Sequence[Path], document: Mapping[str, Any], pair: BeforeAfter, evaluation: Evaluation, stills: Stills
-) -> None:
-    """Write the reports, each in the format of its ending."""
-    from gsmerge.measure.documents import to_json
-    from gsmerge.measure.scores import evaluation_csv
-
-    writers = {".json": to_json, ".csv": evaluation_csv}
-    texts: dict[Path, str | bytes] = {}
-    texts |= {path: writers[path.suffix](document) for path in outputs if path.suffix in writers}
-    if stills:
-        from gsmerge.pages.data import page_data
-        from gsmerge.pages.page import view_page
-
-        sizes = [result["bytes"] for result in document["results"]]
-        data = page_data(
-            pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, evaluation, stills, cameras=pair.cameras
-        )
-        texts |= {path: view_page(data) for path in outputs if path not in texts}
-    write_texts(texts)

@@ -26,7 +26,6 @@ import typer
 
 from gsmerge.errors import UsageError
 from gsmerge.runtime.plugins import LazyFunction
-from gsmerge.settings.budget import parse_share
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
@@ -260,8 +259,8 @@ def option(
         more["autocompletion"] = lambda: choices
         parser = partial(parse_value, flags[0], declared=Setting(help, choices=kind, kind=str))
         metavar, kind = "|".join(kind), str
-    elif kind is int:
-        parser = partial(parse_value, flags[0], declared=Setting(help, kind=int, least=min, most=max))
+    elif kind in (int, float):
+        parser = partial(parse_value, flags[0], declared=Setting(help, kind=kind, least=min, most=max))
     shown = wording or default is not False
     metavar = METAVARS.get(kind) if metavar is None else metavar
     info = typer.Option(*flags, help=_escape(help), metavar=metavar, show_default=shown, **more)
@@ -376,14 +375,6 @@ def parse_path(word: str) -> Path:
     return Path(word).expanduser()
 
 
-def share_list(text: str) -> list[str]:
-    """Parse shares that are separated by commas: "1,4.4%" -> ["1%", "4.4%"]."""
-    shares = [f"{number.strip().removesuffix('%')}%" for number in text.split(",")]
-    if "%" in shares or len({parse_share(share) for share in shares}) < len(shares):
-        raise ValueError(f"expected different shares in %, such as 1,2,4.4,10, got {text!r}")
-    return shares
-
-
 def named_or_none(text: str) -> Path | str:
     """Parse ``--cameras``, ``--images`` and ``--masks``: a path, or the word none; ./none is a path."""
     return text if text == NONE else parse_path(text)
@@ -417,8 +408,6 @@ _TABLE = (
         option("targets", Path, "Cameras of held-out photos, in any camera file. Views that the scene was made from "
                "are skipped."),
         option("target_images", Path, "Folder of the held-out photos. Default: beside their cameras."),
-        option("sizes", str, "Also compact BEFORE to these shares of its Gaussians, in %, such as 1,2,4.4,10. The page "
-               "gets a slider over all sizes.", metavar="LIST", parser=share_list),
     ),
     panel(
         COUNT,

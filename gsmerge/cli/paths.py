@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from gsmerge.io.scene_files import SceneFiles
 
 
-# Reports that gsmerge writes (pages, JSON, CSV, Markdown) have one of these texts in their first MARKED_BYTES
-MARKS = (b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,", b"<!-- gsmerge ")
+# Reports that gsmerge writes (pages, JSON, CSV) have one of these texts in their first MARKED_BYTES
+MARKS = (b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,")
 MARKED_BYTES = 4000
 
 

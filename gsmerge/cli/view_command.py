@@ -4,26 +4,18 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.before_after import BeforeAfter, read_before_after
+from gsmerge.cli.before_after import read_before_after
 from gsmerge.cli.console import print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, check_replaced, input_files, write_texts
-from gsmerge.errors import UsageError
-
-if TYPE_CHECKING:
-    from gsmerge.runtime.record import Progress
-    from gsmerge.types import Cameras, Gaussians
 
 
 @opt.command(
     opt.BEFORE,
     opt.AFTER,
-    f"{opt.READING} masks protect targets sizes",
+    f"{opt.READING} masks targets",
     opt.output("The page, .html. A page that gsmerge made is replaced.",
                wording="AFTER.compare.html, or BEFORE.view.html, beside it"),
     *opt.panel(
@@ -40,8 +32,6 @@ def view(args: opt.Args) -> None:
     from gsmerge.pages.view import check_page_name, file_gains
 
     args.after = args.after or []
-    if args.protect is not None and not args.sizes and "loaded" not in vars(args):
-        raise UsageError("--protect: expected --sizes with it, since it has no effect on the files AFTER")
     files, after = args.files(args.before), args.after
     default = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.base.with_suffix(".view.html")
     output = args.output or default
@@ -53,11 +43,9 @@ def view(args: opt.Args) -> None:
         pair = read_before_after(args, files)
         say_notes(pair.notes, quiet=args.silent)
         sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
-        results, cameras, gains, result_sizes = _compact_sizes(pair, args.sizes or (), progress)
         data = collect(
-            pair.title, pair.scene, pair.gaussians | results, [*sizes, *result_sizes], pair.held_out,
-            cameras=pair.cameras | cameras, new_gains=file_gains(pair.plys) | gains, light=args.light,
-            progress=progress,
+            pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
+            new_gains=file_gains(pair.plys), light=args.light, progress=progress,
         )  # fmt: skip
     page = view_page(data)
     write_texts({output: page})
@@ -68,37 +56,6 @@ def view(args: opt.Args) -> None:
     print_document(document, f"{output}: {summary}", as_json=args.json, quiet=args.quiet)
     if args.open and not _open(output):
         say(f"open {output.absolute().as_uri()} in a browser", quiet=args.silent)
-
-
-def _compact_sizes(
-    pair: BeforeAfter, shares: Sequence[str], progress: Progress
-) -> tuple[dict[str, Gaussians], dict[str, Cameras], dict[str, tuple[float, float]], list[int]]:
-    """Compact the scene to ``shares`` such as "2%"; return Gaussians, cameras and expected gains by name, and bytes.
-
-    Without files AFTER, the share nearest to the default comes first, since the page opens with it.
-    """
-    if not shares:
-        return {}, {}, {}, []
-    from gsmerge.compaction.compact import compact
-    from gsmerge.io.formats.ply import file_bytes
-    from gsmerge.settings.budget import parse_share
-    from gsmerge.settings.stages import SHARE
-
-    results: dict[str, Gaussians] = {}
-    cameras: dict[str, Cameras] = {}
-    gains: dict[str, tuple[float, float]] = {}
-    nearest = min(shares, key=lambda share: abs(parse_share(share) - parse_share(SHARE)))
-    first_share = None if pair.plys else nearest
-    for share in sorted(shares, key=lambda share: (share != first_share, parse_share(share))):
-        name = share.replace("%", " %")
-        progress(f"compact to {name}", 0, 0)
-        result = compact(pair.load.scene, budget=share, fill=True)
-        results[name] = result.gaussians
-        if result.report.new_views is not None:
-            gains[name] = result.report.new_views.bounds
-        if len(result.cameras) == len(pair.scene):
-            cameras[name] = replace(pair.scene.cameras, viewmats=result.cameras.viewmats)
-    return results, cameras, gains, [file_bytes(len(gaussians), gaussians.sh_degree) for gaussians in results.values()]
 
 
 def _open(page: Path) -> bool:

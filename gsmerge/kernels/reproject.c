@@ -1,5 +1,5 @@
-// Project points into views: measure distances from their pixels, mark pixels, and compare colours with photos.
-#include "bilinear.h"
+// Project points into views: measure distances from their pixels, and mark pixels.
+#include "native.h"
 
 // Rows of a matrix times a vector, in the order of multiply_matrices.
 static inline double row_times(const double *row, const double *v) {
@@ -54,27 +54,6 @@ API void mark_pixels(const double *points, const double *viewmat, const double *
     for (int64_t i = 0; i < count; i++)
       if (z[i] > near && x[i] >= 0.0 && x[i] < (double)width && y[i] >= 0.0 && y[i] < (double)height)
         hit[(int64_t)y[i] * width + (int64_t)x[i]] = 1;
-  }
-}
-
-API void add_photo_errors(const double *points, const float *colors, const double *viewmat, const double *K,
-                          const float *photo, const float *depths, const uint8_t *mask, float behind, float most,
-                          float *sums, float *counts, int64_t n, int64_t height, int64_t width) {
-  for (int64_t i = 0; i < n; i++) {
-    if (counts[i] >= most) continue;
-    double place[3];
-    if (!show(points + 3 * i, viewmat, K, width, height, place)) continue;
-    int64_t pixel = (int64_t)place[1] * width + (int64_t)place[0];
-    float farthest = behind * depths[pixel], shown[3];
-    if (!(place[2] < (double)farthest) || (mask && !mask[pixel])) continue;
-    sample_at(photo, (float)(place[0] - 0.5), (float)(place[1] - 0.5), height, width, 3, shown);
-    float sum = 0.f;
-    for (int c = 0; c < 3; c++) {
-      float difference = shown[c] - colors[3 * i + c];
-      sum += absf4(difference);
-    }
-    sums[i] += sum / 3.f;
-    counts[i] += 1.f;
   }
 }
 

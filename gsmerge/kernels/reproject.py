@@ -1,4 +1,4 @@
-"""Project points into views: measure distances from their pixels, mark pixels, and compare colours with photos."""
+"""Project points into views: measure distances from their pixels, and mark pixels."""
 
 from __future__ import annotations
 
@@ -21,25 +21,6 @@ def pixel_errors(points, views, viewmats, Ks, pixels, errors):
 @native(points=f8("n", 3), viewmat=f8(4, 4), K=f8(3, 3), near=f8(), hit=u1("height", "width", out=True))
 def mark_pixels(points, viewmat, K, near, hit):
     """Write 1 to the pixels of a view in which points beyond the depth ``near`` lie; other pixels stay unchanged."""
-
-
-@native(
-    points=f8("n", 3), colors=f4("n", 3), viewmat=f8(4, 4), K=f8(3, 3), photo=f4("height", "width", 3),
-    depths=f4("height", "width"), mask=u1("height", "width", optional=True), behind=f4(), most=f4(),
-    sums=f4("n", out=True), counts=f4("n", out=True),
-)  # fmt: skip
-def add_photo_errors(points, colors, viewmat, K, photo, depths, mask, behind, most, sums, counts):
-    """Add the mean absolute difference of each point's colour from a photo to ``sums``, and 1 to ``counts``.
-
-    A photo shows a point inside its picture and its mask, unless the depth of the point is ``behind`` times the drawn
-    depth there or more. Points that are counted ``most`` times are left out.
-
-    Args:
-        points: ``[n,3]`` in the frame of the camera's ``viewmat``.
-        photo: Picture of the camera, sRGB in [0, 1].
-        depths: Drawn depths of the camera, 0 where nothing is drawn.
-        mask: 1 where the photo counts; None: everywhere.
-    """
 
 
 _see_points = declare(

@@ -38,12 +38,8 @@ def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Poin
     """Return the surface points that the rendered depth of one camera shows."""
     drawn = render(gaussians, camera, near=near, with_depths=True)
     assert drawn.depths is not None
-    return lift_pixels(drawn.depths[0, ..., 0], drawn.alphas[0, ..., 0] > _OPAQUE, camera)
-
-
-def lift_pixels(depths: np.ndarray, shown: np.ndarray, camera: Cameras) -> Points:
-    """Return the points ``[n,3]``, world, at the ``depths [h,w]`` of a camera's pixels in the mask ``shown [h,w]``."""
-    y, x = np.nonzero(shown)
+    depths = drawn.depths[0, ..., 0]
+    y, x = np.nonzero(drawn.alphas[0, ..., 0] > _OPAQUE)
     rays = matmul(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), invert(camera.Ks[0].astype(np.float64)).T)
     pose = invert(camera.viewmats[0].astype(np.float64))
     return matmul(rays * depths[y, x, None].astype(np.float64), pose[:3, :3].T) + pose[:3, 3]

@@ -14,8 +14,7 @@ from gsmerge.geometry.transforms import middle_depth
 from gsmerge.io.encode_pictures import encode_picture
 from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.camera_path import outside_camera
-from gsmerge.measure.error_maps import ErrorReference, draw_errors, expected_errors, make_reference
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, OnImage, Quality, ResultScores, evaluate
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Quality, ResultScores, evaluate
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, to_picture
 from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
@@ -63,7 +62,6 @@ class PageView:
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
     outside: bool = False  # True for the outside view, which has neither a photo nor scores
-    maps: tuple[bytes | None, ...] = ()  # WebP, one for each side: see :mod:`gsmerge.measure.error_maps`
 
 
 @dataclass(frozen=True)
@@ -129,16 +127,54 @@ def collect(
     ``light``: show the scene itself in stills only.
     """
     stills: Stills = {}
-    nets = (LPIPS,) if lpips_available(LPIPS) else ()
-    options = EvaluateOptions(nets, None, fog=False)
-    evaluation = evaluate(
-        scene, results, held_out, options, cameras=cameras, progress=progress, on_image=still_keeper(stills)
-    )
+
+    def add_still(result: str, split: str, view: int, image: np.ndarray) -> None:
+        stills[result, split, view] = encode_still(to_picture(image))
+
+    options = EvaluateOptions((LPIPS,) if lpips_available(LPIPS) else (), None, fog=False)
+    evaluation = evaluate(scene, results, held_out, options, cameras=cameras, progress=progress, on_image=add_still)
     progress("the view from outside", 0, 0)
     with use_threads():
-        data = page_data(title, scene, results, file_bytes, held_out, evaluation, stills, cameras=cameras, light=light)
+        data = _collect(title, scene, results, file_bytes, held_out, evaluation, stills, light=light)
     progress("done", 0, 0)
     return _with_gains(data, new_gains or {})
+
+
+def _collect(
+    title: str,
+    scene: Scene,
+    results: Mapping[str, Gaussians],
+    file_bytes: Sequence[int],
+    held_out: Views | None,
+    evaluation: Evaluation,
+    stills: Stills,
+    *,
+    light: bool,
+) -> ViewData:
+    """Make the content of a page from an evaluation and its stills; see :func:`collect`."""
+    pictures = photo_array(evaluation.pictures)
+    frame = scene_frame(scene)
+    named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
+    canonical = {name: frame.enter(gaussians) for name, gaussians in named.items()}
+    scene_cameras = frame.enter_cameras(scene.cameras.numpy())
+    split = "context" if held_out is None else "target"
+    sides = [
+        _side(result, size, split, canonical[result.name], scene, scene_cameras, light=light)
+        for result, size in zip(evaluation.results, file_bytes, strict=True)
+    ]
+    means = canonical[evaluation.results[:2][-1].name].means  # of the first result, or of the scene without results
+    views = _page_views(_split_views(scene, pictures, held_out), evaluation, stills, frame, means)
+    shown = _shown(views)
+    outside = _outside_view(scene, named, frame, len(views))
+    measured_notes = evaluation.notes if results else ()  # they concern results
+    notes = (*measured_notes, *_limits(sides, len(shown), len(views)))
+    covered_share, _ = evaluation.results[0].mean_covered("context")
+    lacks_pixels = covered_share is not None and covered_share < WHOLE
+    agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
+    return ViewData(
+        title, tuple(sides), shown, outside, len(views), evaluation.reference, notes,
+        lacks_pixels, agreement, doubts=evaluation.doubts,
+    )  # fmt: skip
 
 
 def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> ViewData:
@@ -154,60 +190,6 @@ def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> Vie
             )
         sides.append(replace(side, new_gain=gain))
     return replace(data, sides=tuple(sides), notes=(*data.notes, *notes))
-
-
-def still_keeper(stills: Stills) -> OnImage:
-    """Make a function for ``on_image`` of :func:`gsmerge.evaluate` that adds the drawings to ``stills``."""
-
-    def add_still(result: str, split: str, view: int, image: np.ndarray) -> None:
-        stills[result, split, view] = encode_still(to_picture(image))
-
-    return add_still
-
-
-def page_data(
-    title: str,
-    scene: Scene,
-    results: Mapping[str, Gaussians],
-    file_bytes: Sequence[int],
-    held_out: Views | None,
-    evaluation: Evaluation,
-    stills: Stills,
-    *,
-    cameras: Mapping[str, Cameras] | None = None,
-    light: bool = False,
-) -> ViewData:
-    """Make the content of a page from an evaluation and its stills; see :func:`collect`."""
-    pictures = photo_array(evaluation.pictures)
-    frame = scene_frame(scene)
-    named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
-    canonical = {name: frame.enter(gaussians) for name, gaussians in named.items()}
-    scene_cameras = frame.enter_cameras(scene.cameras.numpy())
-    inspected = [name for name in named if name != INPUT or not results]
-    split = "context" if held_out is None else "target"
-    sides = [
-        _side(result, size, split, canonical[result.name], scene, scene_cameras, light=light)
-        for result, size in zip(evaluation.results, file_bytes, strict=True)
-    ]
-    means = canonical[evaluation.results[:2][-1].name].means  # of the first result, or of the scene without results
-    views = _page_views(_split_views(scene, pictures, held_out), evaluation, stills, frame, means)
-    shown = _shown(views)
-    moved = {name: frame.enter_cameras(result_cameras.numpy()) for name, result_cameras in (cameras or {}).items()}
-    references = {
-        name: make_reference(canonical[name], Views(moved.get(name, scene_cameras), pictures, scene.names), scene.masks)
-        for name in (inspected if len(pictures) > 1 else ())
-    }
-    shown = tuple(replace(view, maps=tuple(_map(references.get(name), view) for name in named)) for view in shown)
-    outside = _outside_view(scene, named, frame, len(views))
-    measured_notes = evaluation.notes if results else ()  # they concern results
-    notes = (*measured_notes, *_limits(sides, len(shown), len(views)))
-    covered_share, _ = evaluation.results[0].mean_covered("context")
-    lacks_pixels = covered_share is not None and covered_share < WHOLE
-    agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
-    return ViewData(
-        title, tuple(sides), shown, outside, len(views), evaluation.reference, notes,
-        lacks_pixels, agreement, doubts=evaluation.doubts,
-    )  # fmt: skip
 
 
 def _split_views(
@@ -232,8 +214,6 @@ def _page_views(
     """List the measured views of the splits, see :func:`_split_views`; ``means [n,3]`` are canonical."""
     views: list[PageView] = []
     for split, (cameras, photos, names) in splits.items():
-        if split not in evaluation.num_views:  # only held-out views were measured
-            continue
         encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
         encoded = encoded or [None] * len(names)
         for i, name in enumerate(short_names(names)):
@@ -277,15 +257,6 @@ def short_names(names: Sequence[str]) -> list[str]:
 def encode_still(picture: Picture) -> bytes:
     """Encode a picture as WebP."""
     return encode_picture(picture, WEBP_QUALITY)
-
-
-def _map(reference: ErrorReference | None, view: PageView) -> bytes | None:
-    """Draw the likely error of one side in a view, estimated by other photos; None without other photos."""
-    if reference is None:
-        return None
-    own = None if view.held_out else view.place
-    camera = view.camera if own is None else reference.views.cameras[[own]]
-    return encode_still(draw_errors(expected_errors(reference, camera, own)))
 
 
 def _pack(

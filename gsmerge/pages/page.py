@@ -45,10 +45,6 @@ def view_page(data: ViewData) -> bytes:
     first = {source: start_stills[source] for source in (left, right)}  # in the HTML itself, to appear at once
     start_stills[left] = start_stills[right] = None
 
-    def pictures(of_sides: Sequence[bytes | None]) -> list[str | None]:
-        """Encode pictures of the sides; the photos, as a source, have none."""
-        return _picture_uris([None] * (len(sources) - len(of_sides)) + list(of_sides))
-
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     result_ids = range(min(len(data.sides) - 1, 1), len(data.sides))  # sides; a single scene counts as a result
     results = [_result(data, i) for i in result_ids]
@@ -80,7 +76,6 @@ def view_page(data: ViewData) -> bytes:
         stills=stills,
         speed_words=speed_words(results[0]["speed"]),
         agreement=agreement_words(data),
-        maps=[pictures(view.maps) for view in data.shown],
         splats=splats,
         engine=base64_text(VIEWER.read_bytes()) if splats else None,
     )

@@ -26,7 +26,7 @@ from gsmerge.fit import report as fit_report
 from gsmerge.io import bounds, photo_files
 from gsmerge.io.formats import ply
 from gsmerge.kernels.raster import blend
-from gsmerge.measure import drawings, error_maps, fog
+from gsmerge.measure import drawings, fog
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
 from gsmerge.pages import data, splats
@@ -143,8 +143,6 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"below 1/{1 / FIT.min_contribution:g} in every picture",
     ),
     EVALUATE: (
-        f"of the {word(error_maps.NEIGHBORS)} nearest",
-        f"yellow is {error_maps.MAX_ERROR:g} of the range or more",
         f"They start from {word(fog.VIEWS)} input views",
         f"have at most {fog.SIDE} pixels on the longer side",
         f"its opacity is below {fog.EMPTY:g} in the whole square of {fog.MARGIN} x {fog.MARGIN} pixels around",

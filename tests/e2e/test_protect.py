@@ -60,7 +60,7 @@ def test_a_protected_part_of_the_photos_is_shown_better(
     assert any(note.startswith("protect: ") for note in report["notes"])
 
 
-def test_a_batch_and_a_page_take_what_each_scene_has(run: Run, make_scene: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_batch_takes_what_each_scene_has(run: Run, make_scene: Callable[..., Path], tmp_path: Path) -> None:
     """Masks and what is to be protected, as of ``compact``: the same bytes."""
     for number in (0, 1):
         room = make_scene(tmp_path / "rooms" / f"room{number}", num_views=3, width=24, height=16, seed=number)
@@ -80,6 +80,3 @@ def test_a_batch_and_a_page_take_what_each_scene_has(run: Run, make_scene: Calla
     run("compact", room, "-o", tmp_path / "own.ply", *quick, *own, code=0)
     assert (tmp_path / "own.ply").read_bytes() == (tmp_path / "out" / "room1.ply").read_bytes()
     assert "'{parent}/signs'" in run(*batch, "--protect", "signs", code=3).err
-    page = ("view", room, *own, "-o", tmp_path / "page.html", "--no-open")
-    assert "--sizes" in run(*page, code=2).err
-    assert "protect: " in run(*page, "--sizes", "10", code=0).err

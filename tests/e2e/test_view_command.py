@@ -1,4 +1,4 @@
-"""``gsmerge view``: what it writes and replaces, the sizes that it adds, pages without the scene's Gaussians."""
+"""``gsmerge view``: what it writes and replaces, pages without the scene's Gaussians."""
 
 from __future__ import annotations
 
@@ -31,17 +31,12 @@ def test_a_page_is_replaced_and_nothing_else(smallest_scene: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_sizes_are_compacted_and_light_leaves_the_scene_out(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
-    page = tmp_path / "page.html"
-    call = ("view", smallest_scene, "--no-open", "-o", page, "--sizes")
-    said = json.loads(run(*call, "2, 10%,4.4", "--json", code=0).out)
+def test_a_light_page_leaves_the_scene_out_of_3d(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
+    page, result = tmp_path / "page.html", tmp_path / "small.ply"
+    run("compact", smallest_scene, "--budget", "4.4%", "--set", "fill=true", "-o", result, code=0)
+    said = json.loads(run("view", smallest_scene, result, "--no-open", "-o", page, "--json", code=0).out)
     assert said["headline"].startswith("4.3 % of the Gaussians, ")  # 50 of 1,152
-    assert [name for name, _ in sources(page)] == ["photo", "input", "4.4 %", "2 %", "10 %"]
+    assert [name for name, _ in sources(page)] == ["photo", "input", "small.ply"]
     assert said["bytes"] == page.stat().st_size
-    run(*call, "4.4", "--light", code=0)
+    run("view", smallest_scene, result, "--no-open", "-o", page, "--light", code=0)
     assert [splats is None for _, splats in sources(page)] == [True, True, False]
-
-
-@pytest.mark.parametrize("sizes", ["none", "0", "101", "2,2%", "2,,4"])
-def test_sizes_are_different_shares(sizes: str, smallest_scene: Path, tmp_path: Path, run: Run) -> None:
-    assert_refused(run("view", smallest_scene, "-o", tmp_path / "page.html", "--sizes", sizes), 2, "--sizes", sizes)

@@ -7,8 +7,7 @@ import pytest
 
 from gsmerge.geometry.transforms import motion_matrices, project_points
 from gsmerge.kernels.elementary import exp
-from gsmerge.kernels.pictures import sample_bilinear
-from gsmerge.kernels.reproject import add_photo_errors, follow_pixels, linearise, mark_pixels, pixel_errors, see_points
+from gsmerge.kernels.reproject import follow_pixels, linearise, mark_pixels, pixel_errors, see_points
 
 K = np.array([[300.0, 0, 150], [0, 310, 110], [0, 0, 1]])
 STEP = 1e-6
@@ -67,30 +66,6 @@ def test_marked_pixels_are_those_of_the_points_beyond_the_near_plane(near: float
     expected[row, column] = 1
     assert np.array_equal(hit, expected)
     assert 100 < expected.sum() < 4000
-
-
-@pytest.mark.parametrize("masked", [False, True])
-def test_photo_errors_are_those_of_the_points_that_the_photo_shows(masked: bool) -> None:
-    rng = np.random.default_rng(1)
-    points, pose = rng.normal(0, 3, (20_000, 3)), make_poses(1, rng)
-    points[0], points[1] = np.nan, np.inf
-    colors, photo = (rng.random(shape).astype(np.float32) for shape in ((20_000, 3), (220, 300, 3)))
-    depths, mask = rng.uniform(0, 6, (220, 300)).astype(np.float32), rng.random((220, 300)) < 0.7
-    sums, counts = rng.integers(0, 3, (2, 20_000)).astype(np.float32)
-    expected = [sums.copy(), counts.copy()]
-    add_photo_errors(
-        points, colors, pose[0], K, photo, depths, mask.view(np.uint8) if masked else None, 1.5, 2, sums, counts
-    )
-    (places,), (shown,) = places_of(points, pose)
-    column, row = np.where(shown[:, None], places, 0).astype(np.int64).T
-    shown &= (project_points(points, pose[0], K)[1] < np.float32(1.5) * depths[row, column]) & (expected[1] < 2)
-    shown &= mask[row, column] | (not masked)
-    differences = np.abs(sample_bilinear(photo, *(places[shown].T - 0.5)) - colors[shown])
-    expected[0][shown] += (differences[:, 0] + differences[:, 1] + differences[:, 2]) / np.float32(3)
-    expected[1][shown] += 1
-    assert np.array_equal(sums, expected[0])
-    assert np.array_equal(counts, expected[1])
-    assert 20 < shown.sum() < 2000
 
 
 @pytest.mark.parametrize("seed", range(3))

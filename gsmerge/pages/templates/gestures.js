@@ -2,7 +2,7 @@
 // Keys, pointers and wheel: the swipe and the zoom of stills, turning and moving in 3D.
 
 const MODES = { 1: "swipe", 2: "side", 3: "blink", 4: "difference" };
-const TOGGLED = { solid: ["", "1"], shape: ["splats", "points"], frustums: ["", "1"], maps: ["", "1"] };
+const TOGGLED = { solid: ["", "1"], shape: ["splats", "points"], frustums: ["", "1"] };
 const FLIGHT = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // right, up, ahead
 const SPEED = 0.5; // distances to what is looked at, in a second
 const [MOST_ZOOM, CLICK_ZOOM, KEY_ZOOM] = [16, 3, 1.25];
@@ -106,7 +106,7 @@ function onKey(event) {
     arrowleft: arrow(1, 0, () => swipeTo(state.at - 0.02)), arrowright: arrow(-1, 0, () => swipeTo(state.at + 0.02)),
     arrowup: arrow(0, 1, () => step(-1)), arrowdown: arrow(0, -1, () => step(1)), home: () => swipeTo(0), end: () => swipeTo(1),
     b: stepBack, r: reset, f: () => (event.shiftKey ? toggleFull() : state.solid ? frameScene() : zoomTo(1)),
-    v: () => toggle("solid"), m: () => toggle("maps"), p: () => toggle("shape"), c: () => toggle("frustums"),
+    v: () => toggle("solid"), p: () => toggle("shape"), c: () => toggle("frustums"),
     "+": () => nearer(KEY_ZOOM), "=": () => nearer(KEY_ZOOM), "-": () => nearer(1 / KEY_ZOOM), 0: () => zoomTo(1),
     " ": () => { state.other = true; show(); },
   };

@@ -7,7 +7,7 @@ const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
   view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
-  order: "worst", overlay: 0, maps: "", other: false, from: data.start, // the view before the step back
+  order: "worst", overlay: 0, other: false, from: data.start, // the view before the step back
   atCamera: true, left: 0, right: 0, scheme: "",
   result: 0, zoom: 1, centre: [0.5, 0.5], // of the stills: what lies in the middle, in shares of the picture
 };
@@ -17,7 +17,6 @@ const PIXELS = 8; // of the screen for one of a still, from which on they are dr
 const QUIET = 1000; // milliseconds after which a 3D that has come is measured
 const NARROW = 640; // pixels of the stage, below which sides go one above the other
 let stills = null; // per view the pictures of every source; those that are seen first are in the page itself
-let maps = []; // per view and source how far off new views are likely to be
 let solid = null; // the 3D view, once it is there
 let blinking = 0; // the timer
 let chosen = false; // whether the reader has chosen stills or 3D
@@ -91,13 +90,11 @@ function showZoom() {
   id("back").textContent = state.atCamera ? `${zoom.toFixed(1)} × · whole picture` : "Back to the view";
 }
 
-const mapOf = (source) => (maps[state.view] || [])[source] || null;
-
-// Lays a picture over a side: the photo, or the map of a source.
-function lay(layer, address, opacity, source = "") {
+// Lays the photo over a side.
+function lay(layer, address, opacity) {
   layer.hidden = !address || opacity === 0;
   if (layer.hidden) return;
-  const key = `${state.view} ${source}`;
+  const key = String(state.view);
   if (layer.dataset.shown !== key) layer.style.backgroundImage = `url("${address}")`;
   layer.dataset.shown = key;
   layer.style.opacity = opacity;
@@ -126,7 +123,6 @@ function show() {
     const pane = id(`${side}-pane`);
     pane.hidden = !here;
     lay(pane.querySelector(".overlay"), data.photos && plain && stillOf(0), state.overlay);
-    lay(pane.querySelector(".maps"), plain && state.maps && mapOf(source), 1, source);
     const tag = id(`${side}-tag`);
     tag.hidden = !here;
     tag.textContent = data.sources[source].name;
@@ -148,17 +144,12 @@ function show() {
 function showLimits() {
   const away = !state.atCamera ? "From a view's camera only: press R" : state.mode === "difference" ? "Not over a difference" : "";
   const none = solid ? "" : id("status").textContent || "3D is not there yet";
-  const shown = [state.left, state.right];
   const outside = view().outside ? "From a photo's camera only" : "";
-  const mapped = maps.some((one) => one.some(Boolean));
-  const unmapped = outside || (shown.some(mapOf) ? "" : mapped ? "Results alone have one: choose one" : "It takes photos of two views");
-  const reasons = { maps: away || unmapped };
   for (const field of document.querySelectorAll(".in-3d")) field.hidden = !state.solid;
   for (const button of document.querySelectorAll("[data-set]")) {
     const { set: name, value } = button.dataset;
-    grey(button, name === "solid" && value ? none : reasons[name]);
+    grey(button, name === "solid" && value ? none : "");
   }
-  if (id("map-legend")) id("map-legend").hidden = !state.maps || Boolean(reasons.maps);
   if (id("overlay-share")) grey(id("overlay-share"), outside || away);
   id("full").hidden = !document.fullscreenEnabled;
 }
@@ -220,7 +211,6 @@ function toggleFull() {
 // The strip, when the stills have come.
 function startStrip() {
   stills = JSON.parse(id("stills").textContent);
-  maps = JSON.parse(id("map-pictures").textContent);
   stills[data.start] = stills[data.start].map((still, source) => still || inPage.get(source) || null);
   const shown = Number(!data.photos && data.sources.length > 1); // without photos the result, not its reference
   for (const card of id("strip").children) {
