@@ -8,32 +8,27 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import RunEnd, print_document, say, separate_stdout, terminal_columns, total_progress
 from gsmerge.errors import BatchError, TargetError, UsageError
+from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.setting import Setting
 from gsmerge.settings.stages import Engine
 from gsmerge.values.words import count_words
 
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
 
+JOBS = Setting("", kind=int | Literal["auto"], least=1)
 MAX_LISTED = 20  # rows of the table, failures, and results that are worse than their input
 HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
 # Key of a reason -> word before it
 REASONS = {"worse": "worse", "left_out": "note", "lacking": "note", "error": "failed"}
-
-
-def parse_jobs(text: str) -> int:
-    """Parse ``--jobs``: a number, or "auto", which gives 0."""
-    if text == "auto":
-        return 0
-    if not text.isdecimal() or int(text) < 1:
-        raise ValueError(f'expected a number from 1 or "auto", got {text!r}')
-    return int(text)
 
 
 @opt.command(
@@ -56,7 +51,8 @@ def parse_jobs(text: str) -> int:
     *opt.panel(
         "Running",
         opt.option("jobs", str, "Number of scenes to run at the same time, or auto.", wording="auto",
-                   parser=parse_jobs, metavar="N|auto"),
+                   metavar="N|auto",
+                   parser=partial(opt.parse_value, "--jobs", declared=JOBS)),
     ),
     "engine",
     opt.output("Folder for the results. Scenes whose results are already in it are skipped.", default=opt.REQUIRED),
@@ -84,7 +80,7 @@ def batch(args: opt.Args) -> None:
     try:
         options = BatchOptions(
             settings, args.opacity, hints, args.cameras, args.images, args.masks, args.protect, args.name,
-            args.jobs or None, args.overwrite, engine.engine, engine.address,
+            None if args.jobs == AUTO else args.jobs, args.overwrite, engine.engine, engine.address,
         )  # fmt: skip
     except ValueError as error:
         raise UsageError(str(error).replace("output:", "--name:", 1)) from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from pathlib import Path
 
 from gsmerge.cli import parameters as opt
@@ -22,7 +21,8 @@ def parse_size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(SIDES[0] <= side <= SIDES[1] for side in size):
-        raise ValueError(f"expected WIDTHxHEIGHT, such as 1920x1080, {SIDES[0]} to {SIDES[1]} pixels each")
+        expected = f"WIDTHxHEIGHT, such as 1920x1080, {SIDES[0]} to {SIDES[1]} pixels each"
+        raise ValueError(f"expected {expected}, got {text!r}")
     return size
 
 
@@ -34,14 +34,6 @@ def parse_views(text: str) -> int | str:
     if count < 1:
         raise ValueError(f"expected a number from 1 or the name of a view, got {text}")
     return count
-
-
-def parse_level(text: str) -> float:
-    """Parse ``--background``."""
-    with suppress(ValueError):
-        if 0 <= float(text) <= 1:
-            return float(text)
-    raise ValueError(f"expected a grey level, 0 to 1, got {text!r}")
 
 
 @opt.command(
@@ -65,8 +57,8 @@ def parse_level(text: str) -> float:
         opt.option("views", str, "Largest number of views, at equal intervals; or the name of one view, such as "
                    "00006 or 6.jpg (6 would be a number).", metavar="NUMBER|NAME", parser=parse_views,
                    wording="4 on a panel, else all"),
-        opt.option("background", float, "Grey level behind the scene, 0 to 1.", wording="0", metavar="LEVEL",
-                   parser=parse_level),
+        opt.option("background", float, "Grey level behind the scene, 0 to 1.", wording="0", metavar="LEVEL", min=0,
+                   max=1),
     ),
     "overwrite",
 )  # fmt: skip

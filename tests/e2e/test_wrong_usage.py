@@ -118,7 +118,7 @@ USAGE = {
     "evaluate room --lpips none -q": "--quiet*-o*--json",
     "evaluate room --lpips none --set context=false": "context=false*held-out*--targets",
     "evaluate room --lpips none --target-images room/images": "--target-images*--targets",
-    "evaluate room --lpips none -o room/scene.ply": "room/scene.ply*.json, .csv or .html",
+    "evaluate room --lpips none -o room/scene.ply": "room/scene.ply*.json or .csv",
     "evaluate room --lpips none -o room/transforms.json": "room/transforms.json*input",
     "evaluate room alone.ply --lpips none -o run.json": "run.json*exists already",
     "evaluate room --lpips none --set photo_side=-1": "--set photo_side*0",
@@ -136,7 +136,7 @@ USAGE = {
     "lab chart -o room/scene.ply room": "--output*room/scene.ply",
     "lab chart -o room room": "room*results",
     "lab generate -o out --views many": "--views*whole number*'many'",
-    "lab generate -o out --size large": "--size*320x240*'large'",
+    "lab generate -o out --size large": "--size*1920x1080*'large'",
     "lab generate -o out --set noise=loud": "--set noise*10*'loud'",
     "lab train -o out": "*'--data'",
 }

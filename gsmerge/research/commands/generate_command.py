@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from functools import partial
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, stage_progress
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.cli.render_command import parse_size
+from gsmerge.errors import SceneError
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.values.words import count_words
@@ -28,7 +28,7 @@ class SeriesOptions(Settings):
         "Scenes",
         opt.option("scenes", int, "Number of scenes.", default=20, min=1),
         opt.option("views", int, "Views of a scene.", default=6, min=2, max=200),
-        opt.option("size", str, "Size of the views, pixels.", default="320x240", metavar="WxH"),
+        opt.option("size", str, "Size of the views, pixels.", default="320x240", metavar="WxH", parser=parse_size),
     ),
     opt.settings_option(OPTIONS, SeriesOptions, example="noise=0"),
     opt.output("Folder for the scenes: scene_0000 and on.", default=opt.REQUIRED),
@@ -39,11 +39,8 @@ def generate(args: opt.Args) -> None:
     from gsmerge.research.generate import GenerateOptions
     from gsmerge.research.generate import generate as generate_scenes
 
-    sides, out = re.fullmatch(r"(\d{1,5})x(\d{1,5})", args.size), args.output
-    if sides is None:
-        raise UsageError(f"--size: expected width and height such as 320x240, got {args.size!r}")
-    size = {"width": int(sides[1]), "height": int(sides[2])}
-    options, series = args.make(GenerateOptions, SeriesOptions, views=args.views, **size)
+    out, (width, height) = args.output, args.size
+    options, series = args.make(GenerateOptions, SeriesOptions, views=args.views, width=width, height=height)
     if out.exists() and not out.is_dir():
         raise SceneError(out, "expected a folder to write scenes to, found a file", "name another")
     with stage_progress(quiet=args.silent) as progress:
