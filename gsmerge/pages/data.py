@@ -29,6 +29,7 @@ from gsmerge.types import Cameras, Gaussians, Scene, Views
 LPIPS = "alex"  # network of LPIPS, if its weights are installed; it takes 0.05 s per picture, "vgg" 0.8 s
 MAX_VIEWS = 32  # of more views, only so many at equal intervals are shown; each takes up to 300 kB
 WEBP_QUALITY = 90  # stills of this quality score within 1 dB of lossless stills
+SplitViews = tuple[Cameras, np.ndarray, Sequence[str]]  # cameras in the world, photos and names of a split
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
 
 
@@ -163,7 +164,10 @@ def _collect(
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
     means = canonical[evaluation.results[:2][-1].name].means  # of the first result, or of the scene without results
-    views = _page_views(_split_views(scene, pictures, held_out), evaluation, stills, frame, means)
+    splits: dict[str, SplitViews] = {"context": (scene.cameras.numpy(), pictures, scene.names)}
+    if held_out is not None:
+        splits["target"] = held_out.cameras.numpy(), held_out.images, held_out.names
+    views = _page_views(splits, evaluation, stills, frame, means)
     shown = _shown(views)
     outside = _outside_view(scene, named, frame, len(views))
     measured_notes = evaluation.notes if results else ()  # they concern results
@@ -192,26 +196,10 @@ def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> Vie
     return replace(data, sides=tuple(sides), notes=(*data.notes, *notes))
 
 
-def _split_views(
-    scene: Scene, pictures: np.ndarray, held_out: Views | None
-) -> dict[str, tuple[Cameras, np.ndarray, Sequence[str]]]:
-    """Return cameras in the world, photos and names of the views by split."""
-    splits: dict[str, tuple[Cameras, np.ndarray, Sequence[str]]] = {
-        "context": (scene.cameras.numpy(), pictures, scene.names)
-    }
-    if held_out is not None:
-        splits["target"] = (held_out.cameras.numpy(), held_out.images, held_out.names)
-    return splits
-
-
 def _page_views(
-    splits: Mapping[str, tuple[Cameras, np.ndarray, Sequence[str]]],
-    evaluation: Evaluation,
-    stills: Stills,
-    frame: Frame,
-    means: np.ndarray,
+    splits: Mapping[str, SplitViews], evaluation: Evaluation, stills: Stills, frame: Frame, means: np.ndarray
 ) -> list[PageView]:
-    """List the measured views of the splits, see :func:`_split_views`; ``means [n,3]`` are canonical."""
+    """List the measured views of the splits; ``means [n,3]`` are canonical."""
     views: list[PageView] = []
     for split, (cameras, photos, names) in splits.items():
         encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
