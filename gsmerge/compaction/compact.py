@@ -108,7 +108,7 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
     """
     result = _compact_once(scene, options)
     cause = result.report.worse
-    if not result.report.is_below or options.decides_count or options.replaces_stages:
+    if not result.report.is_far or options.decides_count or options.replaces_stages:
         return result
     for words, change in SIMPLER:
         simpler = change(options)
@@ -117,7 +117,7 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
         with record_part():
             note(f"{cause}; so it was made again {words}")
             result = _compact_once(scene, simpler)
-        if result.report.worse is None:
+        if not result.report.is_far:
             return result
     problem, budget = f"expected a result as good as its input, found none: {cause}", max(1, len(result.gaussians))
     raise TargetError(
