@@ -8,6 +8,7 @@ gets its own part of the plan, and no stage knows the options of another.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -525,9 +526,11 @@ def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int
     ``effort``: choose as many as its report needs; None: as many as a decision about the count needs.
     """
     reference = prepared.reference
-    if reference.placed or not prepared.repeated:  # placed views, which are not views of the input
+    if reference.placed:
         return reference.score_views
-    candidates = [view for view, place in enumerate(prepared.repeated) if place in reference.score_views]
+    candidates: Sequence[int] = reference.score_views
+    if reference.of_views:  # views of the input, each of which may stand for several
+        candidates = [view for view, place in enumerate(prepared.repeated) if place in candidates]
     count = len(candidates)
     chosen = scored_views(count) if effort is None else pick_views(count, effort.report_views)
     return tuple(candidates[i] for i in chosen)

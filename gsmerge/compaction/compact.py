@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
@@ -52,11 +52,11 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
-# Settings that are tried in this order if a result is worse than its input, with words for a note
-SIMPLER: Sequence[tuple[str, dict[str, Any]]] = (
-    ("with the scene's own colours in place of the photos", {"look": "scene"}),
-    ("without a fit", {"fit": "none"}),
-    ("with as many Gaussians as keep the quality of the input", {"keep": True}),
+# Changes of the options that are tried in this order if a result is worse than its input, with words for a note
+SIMPLER: Sequence[tuple[str, Callable[[CompactOptions], CompactOptions]]] = (
+    ("with the scene's own colours in place of the photos", lambda o: o.with_settings({"look": "scene"})),
+    ("without a fit", lambda o: o.with_settings({"fit": "none"})),
+    ("with more Gaussians", lambda o: replace(o, budget=replace(o.budget, keep=True))),
 )
 SURPLUS = 1.05  # The requested count has to remain after clean-up, so this many times more are built
 
@@ -108,16 +108,16 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
     """
     result = _compact_once(scene, options)
     cause = result.report.worse
-    if not result.report.is_below or options.decides_count or options.replaces_stages:
+    if not result.report.is_far or options.decides_count or options.replaces_stages:
         return result
-    for words, settings in SIMPLER:
-        simpler = options.with_settings(settings)
+    for words, change in SIMPLER:
+        simpler = change(options)
         if simpler == options:
             continue
         with record_part():
             note(f"{cause}; so it was made again {words}")
             result = _compact_once(scene, simpler)
-        if not result.report.is_below:
+        if not result.report.is_far:
             return result
     problem, budget = f"expected a result as good as its input, found none: {cause}", max(1, len(result.gaussians))
     raise TargetError(

@@ -29,6 +29,11 @@ SAMPLE, SIDE, BLUR = 40_000, 80, 1.0
 MOST_PHOTOS, MOST_BETWEEN = 2, 3
 
 
+def is_far(near: float | None, far: float | None) -> bool:
+    """Return whether a PSNR (dB) means twice the error of another, and looks poor; False if one cannot be measured."""
+    return near is not None and far is not None and far < min(near - TWICE, POOR)  # NaN is not less
+
+
 @stage("input")
 def describe_far(gaussians: Gaussians, prepared: Prepared) -> str | None:
     """Describe that canonical Gaussians lie far from the input of a scene with photos; None if they do not."""
@@ -42,7 +47,7 @@ def describe_far(gaussians: Gaussians, prepared: Prepared) -> str | None:
     counts = None if scene.masks is None else shrink_pictures(scene.masks[own].astype(np.float32), *size) == 1
     error = _compare(sample, cameras[own], pictures, counts)
     distance = _compare(sample, more, render(gaussians, more).images, None)
-    if not distance < min(error - TWICE, POOR):  # also without pixels to compare
+    if not is_far(error, distance):
         return None
     return (
         "between the views, pictures of the result differ from pictures of the input more than twice as much as these"

@@ -11,8 +11,7 @@ from typing import Any
 
 from gsmerge.compaction.new_views import NewViews
 from gsmerge.measure.documents import document_head, file_sha256, seconds_document, seconds_line, text_table, wrap_line
-from gsmerge.photos.row_colors import PHOTOS
-from gsmerge.raster.metrics import POOR, psnr_words
+from gsmerge.raster.metrics import psnr_words
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.values.words import count_words
 
@@ -83,7 +82,8 @@ class CompactReport:
         psnr_reference: What the PSNR of the input views is measured against: "photos" or "the model's own pixels"; None
             if it is not measured.
         covered: PSNR over the pixels that the input covers; None if it lacks at most 2 % of them.
-        is_far: The result lies far from the input between the views.
+        is_far: The result is clearly worse than the input: its pictures differ more than twice as much from the photos
+            as the input's do, or else, between the views, from the input's pictures.
         photo_files: PSNR on the photos as their files have them; None if the run changed no photo.
         protected: PSNR over the pixels that ``protect`` names, and their share of all; None without such pixels.
 
@@ -111,16 +111,6 @@ class CompactReport:
     protected: Covered | None = None
     doubts: Sequence[str] = ()
     is_far: bool = False
-
-    @property
-    def is_below(self) -> bool:
-        """Whether the result is worse than its input, by photos or by pictures that no fit has seen; see ``worse``.
-
-        It is not if the pictures look alike, from ``POOR`` dB on, or if only the rows' own colours tell.
-        """
-        if self.worse is None or self.psnr_after is None:
-            return False
-        return self.is_far or (self.psnr_reference == PHOTOS and self.psnr_after < POOR)
 
     def __repr__(self) -> str:
         return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from weakref import ReferenceType
 
 from gsmerge.compaction.candidate import Candidate, with_moved_views
-from gsmerge.compaction.distance import describe_far
+from gsmerge.compaction.distance import describe_far, is_far
 from gsmerge.compaction.new_views import SIDE, NewViews, Trial
 from gsmerge.compaction.outputs import write_result
 from gsmerge.compaction.report import CompactReport, compared_psnr
@@ -193,9 +193,8 @@ def _report(
         name, pictures = f"level {level}" if level else "the result", reference.name
         compared = compared_psnr(parts.covered, before, after)
         worse = describe_loss(name, *compared, OWN_PHOTOS if pictures == PHOTOS else pictures)
-        if worse is None and level == 0:
-            worse = describe_far(candidate.fitted.gaussians, prepared)
-            report = replace(report, is_far=worse is not None)
+        far = describe_far(candidate.fitted.gaussians, prepared) if worse is None and level == 0 else None
+        worse, report = worse or far, replace(report, is_far=far is not None or is_far(*compared))
     return report if worse is None else with_worse(report, worse)
 
 

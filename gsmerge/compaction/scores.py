@@ -29,18 +29,13 @@ def covers_all(before: PhotoScore | None) -> bool:
 
 def measure_renders(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PhotoScore:
     """Score canonical Gaussians against renders of the input in the scored views."""
-    return score_photos(gaussians, scene_photos(prepared.scene), _rendered_views(prepared, plan), covered=plan.covered)
+    return score_photos(gaussians, scene_photos(prepared.scene), plan.scored_views, covered=plan.covered)
 
 
 def may_leave_gaps(prepared: Prepared, plan: Plan) -> bool:
     """Return whether more than a few pixels are black in renders of the input, as where the input covers nothing."""
-    pictures = (prepared.scene.images[view] for view in _rendered_views(prepared, plan))
+    pictures = (prepared.scene.images[view] for view in plan.scored_views)
     return bool(np.mean([(picture.max(-1) > ROUNDING).mean() for picture in pictures]) < WHOLE)
-
-
-def _rendered_views(prepared: Prepared, plan: Plan) -> Sequence[int]:
-    """Return the views of the prepared scene that stand for the scored views of the input."""
-    return [prepared.repeated[view] for view in plan.scored_views] if prepared.repeated else plan.scored_views
 
 
 def written(gaussians: Gaussians, plan: Plan) -> Gaussians:

@@ -60,7 +60,7 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     units = find_nearest(g.means, 1)[1][:, 0] if placed else pixel_sizes(g.means, homes, cameras)
     sizes, seen = g.scales.max(1), (homes >= 0) | placed
     num_sharing = 1 if placed else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
-    hidden = sizes * np.sqrt(num_sharing) < HIDDEN * LOW_PASS * units
+    hidden = (sizes * np.sqrt(num_sharing) < HIDDEN * LOW_PASS * units) & (units < 1)  # 1: the scene's median depth
     if np.count_nonzero(hidden & seen) <= FEWEST * np.count_nonzero(seen):
         return scene
     share, usual = 100 * hidden.mean(), np.median(sizes[hidden] / units[hidden])

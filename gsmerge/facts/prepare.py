@@ -150,8 +150,13 @@ def prepare(
             note(agreement.doubt, doubt=True)
         prepared = replace(prepared, agreement=agreement)
     prepared = _without_holes(prepared, options) if fill and prepared.reference.of_views else prepared
-    draws = outside and prepared.reference.name == PHOTOS and not scene.has_own_pixels
-    return replace(prepared, scene=draw_outside(prepared.scene)) if draws else prepared
+    if not outside or scene.has_own_pixels or len(input_scene) == 0:
+        return prepared
+    drawn, reference = draw_outside(prepared.scene), prepared.reference
+    if reference.name == RENDERS and drawn is not prepared.scene:  # all pixels of all pictures are drawings
+        placed = range(len(prepared.scene), len(drawn))
+        drawn, reference = replace(drawn, masks=None), replace(reference, score_views=(*reference.score_views, *placed))
+    return replace(prepared, scene=drawn, reference=reference)
 
 
 def _photos_before(input_scene: Scene, prepared: Prepared) -> np.ndarray | None:

@@ -48,6 +48,7 @@ from gsmerge.types import PicturedScene
 WINDOW = np.full(5, 1 / 5, np.float32)
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
+HUE_SAMPLE = 2_000  # approximate number of pixels of a photo whose hues are compared, if it has as many
 GREY = 0.25  # of the variation of the Gaussians' hues; photos whose hues vary less are grey
 MIDDLE_GREY = 128  # level of 255 at which notes report the change of tone
 LEAST_PERCENT = 1  # of a photo; no note says that less of it differs
@@ -119,13 +120,13 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
 
 def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
     """Find the ``views`` whose photos have no hues while their Gaussians have; return the share that photos have."""
-    shares, sample = dict[int, float](), (slice(2, None, 4), slice(2, None, 4))  # enough pixels
+    shares, step = dict[int, float](), 1 + pairs.photos[0].size // (3 * HUE_SAMPLE)
     for view in views:
-        weights = pairs.shown.weights[view][sample].reshape(-1)
-        pair = (colors[view][sample].reshape(-1, 3) for colors in (pairs.photos, pairs.shown.pictures))
-        photo, shown = (vary_in_hue(colors, weights) for colors in pair)
-        if photo < min(VISIBLE, GREY * shown) and shown > VISIBLE:
-            shares[view] = photo / shown
+        weights = pairs.shown.weights[view].reshape(-1)[::step]
+        photo, shown = (images[view].reshape(-1, 3)[::step] for images in (pairs.photos, pairs.shown.pictures))
+        hues, shown_hues = (vary_in_hue(colors, weights) for colors in (photo, shown))
+        if hues < min(VISIBLE, GREY * shown_hues) and shown_hues > VISIBLE and photo.std() > VISIBLE:
+            shares[view] = hues / shown_hues
     return shares
 
 

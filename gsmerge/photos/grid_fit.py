@@ -104,7 +104,7 @@ def sharpen(inner: Part, size: Size, shape: Size) -> Part:
     ):
         return inner
     left, top = (
-        round((whole * (low + high) - side) / 2) / whole
+        min(max(0, round((whole * (low + high) - side) / 2)), whole - side) / whole
         for whole, side, low, high in zip(size, sides, inner, inner[2:], strict=False)
     )
     return left, top, left + sides[0] / size[0], top + sides[1] / size[1]

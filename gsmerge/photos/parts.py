@@ -12,7 +12,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of
-from gsmerge.io.photo_files import WHOLE, decode_image, image_size, limit_size, resize_to, same_shape
+from gsmerge.io.photo_files import ASPECT_TOLERANCE, WHOLE, decode_image, image_size, limit_size, resize_to, same_shape
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.photos.assign import Assigner, Assignment, Candidates
 from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_parts, sharpen
@@ -28,11 +28,13 @@ _BAR_SPREAD = 8  # largest range of a bar's colours, of 255
 
 
 def has_bars(scene: Scene) -> bool:
-    """Return whether the first photo of a scene has bars on opposite sides."""
+    """Return whether the first photo of a scene has bars on opposite sides, without which it has another shape."""
     if scene.images is None:
         return False
     above, below, left, right = count_bars(scene.images[0], _BAR_SPREAD / 255)
-    return bool((above and below) or (left and right))
+    height, width = scene.images.shape[1:3]
+    is_letterbox = min(above, below) > 0 and above + below > ASPECT_TOLERANCE * height
+    return is_letterbox or (min(left, right) > 0 and left + right > ASPECT_TOLERANCE * width)
 
 
 def choose_part(

@@ -1,0 +1,102 @@
+"""No result that is clearly worse than its input: how that is told, and in which ways a run goes on."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import scenes
+from messages import refuses
+
+import gsmerge
+from gsmerge import Gaussians, Scene, compact, pipeline, render
+from gsmerge.compaction.distance import BLUR, SIDE, TWICE, describe_far, is_far
+from gsmerge.errors import TargetError
+from gsmerge.facts.place_cameras import between_cameras
+from gsmerge.facts.prepare import Prepared, prepare
+from gsmerge.photos.views import resize_cameras
+from gsmerge.raster.metrics import POOR
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 80, 60), noise=0.2)
+
+
+@pytest.fixture(scope="module")
+def prepared(room: Scene) -> Prepared:
+    return prepare(room)
+
+
+def tiny(gaussians: Gaussians) -> Gaussians:
+    """Points in place of surfaces: nearly nothing is drawn."""
+    return replace(gaussians[::40], opacities=gaussians.opacities[::40] * np.float32(0.1))
+
+
+def slow_psnr(a: np.ndarray, b: np.ndarray, covered: np.ndarray) -> float:
+    """PSNR over the covered pixels of all pictures, blurred by OpenCV."""
+    blurred = [np.stack([cv2.GaussianBlur(p.clip(0, 1), (0, 0), BLUR) for p in pictures]) for pictures in (a, b)]
+    return float(-10 * np.log10(((blurred[0] - blurred[1]) ** 2)[covered].mean()))
+
+
+def test_distances_are_those_of_a_slow_reference(prepared: Prepared) -> None:
+    scene = prepared.scene
+    result = tiny(scene.gaussians)
+    cameras = resize_cameras(scene.cameras, SIDE, round(SIDE * scene.cameras.height / scene.cameras.width))
+    own, between = render(scene.gaussians, cameras[[0, 2]]), between_cameras(cameras)
+    inputs, results = (render(gaussians, between) for gaussians in (scene.gaussians, result))
+    error = slow_psnr(own.images, scene.images[[0, 2]], own.alphas[..., 0] > 0.5)
+    distance = slow_psnr(inputs.images, results.images, inputs.alphas[..., 0] > 0.5)
+    assert distance < error - TWICE
+    text = describe_far(result, prepared)
+    assert text is not None
+    assert [float(value) for value in re.findall(r"([\d.]+) dB", text)] == pytest.approx([distance, error], abs=0.3)
+
+
+def test_the_input_and_usual_results_are_not_far(room: Scene, prepared: Prepared) -> None:
+    assert describe_far(prepared.scene.gaussians, prepared) is None
+    for settings in ({}, {"fit": "none"}, {"superpixels": "1%"}):
+        assert not compact(room, effort="draft", **settings).report.is_far
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [(20, 20 - TWICE - 0.1, True), (20, 20 - TWICE + 0.1, False), (60, POOR + 0.1, False), (None, 3, False),
+     (20, None, False), (float("nan"), 3, False)],
+)  # fmt: skip
+def test_far_is_twice_the_error_and_poor(before: float | None, after: float | None, expected: bool) -> None:
+    assert is_far(before, after) == expected
+
+
+def spoil_fits(monkeypatch: pytest.MonkeyPatch, *, merges: bool) -> None:
+    """Let every fit end in nearly nothing, and with ``merges`` the merge without a fit as well."""
+    fit_scene = pipeline.fit_scene
+
+    def spoilt(start: Any, scene: Any, options: Any, seed: int, **rest: Any) -> Any:
+        fitted = fit_scene(start, scene, options, seed, **rest)
+        is_kept = options.fit == "none" and not merges
+        return fitted if is_kept else replace(fitted, gaussians=tiny(fitted.gaussians))
+
+    monkeypatch.setattr(pipeline, "fit_scene", spoilt)
+
+
+def test_a_run_goes_on_without_a_fit_that_spoils_it(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    spoil_fits(monkeypatch, merges=False)
+    report = compact(room, effort="draft").report
+    assert not report.is_far
+    assert report.options["fit"] == "none"
+    again = [note for note in report.notes if "made again" in note]
+    assert len(again) == 1
+    assert "without a fit" in again[0]
+
+
+def test_nothing_is_made_where_no_way_helps(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    spoil_fits(monkeypatch, merges=True)
+    with refuses(TargetError, "expected a result as good as its input, found none", "--budget"):
+        compact(room, effort="draft")
+    with pytest.warns(gsmerge.DoubtWarning, match="than the input"):
+        compact(room, effort="draft", budget=100)
