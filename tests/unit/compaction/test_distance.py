@@ -19,7 +19,7 @@ from gsmerge.errors import TargetError
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.photos.views import resize_cameras
-from gsmerge.raster.metrics import POOR
+from gsmerge.raster.metrics import POOR, decibels
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def tiny(gaussians: Gaussians) -> Gaussians:
 def slow_psnr(a: np.ndarray, b: np.ndarray, covered: np.ndarray) -> float:
     """PSNR over the covered pixels of all pictures, blurred by OpenCV."""
     blurred = [np.stack([cv2.GaussianBlur(p.clip(0, 1), (0, 0), BLUR) for p in pictures]) for pictures in (a, b)]
-    return float(-10 * np.log10(((blurred[0] - blurred[1]) ** 2)[covered].mean()))
+    return decibels(float(((blurred[0] - blurred[1]) ** 2)[covered].mean()))
 
 
 def test_distances_are_those_of_a_slow_reference(prepared: Prepared) -> None:
