@@ -79,10 +79,6 @@ class PhotoReader:
             raise IndexError(photo)
         return self.read(photo)
 
-    def select(self, ids: Sequence[int]) -> PhotoReader:
-        """Return the reader of a subset of photos, in the given order."""
-        return PhotoReader(len(ids), self.size, lambda photo: self[ids[photo]])
-
 
 PhotoArrays = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c photos [h,w,3], uint8 sRGB; empty without photos
 NO_IMAGES = np.empty((0, 1, 1, 3), np.float32)  # stands for photos as floats if there are none

@@ -254,9 +254,8 @@ def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, l
 
 def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
     """Find the images of a scene: inside its cameras' file, or in a folder; None without."""
-    if cameras is not None:
-        if cameras.suffix == STATE_ENDING or (cameras.suffix == ".npz" and holds_images(cameras)):
-            return cameras
+    if cameras is not None and (cameras.suffix == STATE_ENDING or (cameras.suffix == ".npz" and holds_images(cameras))):
+        return cameras
     folders = [f for root in roots for place in IMAGE_PLACES if can_be_listed(f := root / place, "images")]
     # If a folder has several scenes, each may have its own folder of images
     names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
