@@ -149,14 +149,20 @@ def align(
     """
     camera_file = with_photo_size(camera_file, photo_size(photos))
     source = RowSource(ply, camera_file, photos, order, scale)
-    grids = file_grids(camera_file, source.size)
+    grids, problem = file_grids(camera_file, source.size), None
     try:
         grids.insert(0, photo_grid(camera_file, source.size))
-    except SceneError:
-        if not grids:  # no crop of the cameras has the shape of the photos
-            raise
+    except SceneError as error:  # photos of another shape, to which cameras may have to be cropped
+        problem = error
     recovery = next(filter(None, (_find_pixels(source, grid) for grid in grids)), None)
-    return _choose_cameras(source, grids[0], frames) if recovery is None else _make_result(source, recovery)
+    if recovery is not None:
+        return _make_result(source, recovery)
+    if problem is not None and not grids:
+        raise problem
+    try:
+        return _choose_cameras(source, grids[0], frames)
+    except SceneError as error:
+        raise problem or error from error
 
 
 def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:

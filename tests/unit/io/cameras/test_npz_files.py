@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from messages import refuses
-from tiny_scene import Tiny, assert_same, write_colmap_binary, write_colmap_text, write_npz
+from tiny_scene import Tiny, assert_same, write_npz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras

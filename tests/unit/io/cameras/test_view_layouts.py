@@ -14,8 +14,7 @@ from program_cameras import C2W, CX, CY, FORMATS, FX, FY, HEIGHT, K_DIVIDED, NAM
 from tiny_scene import edited_json, rotation
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import mean_pose_frame
-from gsmerge.geometry.transforms import quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry.transforms import mean_pose_frame, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_source import CameraSource
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras
