@@ -152,21 +152,17 @@ def align(
     grids, problem = file_grids(camera_file, source.size), None
     try:
         grids.insert(0, photo_grid(camera_file, source.size))
-    except SceneError as error:
+    except SceneError as error:  # photos of another shape, to which cameras may have to be cropped
         problem = error
-    recoveries = filter(None, (_find_pixels(source, grid) for grid in grids))
-    if problem is None:
-        recovery = next(recoveries, None)
-        return _choose_cameras(source, grids[0], frames) if recovery is None else _make_result(source, recovery)
-    # photos of another shape are resized or cropped; only their colours show how
-    possible = {id(recovery.place): recovery for recovery in recoveries}
-    places = [recovery.place for recovery in possible.values()] or [PlacedGrid(grid, IDENTITY) for grid in grids]
-    place = _choose_place(source, places)
-    if place is None:
+    recovery = next(filter(None, (_find_pixels(source, grid) for grid in grids)), None)
+    if recovery is not None:
+        return _make_result(source, recovery)
+    if problem is not None and not grids:
         raise problem
-    if id(place) in possible:
-        return _make_result(source, possible[id(place)])
-    return _choose_cameras(source, place.grid, frames)
+    try:
+        return _choose_cameras(source, grids[0], frames)
+    except SceneError as error:
+        raise problem or error from error
 
 
 def _find_pixels(source: RowSource, grid: Grid) -> Recovery | None:
@@ -288,19 +284,6 @@ def _follow(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray 
 
 
 # Rows without pixels, and results
-
-
-def _choose_place(source: RowSource, places: Sequence[PlacedGrid]) -> PlacedGrid | None:
-    """Choose the place whose photos show the colours of the rows best; None if no photos show them."""
-    from gsmerge.cameras.unaligned import check_cameras  # here because few files need it
-
-    best, best_score = None, 0.0
-    for place in places:
-        inputs = source.inputs(place.grid)
-        check = check_cameras(inputs.gaussians, inputs.valid, place.cameras, inputs.images)
-        if check.ok and not math.isnan(check.color_ratio) and check.score > best_score:
-            best, best_score = place, check.score
-    return best
 
 
 def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:

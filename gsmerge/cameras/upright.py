@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from gsmerge.cameras.frames import UPRIGHT, ray_directions, solve_frame
@@ -27,15 +28,14 @@ _QUANTILE = 0.95  # this quantile of the distances along the widest axis is 1 in
 _TOLERANCE = 1e-3  # of the median and the quantile
 _ROUGH_ROWS, _ROUGH = 2000, 1.0  # rows of a first check, and its tolerance before the rotation is undone
 _PER_PIXEL = (1, 2, 3)  # Gaussians of a pixel
-_OUTSIDE = 999  # a colour that no pixel has
-_UNIQUE = 1.1  # least distance of a stretch at its second-best place, divided by the distance at its best place
-_STEP = 2  # every second pixel of a stretch is compared
+_UNIQUE = 1.2  # least distance of a stretch at its second-best place, divided by the distance at its best place
 _LENGTH, _STRETCHES = 48, 96  # rows of a stretch, and number of stretches that are searched
 _PER_STRETCH = 12  # rows of each stretch that the frame is solved from
 _SHARE = 3  # stretches of fused views are taken from the first and the last third of the rows
 _SLACK = 8  # pixels beyond the bounds on both sides that are searched too
-_MAX_COST = 3.0  # largest distance of a stretch, divided by the lower quartile of all distances
-_NO_PLACE = 1 << 30  # distance of a stretch that cannot be in its photo
+_MAX_COST = 9.0  # largest distance of a stretch, divided by the lower quartile of all distances
+_LEAST = 1e-3  # distances below this count as equal
+_NO_PLACE = 1e9  # distance of a stretch that cannot be in its photo
 _PAIRS = 200  # pairs of stretches from which a frame is tried
 _NEAR = 3.0  # a stretch agrees with the frame of a pair if its error is below this multiple of the limit
 _ROUNDS = 3  # of solving for the frame from the stretches that agree with it
@@ -139,8 +139,9 @@ def _match(
     """
     rows = np.array([stretch.start + stretch.step * np.arange(_LENGTH) for stretch in stretches])
     places, sums, next_sums = _place_stretches(inputs, stretches, rows, pixels).T
-    is_near = sums <= _MAX_COST * max(1.0, float(np.quantile(sums, 0.25)))
-    matched = np.flatnonzero(is_near & (next_sums > _UNIQUE * sums))
+    places = places.astype(int)
+    is_near = sums <= _MAX_COST * max(_LEAST, float(np.quantile(sums, 0.25)))
+    matched = np.flatnonzero(is_near & (next_sums > _UNIQUE * np.maximum(sums, _LEAST)))
     sample = np.linspace(0, _LENGTH - 1, _PER_STRETCH).astype(int)
     ids = rows[matched][:, sample].reshape(-1)
     matched_pixels = pixels[(places[matched, None] + sample).clip(max=len(pixels) - 1).reshape(-1)]
@@ -155,46 +156,26 @@ def _match(
 def _place_stretches(
     inputs: AlignmentInput, stretches: Sequence[_Stretch], rows: np.ndarray, pixels: np.ndarray
 ) -> np.ndarray:
-    """Return for each stretch its place, its sum and its next sum ``[s,3]``; see :func:`_place_stretch`.
+    """Return for each stretch its place, its sum and its next sum ``[s,3]``.
 
-    ``rows [s,l]`` are the rows of the stretches, and ``pixels [p]`` the pixels of a photo in which they are searched.
+    The place has the least sum of squared differences of colours; the next sum is that of the second-best place that is
+    more than two pixels away. ``rows [s,l]`` are the rows of the stretches, and ``pixels [p]`` the pixels of a photo in
+    which they are searched.
     """
     with np.errstate(invalid="ignore"):
-        base = np.nan_to_num(sh0_to_rgb(inputs.gaussians.sh0[:, 0])).clip(0, 1)
-    colors = np.ascontiguousarray(np.rint(255 * base).astype(np.int16).T)
-    shown = [_shown_colors(np.rint(255 * photo).astype(np.uint8), pixels, _LENGTH) for photo in inputs.images]
+        colors = np.nan_to_num(sh0_to_rgb(inputs.gaussians.sh0[:, 0])).clip(0, 1).astype(np.float32)
     places = []
     for stretch, stretch_rows in zip(stretches, rows, strict=True):
-        low, high = max(0, stretch.low), min(len(pixels), stretch.high)
-        if low < high:
-            places.append(_place_stretch(shown[stretch.view], colors[:, stretch_rows], low, high))
-        else:
-            places.append((0, _NO_PLACE, 0))
+        low, high = max(0, stretch.low), min(len(pixels), stretch.high + _LENGTH)
+        if high - low < _LENGTH:
+            places.append((0, _NO_PLACE, 0.0))
+            continue
+        shown = inputs.images[stretch.view].reshape(1, -1, 3)[:, pixels[low:high]]
+        sums = cv2.matchTemplate(shown, colors[stretch_rows][None], cv2.TM_SQDIFF)[0]
+        best = int(sums.argmin())
+        others = np.concatenate([sums[: max(0, best - 2)], sums[best + 3 :]])
+        places.append((low + best, float(sums[best]), float(others.min(initial=_NO_PLACE))))
     return np.array(places)
-
-
-def _shown_colors(photo: np.ndarray, pixels: np.ndarray, length: int) -> np.ndarray:
-    """Return the colours ``[3,p+length]`` int16 at ``pixels [p]`` of a uint8 ``photo [h,w,3]``, padded at the end."""
-    shown = photo.reshape(-1, 3)[pixels].T.astype(np.int16)
-    return np.concatenate([shown, np.full((3, length), _OUTSIDE, np.int16)], 1)
-
-
-def _place_stretch(shown: np.ndarray, colors: np.ndarray, low: int, high: int) -> tuple[int, int, int]:
-    """Find the place of ``colors [3,l]`` in the colours ``shown [3,m]`` with the least sum of absolute differences.
-
-    Places from ``low`` to before ``high`` are searched. Returns the best place, its sum, and the sum of the second-best
-    place that is more than two pixels away.
-    """
-    sums, difference = np.zeros(high - low, np.int32), np.empty(high - low, np.int16)
-    for offset in range(0, colors.shape[1], _STEP):
-        for channel in range(3):
-            values = shown[channel, low + offset : high + offset]
-            np.subtract(values, colors[channel, offset], out=difference)
-            np.abs(difference, out=difference)
-            sums += difference
-    best = int(sums.argmin())
-    other_sums = np.concatenate([sums[: max(0, best - 2)], sums[best + 3 :]])
-    return low + best, int(sums[best]), int(other_sums.min(initial=np.iinfo(np.int32).max))
 
 
 def _solve_agreed_frame(

@@ -20,7 +20,7 @@ FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content 
 # Ends of the videos that gsmerge writes, which tell them from films of a capture: a box or element that players skip
 CLIP_ENDS = {".mp4": b"\0\0\0\x0ffreegsmerge", ".webm": b"\xec\x87gsmerge"}
 _CUT = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
-HOLD_PHOTOS = (".npz", ".torch", ".gsm")  # endings of files that may have photos inside
+HOLD_PHOTOS = (".npz", ".gsm")  # endings of files that may have photos inside
 _MAX_PARTS = 16  # parts at the end of a path that names are compared with: the file's name and folders above it
 _NAME_FOLDER = "name the folder of the photos with {option}"
 _HIDDEN = ".@"  # first characters of hidden folders, such as .thumb and @eaDir

@@ -42,7 +42,7 @@ _MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is de
 _COPIES = 2, 3  # of all pixels in memory: with OpenCV, and at most with Pillow and the conversion of its image
 _PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # of a pixel by mode; 4 in all other modes
 _COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10  # of a pixel, while decoding
-_EMBEDDED_BYTES = 9  # additional bytes of a pixel while embedded photos are decoded
+_WORK_BYTES = 9  # additional bytes of a pixel while a library decodes it
 # First bytes of a file -> Pillow's plugin; without a plugin for its first format, Pillow imports those of all formats
 _PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp"}
 _CHANNELS = 3  # bytes of a decoded photo's pixel
@@ -78,10 +78,6 @@ class PhotoReader:
         if not 0 <= photo < self.count:
             raise IndexError(photo)
         return self.read(photo)
-
-    def select(self, ids: Sequence[int]) -> PhotoReader:
-        """Return the reader of a subset of photos, in the given order."""
-        return PhotoReader(len(ids), self.size, lambda photo: self[ids[photo]])
 
 
 PhotoArrays = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c photos [h,w,3], uint8 sRGB; empty without photos
@@ -160,7 +156,7 @@ def decode_small(path: Path, side: int) -> np.ndarray:
     divisor = next(divisor for divisor in reversed(_REDUCTIONS) if max(width, height) >= divisor * side or divisor == 1)
     with read_errors(path):
         data = np.fromfile(path, np.uint8)
-    _check_scans(ReadBudget(path, len(data)), [data], (width, height))
+    _check_scans(path, data, (width, height))
     photo = _decode(path, data, (width, height), divisor if data[:2].tobytes() == _JPEG else 1)
     ratio = max(photo.shape[:2]) / (2 * side)
     if ratio > 1:
@@ -187,7 +183,7 @@ def decode_image(path: Path, size: Size) -> np.ndarray:
     """Decode an image file of known size to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
     with read_errors(path):
         data = np.fromfile(path, np.uint8)
-    _check_scans(ReadBudget(path, len(data)), [data], size)
+    _check_scans(path, data, size)
     return _decode(path, data, size)
 
 
@@ -328,7 +324,7 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
 
 def _undecodable(path: Path, size: Size) -> SceneError:
     """Make the error of an image that a library did not decode; MemoryError if there was no memory for it."""
-    np.empty((_CHANNELS + _EMBEDDED_BYTES, *size), np.uint8)  # libraries do not say that memory was the reason
+    np.empty((_CHANNELS + _WORK_BYTES, *size), np.uint8)  # libraries do not say that memory was the reason
     return _unreadable(path)
 
 
@@ -406,34 +402,11 @@ def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
     return Image.open(file, formats=tuple(formats))
 
 
-def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray | PhotoReader:
-    """Decode image files that are embedded in a file (``[b]`` uint8 each) to ``[c,h,w,3]`` uint8.
-
-    If there are many large images, they are decoded at each use. SceneError if an image cannot be decoded, if two
-    differ in size, or if they take more memory or time than the file's budget allows.
-    """
-    path = Path(budget.path)
-    sizes = [_parse_header(path, io.BytesIO(data.tobytes()))[0] for data in files]
-    width, height = sizes[0]
-    for name, (w, h) in zip(names, sizes, strict=True):
-        if (w, h) != sizes[0]:
-            problem = f"{name}: expected images of one size, {width} x {height}, found {w} x {h}"
-            raise SceneError(path, problem, "resize them to one size")
-    at_once = len(files) if _CHANNELS * len(files) * width * height <= _AT_ONCE else 1
-    num_bytes = (_CHANNELS * at_once + _EMBEDDED_BYTES) * width * height
-    budget.check_memory(num_bytes, f"{at_once} photos of {width} x {height}")
-    _check_scans(budget, files, sizes[0])
-    if at_once < len(files):
-        return PhotoReader(len(files), sizes[0], lambda photo: _decode(path, files[photo], sizes[0]))
-    out = np.empty((len(files), height, width, 3), np.uint8)
-    parallel_map(lambda i: np.copyto(out[i], _decode(path, files[i], sizes[i])), range(len(files)))
-    return out
-
-
-def _check_scans(budget: ReadBudget, files: Sequence[np.ndarray], size: Size) -> None:
-    """Raise SceneError if the scans of JPEG files, each over all pixels, take longer than the budget allows."""
-    num_scans = sum(data.tobytes().count(_SCAN) for data in files if data[:2].tobytes() == _JPEG)
-    budget.check_steps(num_scans * size[0] * size[1] // _PIXELS_PER_STEP, f"steps of decoding {num_scans:,} scans")
+def _check_scans(path: Path, data: np.ndarray, size: Size) -> None:
+    """Raise SceneError if the scans of a JPEG file, each over all pixels, take longer than its bytes allow."""
+    num_scans = data.tobytes().count(_SCAN) if data[:2].tobytes() == _JPEG else 0
+    steps = num_scans * size[0] * size[1] // _PIXELS_PER_STEP
+    ReadBudget(path, len(data)).check_steps(steps, f"steps of decoding {num_scans:,} scans")
 
 
 def _decode(path: Path, data: np.ndarray, size: Size, divisor: int = 1) -> np.ndarray:

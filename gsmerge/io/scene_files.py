@@ -24,7 +24,7 @@ from gsmerge.io.cameras.read import (
     read_cameras,
     read_sharp_camera,
 )
-from gsmerge.io.cameras.table import CHUNK, is_colmap
+from gsmerge.io.cameras.table import is_colmap
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.ply import header_content, header_counts, is_file_from_gsmerge
 from gsmerge.io.formats.table import (
@@ -78,8 +78,8 @@ _MAX_CAMERAS, _MAX_FOLDERS = 8, 100  # cameras that are tried in turn; folders i
 class SceneFiles:
     """The files of a scene.
 
-    ``cameras`` may be a COLMAP folder, or the ``.ply`` itself if it holds its cameras. ``images`` may be an ``.npz`` or
-    ``.torch`` that holds them. For a ``.gsm`` both are the file itself.
+    ``cameras`` may be a COLMAP folder, or the ``.ply`` itself if it holds its cameras. ``images`` may be an ``.npz``
+    that holds them. For a ``.gsm`` both are the file itself.
     """
 
     ply: Path
@@ -193,7 +193,7 @@ def find_scene_files(
     may not be its own. Of COLMAP's models in one place, the one with the most images comes first. Cameras inside the
     ``.ply`` precede those beside it. If no place has cameras,
     the only file of any name that holds cameras is taken. Without it, cameras of a program whose files are not read are
-    taken, so that the reader says so. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder,
+    taken, so that the reader says so. Images inside the cameras' ``.npz`` take precedence over a folder,
     because the model saw these. A result of gsmerge is taken as the scene only if a folder has nothing else.
 
     Raises:
@@ -254,10 +254,8 @@ def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, l
 
 def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
     """Find the images of a scene: inside its cameras' file, or in a folder; None without."""
-    if cameras is not None:
-        holds_all = cameras.suffix in (CHUNK, STATE_ENDING)
-        if holds_all or (cameras.suffix == ".npz" and holds_images(cameras)):
-            return cameras
+    if cameras is not None and (cameras.suffix == STATE_ENDING or (cameras.suffix == ".npz" and holds_images(cameras))):
+        return cameras
     folders = [f for root in roots for place in IMAGE_PLACES if can_be_listed(f := root / place, "images")]
     # If a folder has several scenes, each may have its own folder of images
     names = ply.stem, os.path.basename(os.path.realpath(ply.parent))

@@ -22,7 +22,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, sizes_of
 from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.cameras.table import CHUNK, FFGS
+from gsmerge.io.cameras.table import FFGS
 from gsmerge.io.first_bytes import CONVERT
 from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_order, propose_images
 from gsmerge.io.photo_files import (
@@ -239,9 +239,8 @@ def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
     if files.images is None or files.images.is_dir():
         return ()
     same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
-    stored = (camera_file if same_file else read_cameras(files.images, scene=files.ply.stem)).images
-    may_lack = same_file and files.images.suffix == CHUNK and not len(stored)
-    if not may_lack and len(stored) != len(camera_file):
+    stored = (camera_file if same_file else read_cameras(files.images)).images
+    if len(stored) != len(camera_file):
         raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {len(stored)}")
     return stored
 

@@ -13,12 +13,12 @@ from gsmerge.io import SCENE_SUFFIXES, CameraFile, read_cameras
 from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.dataparser import DATAPARSER
 from gsmerge.io.cameras.foreign import INTRINSICS
-from gsmerge.io.cameras.long_lrm import FRAMES_FILE, POSE_FILE, SCALE_FILE
+from gsmerge.io.cameras.long_lrm import FRAMES_FILE
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
 from gsmerge.photos.photo_folders import capture_folder, find_named_photos
 from gsmerge.photos.scene_photos import images_beside
 
-EXTRA_FILES = (DATAPARSER, INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files
+EXTRA_FILES = (DATAPARSER, INTRINSICS, FRAMES_FILE)  # read with some camera files
 
 
 def digest(value: Mapping[str, Any]) -> str:

@@ -305,7 +305,7 @@ _EXPORTERS = (
         (
             Model(
                 "Long-LRM", "arthurhero/Long-LRM d92dd51; `data/dataset.py` 1fccf47, `main.py` 3c35270",
-                "`gaussians_001.ply`; `input_frame_idx.txt`; in some versions `pos_avg_inv.txt` and `scene_scale.txt`",
+                "`gaussians_001.ply`; `input_frame_idx.txt`, whose frames show the mean pose that it is in",
                 "read right with the data set's file of cameras",
                 camera_advice="the data set's .json file has the cameras: name it with --cameras",
             ),

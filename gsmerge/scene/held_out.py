@@ -82,7 +82,7 @@ def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int
 
     Frame and convention are chosen as in :func:`read_held_out`.
     """
-    stored, cameras = read_cameras(path, scene=load.files.ply.stem), load.cameras
+    stored, cameras = read_cameras(path), load.cameras
     candidates = [stored]
     if cameras is not None and cameras.source == stored.source and cameras.convention != stored.convention:
         candidates.insert(0, with_convention(stored, cameras.convention))  # in which the scene's own cameras fit
@@ -148,7 +148,7 @@ def _similarity_from_stored(load: Loaded) -> Similarity:
         return load.recovery.frame
     if load.cameras is None or load.files.cameras is None:
         return IDENTITY
-    camera_file = read_cameras(load.files.cameras, scene=load.files.ply.stem, folder=load.files.ply.parent)
+    camera_file = read_cameras(load.files.cameras, folder=load.files.ply.parent)
     if (camera_file.names, camera_file.convention) != (load.cameras.names, load.cameras.convention):
         return IDENTITY  # other views, or another convention: the poses cannot be compared
     if np.array_equal(camera_file.viewmats, load.cameras.viewmats):

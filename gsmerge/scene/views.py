@@ -37,7 +37,7 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
     is a multiple of the number of views.
     """
     if files.cameras is not None:
-        stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
+        stored = read_cameras(files.cameras, folder=files.ply.parent)
         if not stored.has_intrinsics:
             raise missing_intrinsics(stored.path)
         # if the number is a multiple, each view may have rows of its own

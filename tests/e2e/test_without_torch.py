@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_scene import make_tiny
 
 from gsmerge.cli import main
 from gsmerge.errors import TORCH_INSTALL
@@ -26,7 +25,7 @@ FEW = ("--set", "superpixels=60")
 COMMANDS = (
     ("compact", "scene", *FEW, "--set", "recipe=paper", "-o", "new.ply"),
     ("evaluate", "scene", "small.ply", "--lpips", "alex", "--json"),
-    ("inspect", "chunk/000000.torch"), ("lab", "train", "--data", "scene", "-o", "run"),
+    ("lab", "train", "--data", "scene", "-o", "run"),
 )  # fmt: skip
 OTHERS = (
     ("compact", "scene", *FEW, "-o", "new.ply"), ("batch", "scene", "--jobs", "2", *FEW, "-o", "new"),
@@ -102,9 +101,6 @@ def test_networks_and_lpips_need_no_torch_and_what_does_says_how_to_install_it(
     call: Call, tmp_path: Path, torch: Any
 ) -> None:
     """In one process, which takes a second to start."""
-    from re10k_chunks import entry, save
-
-    save(tmp_path / "work" / "chunk", entry(make_tiny(), "scene"))
     write_lpips_weights(tmp_path / "start")
     done = call("-c", EACH, json.dumps(COMMANDS))
     assert done.returncode == 0, done.stderr

@@ -173,8 +173,6 @@ def long_lrm(folder: Path, *, order: str = "view-major") -> Export:
     export = finish_rows(saver, scene, pixels, World(move[:3, :3], scale, scale * move[:3, 3]), scene)
     export = save(export, folder)
     (folder / "input_frame_idx.txt").write_text("0\n1\n2\n")
-    np.savetxt(folder / "pos_avg_inv.txt", move)
-    np.savetxt(folder / "scene_scale.txt", [scale])
     common = {"fx": scene.K[0, 0], "fy": scene.K[1, 1], "cx": scene.K[0, 2], "cy": scene.K[1, 2], "w": 48, "h": 36}
     frames = [
         {"file_path": f"images/{n}", "w2c": m.tolist(), **common} for n, m in zip(scene.names, scene.w2c, strict=True)

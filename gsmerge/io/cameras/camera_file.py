@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import Similarity, pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
-from gsmerge.io.photo_files import PhotoArrays, PhotoReader, PhotoTransform, Size, change_photos, photo_size, same_shape
+from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, Size, change_photos, photo_size, same_shape
 from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath
@@ -288,8 +288,7 @@ def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
     ids = list(view_ids)
     lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
     arrays = {name: getattr(cameras, name)[ids] for name in ("viewmats", "Ks", "widths", "heights")}
-    images = cameras.images.select(ids) if isinstance(cameras.images, PhotoReader) else cameras.images
-    images = images[ids] if isinstance(images, np.ndarray) else images
+    images = cameras.images[ids] if isinstance(cameras.images, np.ndarray) else cameras.images
     names = tuple(cameras.names[i] for i in ids)
     return replace(cameras, **arrays, names=names, images=images, lenses=lenses if any(lenses) else ())
 

@@ -25,7 +25,6 @@ class CameraSource:
     """A camera file or folder, whose content is read once, at the first use."""
 
     path: Path
-    scene: str | None = None  # the scene's name, for files that hold several scenes
     folder: Path | None = None  # of the Gaussians, beside which some models write how they moved the cameras
 
     @cached_property

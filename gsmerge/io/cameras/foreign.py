@@ -70,6 +70,8 @@ PROGRAMS = (
             " save_as_kitti into lines of 12 numbers, which are read with one photo for each",
             rf"\A(#.*\n)*({_NUMBER}[ \t]+){{7}}{_NUMBER}\s*$"),
     Foreign("*.txt", "RealEstate10K", _WRITE, rf"\Ahttps?:.*\n({_NUMBER}[ \t]+){{18}}{_NUMBER}\s*$"),
+    Foreign("*.torch", "a chunk of RealEstate10K", "write the cameras and photos of its scene into views.npz"
+            " (docs/reference/formats.md)"),
     Foreign("*.log", "Open3D or Tanks and Temples", _WRITE, r"\A\d+[ \t]+\d+[ \t]+\d+\s*$"),
     Foreign("*.traj", "ARKitScenes", _WRITE), Foreign("*.jgz", "CO3D", _WRITE),
     Foreign("*.json", "Open3D", _WRITE, '"PinholeCamera'),

@@ -25,7 +25,6 @@ from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import check_file, check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, MAX_NORMALISED_FOCAL, ORDERS, StoredView, check_count
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
-from gsmerge.io.cameras.colmap import read_colmap
 from gsmerge.io.photo_files import PhotoArrays
 
 _LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of the arrays' names in ``cameras.npz`` of Lyra 2's scripts
@@ -70,7 +69,7 @@ def read_da3(source: CameraSource) -> StoredCameras:
     width = height = 0
     if pixels is not None and pixels.ndim >= 3 and min(pixels.shape[1:3]) > 0:
         height, width = pixels.shape[1:3]
-        Ks = None if Ks is None else _at_size(_without_colmap_scale(path, Ks, width, height), width, height)
+        Ks = None if Ks is None else _at_size(Ks, width, height)
     elif Ks is not None:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
     if width <= 1 and Ks is not None and not is_da3(path):  # AnySplat divides intrinsics by the size
@@ -147,18 +146,6 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
     for row in range(images.shape[1]):  # row by row, because the floats of a row take little memory
         out[:, row] = np.round(np.nan_to_num(np.clip(images[:, row], 0, 1).astype(np.float32)) * 255)
     return out
-
-
-def _without_colmap_scale(path: Path, Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Scale intrinsics back to the depth maps if a COLMAP export of the same call has scaled them to the photos."""
-    folder = path.parent.parent.parent
-    for suffix in (".bin", ".txt"):
-        with suppress(SceneError):
-            views = read_colmap(CameraSource(folder), suffix).views
-            sizes = np.array([view.size for view in views], np.float64).reshape(-1, 2, 1).clip(min=1)
-            if len(views) == len(Ks) and np.allclose(np.array([view.K for view in views]), Ks, rtol=_EQUAL_INTRINSICS):
-                return Ks * np.insert([[width], [height]] / sizes, 2, 1, axis=1)
-    return Ks
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.camera_source import CameraSource, check_objects
 from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program
-from gsmerge.io.cameras.table import CAMERA_ENDINGS, CAMERA_FORMATS, CHUNK, KEYFRAME, SHARP_PLY, is_colmap, is_keyframes
+from gsmerge.io.cameras.table import CAMERA_ENDINGS, CAMERA_FORMATS, KEYFRAME, SHARP_PLY, is_colmap, is_keyframes
 from gsmerge.io.cameras.viewer_cameras import ENDING
 from gsmerge.io.image_names import natural_order
 from gsmerge.runtime.plugins import lazy_functions
@@ -32,7 +32,7 @@ def find_cameras(folder: Path) -> Path | None:
 
 
 def list_cameras(folder: Path) -> Iterator[Path]:
-    """Yield the known camera files below a folder, the one to prefer first, and its only ``.torch`` chunk."""
+    """Yield the known camera files below a folder, the one to prefer first."""
     for place in CAMERA_PLACES:
         candidate = folder / place
         if "*" in place:
@@ -40,8 +40,6 @@ def list_cameras(folder: Path) -> Iterator[Path]:
             yield from sorted(models, key=lambda path: -count_images(path)) if len(models) > 1 else models
         elif candidate.is_file() or (candidate.is_dir() and _is_camera_folder(candidate)):
             yield candidate
-    chunks = [chunk for chunk in folder.glob(f"*{CHUNK}") if chunk.is_file()]
-    yield from chunks if len(chunks) == 1 else []
 
 
 def _is_camera_folder(folder: Path) -> bool:
@@ -73,14 +71,13 @@ def holds_cameras(path: Path) -> bool:
 
 
 @check_arguments
-def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None = None) -> CameraFile:
+def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
     """Read cameras from a file, or from a folder that holds one of the known kinds.
 
     The formats are those of docs/reference/formats.md. Poses become world-to-camera with OpenCV axes.
 
     Args:
         path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
-        scene: Name of the scene, for files that hold several (``.torch`` chunks); usually the name of the ``.ply``.
         folder: Folder of the Gaussians, where Long-LRM writes how it moved the cameras; None: the cameras' own folder.
 
     Raises:
@@ -93,7 +90,7 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
     """
     path = _resolve(Path(path))
     ending = "" if path.is_dir() else path.suffix.lower()
-    source = CameraSource(path, scene, folder)
+    source = CameraSource(path, folder)
     format_ = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
     if format_ is None:
         if isinstance(entries := source.json if ending == ".json" else None, list):

@@ -22,7 +22,6 @@ from gsmerge.io.formats.table import STATE_ENDING
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
 
 _lazy = lazy_functions(__package__)
-CHUNK = ".torch"  # ending of re10k's chunks
 FFGS = "ffgs cameras.json"  # format of cameras whose photos were resized to cover the model's input, and cropped
 KEYFRAME = "t_00"  # key in files of Polycam, within their first bytes
 
@@ -180,8 +179,6 @@ CAMERA_FORMATS = (
                  lambda file: _IS_DA3(file.path)),
     CameraFormat("npz of poses", "`.npz` of what VGGT, or MapAnything or AnySplat (camera-to-world), returns",
                  ".npz", _READ_DA3, W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
-    CameraFormat("re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`; needs torch", CHUNK,
-                 _lazy("re10k.read_re10k"), W2C_OPENCV, "divided by the size"),
     SHARP_PLY,
     CameraFormat("state", "inside a `.gsm` of gsmerge extend", STATE_ENDING, _READ_STATE, W2C_OPENCV, "pixels"),
 )  # fmt: skip

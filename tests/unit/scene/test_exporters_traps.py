@@ -235,7 +235,7 @@ def test_photos_that_a_model_cropped_for_rows_without_pixels(tmp_path: Path, sho
     if shown:
         assert np.array_equal((load_scene(tmp_path).scene.images * 255).round(), square.images)
     else:
-        with refuses(SceneError, "scene.ply", "as far from the photos"):
+        with refuses(SceneError, "images", "no part"):
             load_scene(tmp_path, cameras=tmp_path, images=tmp_path / "images")
 
 

@@ -14,7 +14,7 @@ from program_cameras import C2W, CX, CY, FORMATS, FX, FY, HEIGHT, K_DIVIDED, NAM
 from tiny_scene import edited_json, rotation
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry.transforms import mean_pose_frame, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_source import CameraSource
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras
@@ -219,16 +219,14 @@ def test_world_mirror_s_size_is_twice_the_principal_point(
 def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path) -> None:
     """A point of the cameras' world and its image in the Gaussians' are seen in the same direction."""
     path = FORMATS["Long-LRM"].write(tmp_path)
-    move = np.eye(4)
-    move[:3, :3], move[:3, 3] = rotation(0.4, -0.2, 1.0), (0.3, -1.0, 2.0)
-    np.savetxt(tmp_path / "pos_avg_inv.txt", move)
-    (tmp_path / "scene_scale.txt").write_text("1.35")
     (tmp_path / "input_frame_idx.txt").write_text("2 0")
     actual = read_cameras(path)
-    point = np.array([0.2, -0.1, 3.0, 1.0])
-    moved = np.append(1.35 * (move @ point)[:3], 1.0)
+    point, frame = np.array([[0.2, -0.1, 3.0]]), mean_pose_frame(W2C[[2, 0]])
+    moved = frame.move_points(point)[0]
     for view, viewmat in zip((2, 0), actual.viewmats, strict=True):
-        np.testing.assert_allclose((viewmat @ moved)[:3], 1.35 * (W2C[view] @ point)[:3], atol=1e-9)
+        seen = frame.scale * (W2C[view] @ np.append(point, 1.0))[:3]
+        np.testing.assert_allclose((viewmat @ np.append(moved, 1.0))[:3], seen, atol=1e-9)
+    assert np.abs(np.linalg.inv(actual.viewmats)[:, :3, 3]).max() == pytest.approx(1)
     assert actual.names == ("2.png", "0.png")
 
 
@@ -342,10 +340,7 @@ def test_what_is_wrong_is_named(tmp_path: Path, name: str, old: str, new: str, p
         ("input_frame_idx.txt", "0 7", ("0 to 2", 7)),
         ("input_frame_idx.txt", "nan", ("NaN",)),
         ("input_frame_idx.txt", "0 " * 10_001, (10000, "more")),
-        ("pos_avg_inv.txt", "0 " * 16, ("inverted",)),
-        ("pos_avg_inv.txt", "1 " * 15, (16, 15)),
-        ("scene_scale.txt", "0", ("positive",)),
-        ("scene_scale.txt", "inf", ("NaN",)),
+        ("input_frame_idx.txt", "1e999", ("infinity",)),
     ],
 )
 def test_files_beside_long_lrm_s_cameras_are_checked(
