@@ -51,6 +51,7 @@ PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply"
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # DepthSplat and its relatives write NAME.ply there, with the photos in images/NAME
 IMAGE_PLACES = (
+    "images_resized",  # what WorldMirror saw; tall photos in its images/ are squeezed
     "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
     "keyframes/images",
 )  # fmt: skip
