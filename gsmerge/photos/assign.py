@@ -50,7 +50,7 @@ class Candidates:
 
     read: Callable[[int], np.ndarray]  # [h,w,3] photo as it is stored, sRGB in [0, 1]; may be reduced to SIDE pixels
     count: int
-    tags: Sequence[int]  # orientation in each photo's EXIF tag, 0 to 7
+    tag: Callable[[int], int]  # photo -> orientation in its EXIF tag, 0 to 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +214,7 @@ class Assigner:
 
     def _stored_or_tagged(self, scores: _Scores, view: int, photo: int) -> int:
         """Return the orientation of a photo's tag if it scores clearly higher than the stored orientation, else 0."""
-        tag = self.candidates.tags[photo]
+        tag = self.candidates.tag(photo)
         stored, tagged = np.nan_to_num(scores.values[view, scores.photos.index(photo), [0, tag]], nan=-np.inf)
         return tag if tagged > stored + SIGNIFICANT else 0
 
@@ -242,7 +242,7 @@ class Assigner:
         """
         if not views or not photos:
             return {}
-        step, tags = -(-len(photos) // FIRST_PHOTOS), self.candidates.tags
+        step, tag = -(-len(photos) // FIRST_PHOTOS), self.candidates.tag
         compared = set(range(0, len(photos), step))  # indices into ``photos``
         while True:
             scores = self.score(photos[index] for index in sorted(compared))
@@ -257,7 +257,7 @@ class Assigner:
 
         def list_assignments(view: int) -> list[Assignment]:
             likely = [scores.photos[column] for column in columns[view] if np.isfinite(best[view, column])]
-            return [Assignment(photo, scores.choose_orientation(view, photo, tags[photo])) for photo in likely]
+            return [Assignment(photo, scores.choose_orientation(view, photo, tag(photo))) for photo in likely]
 
         return {view: list_assignments(view) for view in views}
 

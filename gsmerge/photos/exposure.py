@@ -5,11 +5,11 @@ several tones. Pixels of a view are looked up in other views that have Gaussians
 each channel is the ratio of the pair of views. The gains of all views follow from all pairs by least squares, with a
 geometric mean of one.
 
-Gains are removed under two conditions. The colours of the same surfaces have to come clearly nearer. And nothing may
-predict the gain of a new view, so that the mean of all gains is the best guess. The gain can be predicted in two cases,
-in which photos stay unchanged. First, a camera that meters light makes bright places darker, in new photos, too; then
-photos with larger gains are not brighter. Second, exposure may drift along a video; then neighbours have nearly the
-same gain. In both cases the mean would be farther from new photos, by 1.5 dB in a video of a kitchen.
+Gains are removed if nothing predicts the gain of a new view, so that the mean of all gains is the best guess. The gain
+can be predicted in two cases, in which photos stay unchanged. First, a camera that meters light makes bright places
+darker, in new photos, too; then photos with larger gains are not brighter. Second, exposure may drift along a video;
+then neighbours have nearly the same gain. In both cases the mean would be farther from new photos, by 1.5 dB in a video
+of a kitchen.
 """
 
 from __future__ import annotations
@@ -19,15 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.geometry.transforms import (
-    camera_distances,
-    correlation,
-    median,
-    medians,
-    order_others,
-    rgb_to_sh0,
-    sh0_to_rgb,
-)
+from gsmerge.geometry.transforms import camera_distances, correlation, medians, order_others, rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels.compare_views import find_surfaces
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import solve
@@ -41,13 +33,10 @@ from gsmerge.types import Cameras, PicturedScene, Scene
 SAMPLE_PIXELS = 2000  # pixels of a view that are looked up in the other views
 SAME_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LOW, HIGH = 0.05, 0.95  # colours in between are neither noise nor clipped
-MIN_PAIRS = 60  # least number of pixels that two views share; this many pixels of each pair are compared again
-# The following four bounds were chosen on the plain exports of 15 captures. Root mean square of the logarithmic gains:
+MIN_PAIRS = 60  # least number of pixels that two views share
+# The following three bounds were chosen on the plain exports of 15 captures. Root mean square of the logarithmic gains:
 # above the bound in nine of ten draws of random gains of 0.8 to 1.25 for five photos, and in six unchanged captures
 DIFFERENT = 0.06
-# Differences between colours of the same surfaces after the correction, as a share of those before: 0.12 to 0.60 with
-# random gains
-NEARER = 0.75
 # Slope of a photo's brightness over its gain, both as logarithms: 0.61 to 1.11 with random gains of 0.5 to 2, at most
 # 0.41 if a camera metered light and gains are 0.1 or more. If places differ in brightness by more than the gains, the
 # slope says little. So it counts only if gains and brightness are opposed, with a correlation of -0.67 to -0.99
@@ -69,7 +58,6 @@ class _Pair:
     view: int
     other: int
     ratios: np.ndarray  # [3], median of the logarithms
-    sample: np.ndarray  # [MIN_PAIRS,3], logarithms of single pixels
     count: int  # Number of pixels
 
 
@@ -84,8 +72,6 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
         return scene
     pairs = _measure_pairs(scene, views)
     gains = _solve_gains(pairs, len(scene))
-    if gains is None:
-        return scene
     factors = exp(gains).round(3)
     low, high = factors.min(), factors.max()
     if low == high:
@@ -94,7 +80,7 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
     if exposure == "auto":
         if root_mean_square(gains[list(views)]) < DIFFERENT:
             return scene
-        objection = _find_objection(scene, views, pairs, gains)
+        objection = _find_objection(scene, views, gains)
         if objection:
             remedy = "--set exposure=per-photo brings them to their mean exposure"
             note(f"{differ}; photos stay unchanged, because {objection}; {remedy}")
@@ -104,12 +90,10 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
     return _divide(scene, factors)
 
 
-def _find_objection(scene: PicturedScene, views: Sequence[int], pairs: Sequence[_Pair], gains: np.ndarray) -> str:
+def _find_objection(scene: PicturedScene, views: Sequence[int], gains: np.ndarray) -> str:
     """Return why photos should stay unchanged, or an empty text."""
     view_gains, photos = gains[list(views)], [scene.images[view][::COARSE, ::COARSE] for view in views]
     brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
-    if share_left(pairs, gains) > NEARER:
-        return "other exposures do not bring the colours of the same surfaces clearly nearer"
     if is_metered(brightness, view_gains):
         return "this looks like automatic exposure (photos with larger factors are not brighter)"
     if share_unexpected(view_gains, camera_distances(scene.cameras[list(views)])) < UNEXPECTED:
@@ -121,13 +105,6 @@ def root_mean_square(gains: np.ndarray) -> float:
     """Compute the root mean square of logarithmic gains ``[v,3]`` about their mean."""
     away = gains - gains.mean(0)
     return float(np.sqrt((away * away).mean()))
-
-
-def share_left(pairs: Sequence[_Pair], gains: np.ndarray) -> float:
-    """Return the share of the views' colour differences that remains after applying logarithmic gains ``[v,3]``."""
-    before = sum(median(np.abs(pair.sample)) for pair in pairs)
-    after = sum(median(np.abs(pair.sample - gains[pair.other] + gains[pair.view])) for pair in pairs)
-    return after / max(before, 1e-9)
 
 
 def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
@@ -201,7 +178,7 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
             clear = red & green & blue
             if clear.sum() >= MIN_PAIRS:
                 ratios = log(there[clear].astype(np.float64) / here[clear])
-                pairs.append(_Pair(view, other, medians(ratios), ratios[:MIN_PAIRS].copy(), len(ratios)))
+                pairs.append(_Pair(view, other, medians(ratios), len(ratios)))
         return pairs
 
     return [pair for pairs in parallel_map(measure, range(len(views))) for pair in pairs]
@@ -219,10 +196,8 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
     return np.sort(order, axis=1)
 
 
-def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:
-    """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; None without pairs."""
-    if not pairs:
-        return None
+def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
+    """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; all are zero without pairs."""
     matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
     for pair in pairs:
         ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, MAX_WEIGHTED_PIXELS))

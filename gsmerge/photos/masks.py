@@ -12,19 +12,10 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import find_image, match_masks
-from gsmerge.io.photo_files import (
-    Part,
-    Size,
-    cut_part,
-    decode_alpha,
-    decode_levels,
-    decode_small,
-    image_size,
-    same_shape,
-)
+from gsmerge.io.photo_files import Part, Size, cut_part, decode_alpha, decode_levels, image_size, same_shape
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import turn_picture
-from gsmerge.photos.offsets import SIDE
+from gsmerge.photos.photo_folders import is_grey
 from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
@@ -32,7 +23,6 @@ from gsmerge.types import PROTECTED, Cameras
 
 _MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
 _WHITE = np.uint8(255)
-_ROUNDING = 1 / 255  # mean difference of two pictures or channels that rounding to 8 bits may cause
 _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file count
 
 
@@ -42,10 +32,6 @@ class Masks:
 
     counts: np.ndarray | None = None  # [v,h,w] bool: whether a pixel counts; None: all pixels count
     importance: np.ndarray | None = None  # [v,h,w] float32: weight of a pixel in a fit; None: all weights are 1
-
-    def __getitem__(self, views: Sequence[int]) -> Masks:
-        """Return the masks of some views."""
-        return Masks(*(None if values is None else values[views] for values in (self.counts, self.importance)))
 
 
 NO_MASKS = Masks()
@@ -121,26 +107,26 @@ def read_masks(
 
     Masks that the cameras' file names come before those beside the scene. ``cut``: as in :class:`MaskFiles`.
     """
-    paths, names = photos.paths, list(camera_file.names)
-    if paths:
-        names = [path.as_posix() for path in paths if path is not None]
-    of_cameras, more = ([], []) if "masks" in files.named else _find_masks_of_cameras(camera_file)
-    masks, notes = ([None] * len(names), []) if any(of_cameras) else _match_masks(files, names)
-    notes += more
-    protecting: Sequence[Path | None] = [None] * len(names)
+    paths = photos.paths
+    views = [view for view in range(len(camera_file)) if not paths or paths[view] is not None]  # with a photo
+    names = [path.as_posix() for path in paths if path is not None] or list(camera_file.names)
+    of_cameras, notes = ([], []) if "masks" in files.named else _find_masks_of_cameras(camera_file)
+    if any(of_cameras):
+        found: Sequence[Path | None] = [of_cameras[view] for view in views]
+    else:
+        found, more = _match_masks(files, names)
+        notes += more
+    protecting: Sequence[Path | None] = [None] * len(views)
     if files.protect is not None:
         protecting, unused = match_masks(files.protect, names, "--protect")
         notes += unused
-    if paths:
-        index_of_photo = {path: i for i, path in enumerate(path for path in paths if path is not None)}
 
-        def spread(pictures: Sequence[Path | None]) -> list[Path | None]:
-            """Spread the pictures of existing photos over all views; None for a view without a photo."""
-            return [None if path is None else pictures[index_of_photo[path]] for path in paths]
+    def spread(pictures: Sequence[Path | None]) -> list[Path | None]:
+        """Spread the pictures of existing photos over all views; None for a view without a photo."""
+        of_views = dict(zip(views, pictures, strict=True))
+        return [of_views.get(view) for view in range(len(camera_file))]
 
-        masks, protecting = spread(masks), spread(protecting)
-    if any(of_cameras):
-        masks = [None if paths and paths[view] is None else mask for view, mask in enumerate(of_cameras)]
+    masks, protecting = spread(found), spread(protecting)
     turns = photos.turns or (0,) * len(masks)
     mask_files = MaskFiles(tuple(paths), turns, masks, protecting, photos.part, stored, cut, cameras)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
@@ -148,32 +134,17 @@ def read_masks(
     result = Masks(_stack(counts, True, shape), _stack(importance, np.float32(1), shape))
     if files.protect is not None:
         notes.append(_describe_protected(result.importance, protecting))
-    for option, pictures in (("masks", masks), ("protect", protecting)):
-        notes += _doubt_masks(option, pictures, paths)
-    return result, notes
+    return result, [*notes, *_doubt_masks("masks", masks), *_doubt_masks("protect", protecting)]
 
 
-def _doubt_masks(option: str, masks: Sequence[Path | None], photos: Sequence[Path | None]) -> list[str]:
-    """Note masks that seem to be photos, because they have colours or show the same as their photos."""
-
-    def is_photo(view: int) -> bool:
-        mask = masks[view]
-        if mask is None:
-            return False
-        picture = decode_small(mask, SIDE)
-        if np.ptp(picture, axis=-1).mean() > _ROUNDING:
-            return True
-        photo = photos[view] if photos else None
-        shown = None if photo is None else decode_small(photo, SIDE)
-        return shown is not None and shown.shape == picture.shape and bool(np.abs(shown - picture).mean() <= _ROUNDING)
-
-    answers = parallel_map(is_photo, range(len(masks)))
-    doubtful = [mask.name for mask, answer in zip(masks, answers, strict=True) if mask is not None and answer]
+def _doubt_masks(option: str, masks: Sequence[Path | None]) -> list[str]:
+    """Note masks that seem to be photos, because they have colours."""
+    known = [mask for mask in masks if mask is not None]
+    doubtful = [mask.name for mask, is_mask in zip(known, parallel_map(is_grey, known), strict=True) if not is_mask]
     if not doubtful:
         return []
     expected = "white where a photo is protected" if option == "protect" else "dark where photos do not count"
-    count = sum(mask is not None for mask in masks)
-    problem = f"{len(doubtful)} of {count} pictures look like photos, {list_some(doubtful)}"
+    problem = f"{len(doubtful)} of {len(known)} pictures look like photos, {list_some(doubtful)}"
     return [f"{option}: {problem}; expected grey pictures, {expected}"]
 
 
@@ -193,11 +164,9 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
     photos = f"{count} photo{'' if count == 1 else 's'} of {len(masks)}"
     if importance is None or max_weight <= 1:
         return f"protect: the pictures of {photos} have no white pixel, so no pixel gets a higher weight"
-    has_white = max_weight >= PROTECTED / 2
-    threshold = PROTECTED / 2 if has_white else (1 + max_weight) / 2
-    share = 100 * float((importance >= threshold).mean())
-    weight = f"{PROTECTED:g}" if has_white else f"at most {max_weight:.2g}"
-    return f"protect: {share:.1f} % of the photos' pixels have a weight of {weight}, by the pictures of {photos}"
+    share = 100 * float((importance >= (1 + max_weight) / 2).mean())
+    weight = f"a weight of {max_weight:.2g}"
+    return f"protect: {share:.1f} % of the photos' pixels have {weight}, by the pictures of {photos}"
 
 
 def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], list[str]]:

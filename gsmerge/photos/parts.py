@@ -50,7 +50,7 @@ def choose_part(
     views, photos = zip(*(named[i] for i in pick_views(len(named), _COMPARED)), strict=True) if named else ((), ())
     sizes = [image_size(proposal.pool[photo]) for photo in photos]
     shapes_differ = not all(same_shape(size, sizes[0]) for size in sizes)
-    if not photos or shapes_differ or any(proposal.tags[photo] for photo in photos):
+    if not photos or shapes_differ or any(map(proposal.tag, photos)):
         return None
 
     def read(photo: int) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +73,7 @@ def choose_part(
     fit = choose_fit(show_views(scene, SIDE)[views], pictures, fits)
     if isinstance(fit, GridFit) or fit == WHOLE_FIT:
         return None
-    candidates = Candidates(lambda photo: fit.cut(pictures[photo]), len(photos), [0] * len(photos))
+    candidates = Candidates(lambda photo: fit.cut(pictures[photo]), len(photos), lambda _: 0)
     assigner = Assigner(lambda side: show_views(scene, side)[views], candidates)
     is_right = assigner.explain_most([Assignment(photo, 0) for photo in range(len(photos))])
     note = fit.describe(sizes[0], bars=fit.part == inner != WHOLE)

@@ -50,14 +50,12 @@ def find_named_photos(
 
     def rank(folder: Path) -> tuple[Any, ...]:
         found = propose_images(folder, list(pools[folder]), camera_file.names, count_pixels)
-        first, is_grey = next(filter(count_pixels, filter(None, found)), None), False
+        first = next(filter(count_pixels, filter(None, found)), None)
         if first is None:
             return 0, folder
         own, size = sizes[found.index(first)], image_size(first)
-        with suppress(SceneError):
-            is_grey = bool(np.ptp(decode_small(first, SIDE), axis=-1).mean() <= _ROUNDING)
         count, num_exact = len({*found} - {None}), sum(path.name in endings for path in filter(None, found))
-        look = is_grey, size != own, min(own) > 1 and not same_shape(own, size), -count_pixels(first)
+        look = is_grey(first), size != own, min(own) > 1 and not same_shape(own, size), -count_pixels(first)
         nested = len(pools[folder]), -len(folder.parts), folder  # the folder itself rather than one above it
         return -count, -num_exact, not folder.is_relative_to(roots[0]), *look, *nested
 
@@ -66,6 +64,13 @@ def find_named_photos(
         return None
     pool = list(dict.fromkeys(path for folder in best for path in pools[folder]))
     return best[0], pool, propose_images(best[0], list(pools[best[0]]), camera_file.names, count_pixels)
+
+
+def is_grey(path: Path) -> bool:
+    """Return whether an image file has no colours, as masks and depths; False where it cannot be read."""
+    with suppress(SceneError):
+        return bool(np.ptp(decode_small(path, SIDE), axis=-1).mean() <= _ROUNDING)
+    return False
 
 
 def count_pixels(path: Path) -> int:

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path, PurePath
-from typing import Any
 
 import numpy as np
 
@@ -40,7 +39,7 @@ from gsmerge.io.photo_files import (
     same_shape,
 )
 from gsmerge.io.scene_files import SceneFiles
-from gsmerge.kernels.pictures import is_mirrored, turn_picture
+from gsmerge.kernels.pictures import turn_picture
 from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
 from gsmerge.photos.colors import cut_blocks
 from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
@@ -54,7 +53,6 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
 UNNAMED = "view 0"  # name of the first camera if the format, or rows without cameras, have no names
-SEEN_PLACE = "images_resized"  # WorldMirror writes its input photos there; tall photos in "images" are squeezed
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +93,14 @@ class Proposal:
     fit: PartFit = WHOLE_FIT  # what is used of each photo
     notes: tuple[str, ...] = ()  # on what is used of the photos
 
-    @cached_property
-    def tags(self) -> Sequence[int]:
-        """For each file of the pool, the turn by its orientation tag."""
-        return _Tags(self.pool)
+    def tag(self, photo: int) -> int:
+        """Read the turn of a file of the pool by its orientation tag."""
+        return orientation_turn(self.pool[photo])
+
+    @property
+    def paths(self) -> list[Path | None]:
+        """The proposed file of each camera."""
+        return [None if photo is None else self.pool[photo] for photo in self.named]
 
     @property
     def choice(self) -> list[Assignment | None]:
@@ -109,16 +111,37 @@ class Proposal:
         """Return a copy with faults for ``cameras`` whose views have no Gaussians, and so no photos."""
         faults = list(self.faults)
         for camera in cameras:
-            photo = self.named[camera]
-            which = f"view {camera}" if photo is None else _inside(self.pool[photo], self)
+            path = self.paths[camera]
+            which = f"view {camera}" if path is None else _inside(path, self)
             faults[camera] = f"{which}: its camera is unknown, since no Gaussian belongs to it"
         return replace(self, faults=tuple(faults))
 
+    def without_files(self, faults: Mapping[Path, str]) -> Proposal:
+        """Return a copy without some files; why each of them cannot be used becomes a fault of its cameras."""
+        pool = tuple(path for path in self.pool if path not in faults)
+        ids = {path: number for number, path in enumerate(pool)}
+        of_cameras = (
+            fault if path not in faults or path is None else f"{_inside(path, self)}: {faults[path]}"
+            for path, fault in zip(self.paths, self.faults, strict=True)
+        )
+        named = (None if path is None else ids.get(path) for path in self.paths)
+        return replace(self, pool=pool, named=tuple(named), faults=tuple(of_cameras))
+
+    def without_unreadable(self, *, decode: bool) -> Proposal:
+        """Return a copy without the proposed files whose headers, or with ``decode`` whose pixels, cannot be read."""
+        paths = [path for path in dict.fromkeys(self.paths) if path is not None]
+        faults = parallel_map(lambda path: _find_fault(path, decode=decode), paths)
+        return self.without_files({path: fault for path, fault in zip(paths, faults, strict=True) if fault})
+
     def without_broken(self) -> Proposal | None:
         """Return a copy without the proposed files that cannot be decoded; None if all or none can be decoded."""
-        named = [None if photo is None else self.pool[photo] for photo in self.named]
-        sound = _drop_unreadable(replace(self, named=()), named, decode=True)
+        sound = self.without_unreadable(decode=True)
         return None if len(sound.pool) == len(self.pool) or not any(sound.choice) else sound
+
+    def select_views(self, cameras: Sequence[int]) -> Proposal:
+        """Return a copy for some ``cameras``."""
+        named = tuple(self.named[camera] for camera in cameras)
+        return replace(self, named=named, faults=tuple(self.faults[camera] for camera in cameras))
 
 
 def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | None:
@@ -148,7 +171,9 @@ def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | Non
         _describe_missing(folder, name) if exact and path is None else None
         for name, path in zip(names, named, strict=True)
     )
-    return _drop_unreadable(Proposal(folder, tuple(pool), (), exact, faults, found is not None), named)
+    ids = {path: number for number, path in enumerate(pool)}
+    photos = tuple(None if path is None else ids.get(path) for path in named)
+    return Proposal(folder, tuple(pool), photos, exact, faults, found is not None).without_unreadable(decode=False)
 
 
 def _find_near_cameras(files: SceneFiles, camera_file: CameraFile) -> tuple[Path, list[Path], list[Path | None]]:
@@ -162,7 +187,9 @@ def _find_near_cameras(files: SceneFiles, camera_file: CameraFile) -> tuple[Path
     pool = list(dict.fromkeys(path for path in named if path is not None))
     is_nameless = all(name.removeprefix("view ").isdecimal() for name in names)
     if not pool and is_nameless:
-        folder, pool = files.ply.parent, images_beside(files.ply)  # AnySplat writes its Gaussians among the photos
+        folder = files.ply.parent  # AnySplat writes its Gaussians among the photos
+        beside = (path for path in folder.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
+        pool = natural_order(path for path in beside if path.is_file())
     return folder, pool, named
 
 
@@ -179,25 +206,6 @@ def _describe_missing(folder: Path, name: str) -> str:
     return f"{shown}: no such file, and the format of {min(unread)} is not read; {CONVERT}"
 
 
-def _drop_unreadable(proposal: Proposal, named: Sequence[Path | None], *, decode: bool = False) -> Proposal:
-    """Return a proposal of the ``named`` file of each camera, without unreadable files.
-
-    Their headers are read, and with ``decode`` also their pixels. An unreadable file leaves the pool, and becomes a
-    fault of its cameras.
-    """
-    paths = list(dict.fromkeys(path for path in named if path is not None))
-    faults = parallel_map(lambda path: _find_fault(path, decode=decode), paths)
-    broken = {path: fault for path, fault in zip(paths, faults, strict=True) if fault is not None}
-    camera_faults = tuple(
-        f"{_inside(path, proposal)}: {broken[path]}" if path in broken and path is not None else before
-        for path, before in zip(named, proposal.faults or [None] * len(named), strict=True)
-    )
-    pool = tuple(path for path in proposal.pool if path not in broken)
-    ids = {path: number for number, path in enumerate(pool)}
-    photos = tuple(None if path is None else ids.get(path) for path in named)
-    return replace(proposal, pool=pool, named=photos, faults=camera_faults)
-
-
 def _find_fault(path: Path, *, decode: bool = False) -> str | None:
     """Return why the header of an image file, or with ``decode`` its pixels, cannot be read; None if they can."""
     try:
@@ -207,12 +215,6 @@ def _find_fault(path: Path, *, decode: bool = False) -> str | None:
     except SceneError as error:
         return f"{error.problem}; {CONVERT}" if error.remedy == CONVERT else error.problem
     return None
-
-
-def images_beside(ply: Path) -> list[Path]:
-    """List the images directly in the folder of a ``.ply``, in the order of :func:`list_images`."""
-    named = (path for path in ply.parent.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
-    return natural_order(path for path in named if path.is_file())
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
@@ -274,55 +276,32 @@ def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[Camer
     Returns the cameras and the photos of all other views, and a note on the views that are left out. None if that is
     not possible, because there are no photos, all have one aspect ratio, or a single view would remain.
     """
-    paths = [None if photo is None else proposal.pool[photo] for photo in proposal.named]
-    if not any(paths):
+    paths = proposal.paths
+    sizes = {path: image_size(path) for path in paths if path is not None}
+    if not sizes:
         return None
-    camera_sizes = list(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True))
-    sizes = [size if path is None else image_size(path) for path, size in zip(paths, camera_sizes, strict=True)]
-    photo_sizes = Counter(size for size, path in zip(sizes, paths, strict=True) if path is not None)
-    (width, height), _ = photo_sizes.most_common(1)[0]
-    # a size of 1 pixel means that the size is unknown
-    has_shape = [min(size) <= 1 or same_shape(size, (width, height)) for size in sizes]
-    camera_fits = [min(size) > 1 and same_shape(size, (width, height)) for size in camera_sizes]
-    used = [view for view in range(len(sizes)) if has_shape[view] or camera_fits[view]]
-    unused = [view for view in range(len(sizes)) if view not in used]
-    if all(has_shape) or len(used) == 1:
-        return None
+    (width, height), _ = Counter(sizes[path] for path in paths if path is not None).most_common(1)[0]
     shape = f"the aspect ratio of {width} x {height}"
-    names = list_some([f"{camera_file.names[view]} ({sizes[view][0]} x {sizes[view][1]})" for view in unused])
-    note = f"{len(unused)} of {len(sizes)} views are left out, since they do not have {shape}: {names}"
-    other_paths = {path for path, fits in zip(paths, has_shape, strict=True) if not fits}
-    faults = [
-        proposal.faults[view]
-        if has_shape[view]
-        else f"{camera_file.names[view]}: {sizes[view][0]} x {sizes[view][1]}, not {shape}"
-        for view in used
+    others = {path: "{} x {}".format(*size) for path, size in sizes.items() if not same_shape(size, (width, height))}
+    camera_sizes = list(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True))
+    # a size of 1 pixel means that the size is unknown, and is that of the photo
+    used = [
+        view
+        for view, (path, size) in enumerate(zip(paths, camera_sizes, strict=True))
+        if (same_shape(size, (width, height)) if min(size) > 1 else path not in others)
     ]
-    pool = tuple(path for path in proposal.pool if path not in other_paths)
-    fewer = replace(proposal, pool=pool, named=(), faults=tuple(faults))
-    named = [paths[view] if has_shape[view] else None for view in used]
-    return select_views(camera_file, used), _drop_unreadable(fewer, named), [note] if unused else []
+    if len(used) < 2 or (len(used) == len(paths) and not others):
+        return None
+    unused = [camera_file.names[view] for view in range(len(paths)) if view not in used]
+    note = f"{len(unused)} of {len(paths)} views are left out, since they do not have {shape}: {list_some(unused)}"
+    fewer = proposal.without_files({path: f"{size}, not {shape}" for path, size in others.items()})
+    return select_views(camera_file, used), fewer.select_views(used), [note] if unused else []
 
 
 def _turned_size(path: Path, turn: int) -> Size:
     """Read the size of a photo after a turn."""
     width, height = image_size(path)
     return (height, width) if turn % 2 else (width, height)
-
-
-class _Tags(Sequence[int]):
-    """The turns by the orientation tags of files; a tag is read once, when it is asked for."""
-
-    def __init__(self, paths: Sequence[Path]) -> None:
-        self._paths, self._turns = paths, dict[int, int]()
-
-    def __len__(self) -> int:
-        return len(self._paths)
-
-    def __getitem__(self, photo: Any) -> Any:
-        if photo not in self._turns:
-            self._turns[photo] = orientation_turn(self._paths[photo])
-        return self._turns[photo]
 
 
 def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
@@ -336,49 +315,33 @@ def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
         small = proposal.fit.cut(small)
         return small if fit is None else fit.cut(small)
 
-    return Candidates(read, len(proposal.pool), proposal.tags)
+    return Candidates(read, len(proposal.pool), proposal.tag)
 
 
 def assign_to_views(
-    scene: Scene,
-    cameras: Sequence[int],
-    proposal: Proposal,
-    *,
-    read: bool,
-    guessed: Sequence[int] = (),
-    fit: GridFit | None = None,
+    scene: Scene, proposal: Proposal, *, read: bool, guessed: Sequence[int] = (), fit: GridFit | None = None
 ) -> tuple[list[Assignment | None], bool]:
-    """Assign files to the views of a scene, each with its camera; see :func:`gsmerge.photos.assign.assign_photos`.
+    """Assign files to the views of a scene; see :func:`gsmerge.photos.assign.assign_photos`.
 
     Args:
         scene: The scene; its photos are those that names propose if ``read``.
-        cameras: The camera of each view. Cameras without a view keep their proposed file.
         proposal: The files.
         read: The scene has the proposed photos. Otherwise files are read small.
-        guessed: Cameras that get no photo.
+        guessed: Views that get no photo.
         fit: How files are resized and cropped to the pixels of a grid.
 
     Returns:
-        The file of each camera with its turn, None without a photo; and whether the proposed photos explain most views.
+        The file of each view with its turn, None without a photo; and whether the proposed photos explain most views.
     """
-    views = [list(cameras).index(camera) for camera in dict.fromkeys(cameras)]  # layers of a camera have one photo
-    named = [proposal.named[cameras[view]] for view in views]
     stored, images = _list_candidates(proposal, fit), scene.images
     candidates = stored
     if read and images is not None:
-        view_of_photo = {photo: view for view, photo in zip(views, named, strict=True) if photo is not None}
+        view_of_photo = {photo: view for view, photo in enumerate(proposal.named) if photo is not None}
         candidates = replace(stored, read=lambda photo: images[view_of_photo[photo]])
-
     masks = None if scene.masks is None else scene.masks | ~scene.masks.any((1, 2), keepdims=True)
-
-    def show(side: int) -> ViewPictures:
-        return show_views(replace(scene, masks=masks), side)[views]
-
-    assigned, are_alike = assign_photos(show, candidates, named, exact=proposal.exact, stored=stored)
-    chosen = proposal.choice
-    for view, assignment in zip(views, assigned, strict=True):
-        chosen[cameras[view]] = assignment
-    return [None if camera in guessed else assignment for camera, assignment in enumerate(chosen)], are_alike
+    show = partial(show_views, replace(scene, masks=masks))
+    chosen, are_alike = assign_photos(show, candidates, proposal.named, exact=proposal.exact, stored=stored)
+    return [None if view in guessed else assignment for view, assignment in enumerate(chosen)], are_alike
 
 
 def list_guessed(scene: Scene, camera_file: CameraFile) -> list[int]:
@@ -402,31 +365,23 @@ def fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
 
 
 def has_other_shape(proposal: Proposal, camera_file: CameraFile) -> bool:
-    """Return whether the proposed photos have another aspect ratio than all cameras of a file, and no known crop."""
+    """Return whether proposed photos have another aspect ratio than all cameras, also if turned, and no known crop."""
     photo, shapes = next((photo for photo in proposal.named if photo is not None), None), sizes_of(camera_file)
     if photo is None or not shapes or camera_file.photo_map is not None or camera_file.source in (FFGS, SHARP):
         return False
     size = proposal.fit.stretch(part_size(image_size(proposal.pool[photo]), proposal.fit.part))
-    return not any(same_shape(shape, size) for shape in shapes)
+    return not any(same_shape(shape, turned) for shape in shapes for turned in (size, size[::-1]))
 
 
-def shows_better(scene: Scene, other: Scene, *, colors: bool = False) -> bool:
-    """Return whether the photos of ``scene`` match its Gaussians better than the photos of ``other`` match its own.
+def has_nearer_colors(scene: Scene, other: Scene) -> bool:
+    """Return whether the colours of a scene are nearer to its photos than those of ``other`` with the same photos."""
 
-    With ``colors``, the colours themselves are compared; otherwise their local contrast.
-    """
-    if len(scene) != len(other):
-        return False
-    scores = list[np.ndarray]()
-    for scored in (scene, other):
-        shown, images = show_views(scored, SIDE), scored.images
-        assert images is not None
-        if colors:
-            photos = shrink_pictures(images, *shown.weights.shape[2:0:-1])
-            scores.append(-cut_blocks(Pairs(photos, shown)).errors())
-        else:
-            scores.append(np.concatenate([correlate_parts(shown, view, images[view]) for view in range(len(scored))]))
-    return stands_out(scores[0] - scores[1])
+    def measure(images: np.ndarray, shown: ViewPictures) -> np.ndarray:
+        return cut_blocks(Pairs(shrink_pictures(images, *shown.weights.shape[2:0:-1]), shown)).errors()
+
+    images = scene.images
+    assert images is not None
+    return stands_out(measure(images, show_views(other, SIDE)) - measure(images, show_views(scene, SIDE)))
 
 
 def name_by_photos(
@@ -461,15 +416,14 @@ def describe_assignment(
     folders = dict.fromkeys(str(proposal.pool[assignment.photo].parent) for assignment in chosen if assignment)
     text = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
     count, notes = len(chosen), [text] if proposal.by_names else []
-    changes: dict[str, list[str]] = {"turned": [], "mirrored": []}
-    for assignment in chosen:
-        if assignment is not None and assignment.orientation != (tag := proposal.tags[assignment.photo]):
-            kind = "turned" if is_mirrored(assignment.orientation) == is_mirrored(tag) else "mirrored"
-            changes[kind].append(_inside(proposal.pool[assignment.photo], proposal))
-    for kind, files in changes.items():
-        if files:
-            names = list_some(files)
-            notes.append(f"{len(files)} of {count} photos are {kind} relative to their orientation tags: {names}")
+    turned = [
+        _inside(proposal.pool[assignment.photo], proposal)
+        for assignment in chosen
+        if assignment is not None and assignment.orientation != proposal.tag(assignment.photo)
+    ]
+    if turned:
+        text = f"{len(turned)} of {count} photos are turned or mirrored relative to their orientation tags"
+        notes.append(f"{text}: {list_some(turned)}")
     moved = [
         f"photo {_inside(proposal.pool[assignment.photo], proposal)} for view {camera_file.names[view]}"
         for view, assignment in enumerate(chosen)
@@ -488,13 +442,10 @@ def describe_assignment(
 
 def _explain(proposal: Proposal, view: int, name: str) -> str:
     """Say why a camera has no photo."""
-    fault = proposal.faults[view]
-    if fault is not None:
-        return fault
-    photo = proposal.named[view]
-    if photo is None:
-        return f"{name}: no photo shows this view"
-    return f"{_inside(proposal.pool[photo], proposal)}: shows something else than its camera"
+    path = proposal.paths[view]
+    if path is None:
+        return proposal.faults[view] or f"{name}: no photo shows this view"
+    return proposal.faults[view] or f"{_inside(path, proposal)}: shows something else than its camera"
 
 
 def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, are_pixels: bool) -> list[str]:
@@ -508,17 +459,19 @@ def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, 
     spare = [path for path in proposal.pool if path.parent in folders and path.stem not in stems]
     if not spare or (are_pixels and (not proposal.exact or len(spare) >= len(used))):
         return []
-    which = list_some([_inside(path, proposal) for path in spare])
     count = f"{len(spare)} of {len(spare) + len(used)} photos {'has' if len(spare) == 1 else 'have'} no camera"
-    return [f"{count} and {'is' if len(spare) == 1 else 'are'} not used: {which}"]
+    names = list_some([_inside(path, proposal) for path in spare])
+    return [f"{count} and {'is' if len(spare) == 1 else 'are'} not used: {names}"]
 
 
-def describe_missing(names: Sequence[str], stored: CameraFile, *, is_right: bool) -> str | None:
+def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | None, *, is_right: bool) -> str | None:
     """Note which views of a grid have no camera in the file ``stored``; None if it may be of another scene.
 
     ``names`` of the views are those of their photos, where photos show them. ``is_right``: the cameras see the
     Gaussians; otherwise only photos with their names show that they belong to the scene.
     """
+    if not isinstance(stored, CameraFile):
+        return None
     known, count = {PurePath(name).stem for name in stored.names}, len(names) - len(stored)
     lacking = [name for name in names if PurePath(name).stem not in known]
     are_named = len(lacking) == count > 0
@@ -529,27 +482,8 @@ def describe_missing(names: Sequence[str], stored: CameraFile, *, is_right: bool
     return f"{text}: the poses and focal length of all views are estimated from the Gaussians' own grid"
 
 
-def describe_unused(proposal: Proposal, camera_file: CameraFile) -> str:
-    """Note that none of the photos is used, and why."""
-    verb = "not used" if camera_file.source == ESTIMATED else "left out"
-    return f"the photos in {proposal.folder} are {verb}: {_describe_mismatch(proposal, camera_file)}"
-
-
-def refuse_photos(
-    files: SceneFiles, proposal: Proposal, camera_file: CameraFile, cause: SceneError | None
-) -> SceneError | None:
-    """Return the error that no photo shows any view; None if the photos may be left out.
-
-    ``cause``: why photos and cameras do not fit. The files that the caller named are at fault, not those beside them.
-    """
-    is_of_cameras = cause is not None and cause.path == camera_file.path and "cameras" not in files.named
-    if "images" not in files.named or not (cause is None or is_of_cameras):
-        return cause
-    return SceneError(proposal.folder, _describe_mismatch(proposal, camera_file), "name their folder with --images")
-
-
-def _describe_mismatch(proposal: Proposal, camera_file: CameraFile) -> str:
-    """Say that no photo shows any view, and which photos are missing."""
+def explain_mismatch(proposal: Proposal, camera_file: CameraFile) -> SceneError:
+    """Return the error that no photo shows any view, with the photos that are missing."""
     views = f"the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
     found = "none that shows one of them"
     if has_other_shape(proposal, camera_file) and camera_file.source != ESTIMATED:
@@ -558,7 +492,8 @@ def _describe_mismatch(proposal: Proposal, camera_file: CameraFile) -> str:
         found = f"{width} x {height}{shape}, of which no part shows one of them"
     faults = [fault for fault in proposal.faults if fault is not None]
     reasons = f" ({list_some(faults, '; ')})" if faults else ""
-    return f"expected photos of {views}, found {found}{reasons}"
+    problem = f"expected photos of {views}, found {found}{reasons}"
+    return SceneError(proposal.folder, problem, "name their folder with --images")
 
 
 def without_photo(scene: Scene, views: Sequence[int]) -> Scene:

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import SCENE_SUFFIXES, CameraFile, read_cameras
+from gsmerge.io import SCENE_SUFFIXES, read_cameras
 from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.dataparser import DATAPARSER
 from gsmerge.io.cameras.foreign import INTRINSICS
 from gsmerge.io.cameras.long_lrm import FRAMES_FILE
-from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
-from gsmerge.photos.photo_folders import capture_folder, find_named_photos
-from gsmerge.photos.scene_photos import images_beside
+from gsmerge.io.scene_files import SceneFiles
+from gsmerge.photos.scene_photos import propose_photos
 
 EXTRA_FILES = (DATAPARSER, INTRINSICS, FRAMES_FILE)  # read with some camera files
 
@@ -48,28 +47,20 @@ def list_files(files: SceneFiles) -> list[Path]:
         root = cameras if cameras.is_dir() else cameras.parent
         folders = (root, cameras.parent, files.ply.parent)
         paths += [folder / name for folder in folders for name in EXTRA_FILES if (folder / name).exists()]
-        paths += list_photos(cameras) or ([] if files.images else images_beside(files.ply))
+        paths += list_photos(files, cameras)
     return list(dict.fromkeys(paths))
 
 
-def list_photos(cameras: Path) -> list[Path]:
-    """List the photos of a camera file: the files that it names, or image folders, or files by its names; and masks."""
-    camera_file = try_cameras(cameras)
-    root = cameras if cameras.is_dir() else cameras.parent
-    names = () if camera_file is None else camera_file.names
-    named = [root / name for name in names if (root / name).is_file()]
-    found = None if named or camera_file is None else find_named_photos([capture_folder(cameras)], camera_file, 0)
-    folders = [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
-    masks = () if camera_file is None else camera_file.masks.values()
-    return [*(named or folders or (found or ([], []))[1]), *(root / name for name in masks if (root / name).is_file())]
-
-
-def try_cameras(path: Path) -> CameraFile | None:
-    """Read the cameras of a file; None if that fails, since the reader of the scene reports the reason."""
+def list_photos(files: SceneFiles, cameras: Path) -> list[Path]:
+    """List the photos that may show the views of some cameras, and the masks that the cameras' file names."""
     try:
-        return read_cameras(path)
-    except SceneError:
-        return None
+        camera_file = read_cameras(cameras)
+        proposal = propose_photos(files, camera_file)
+    except SceneError:  # the reader of the scene reports it
+        return []
+    root = cameras if cameras.is_dir() else cameras.parent
+    masks = [root / name for name in camera_file.masks.values() if (root / name).is_file()]
+    return [*(() if proposal is None else proposal.pool), *masks]
 
 
 def scene_name(scene: Path) -> str:

@@ -13,7 +13,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.image_names import find_image
 from gsmerge.io.photo_files import as_floats, photo_size
-from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
+from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.elementary import arccos
 from gsmerge.photos.scene_photos import stored_photos
 from gsmerge.scene.exporters import NO_HINTS
@@ -86,26 +86,19 @@ def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int
     candidates = [stored]
     if cameras is not None and cameras.source == stored.source and cameras.convention != stored.convention:
         candidates.insert(0, with_convention(stored, cameras.convention))  # in which the scene's own cameras fit
-    worlds = []
-    for candidate in candidates:
-        world, shared = _find_world(candidate, _shared_views(candidate, load.scene.names), load)
-        worlds.append((candidate, world, shared))
+    worlds = [(candidate, *_find_world(candidate, load)) for candidate in candidates]
     camera_file, world, shared = next((entry for entry in worlds if entry[2]), worlds[0])
     return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
 
 
 def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
-    """Find the folder of the photos: the named one, or a folder beside cameras that name no files."""
+    """Return the folder of the photos that was named, or the file with photos inside; None: search for their names."""
     if images is not None:
         if not Path(images).is_dir():
             actual = "a file" if Path(images).exists() else "no such folder"
             raise SceneError(images, f"expected a folder of photos, found {actual}", f"name it with {_OPTION}")
         return Path(images)
-    if len(cameras.images):
-        return path
-    root = path if path.is_dir() else path.parent
-    names_files = any((root / name).is_file() for name in cameras.names)
-    return None if names_files else next((root / place for place in IMAGE_PLACES if (root / place).is_dir()), None)
+    return path if len(cameras.images) else None
 
 
 def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
@@ -119,13 +112,12 @@ def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, 
     return {places[stem]: view for stem, view in views.items() if stem in places}
 
 
-def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) -> tuple[Similarity, dict[int, int]]:
+def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict[int, int]]:
     """Find the similarity from the file's world to the world of the Gaussians, and the views that the scene also has.
 
-    ``named`` maps indices in the file to views of the scene with the same name. The result is this map, or empty if the
-    poses of these views differ.
+    The result maps indices in the file to views of the scene with the same name; it is empty if their poses differ.
     """
-    stored = _similarity_from_stored(load)
+    stored, named = _similarity_from_stored(load), _shared_views(camera_file, load.scene.names)
     if not named:
         return stored, {}
     theirs = camera_file.viewmats[list(named)]
@@ -138,7 +130,7 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) ->
         spread = float(np.linalg.norm(np.ptp(centres, axis=0), axis=0)) or 1.0
         angle = np.degrees(arccos(cosines.clip(-1, 1))).max()
         if angle <= _MAX_ANGLE and distance / spread <= _MAX_SHIFT:
-            return frame, dict(named)
+            return frame, named
     return stored, {}
 
 

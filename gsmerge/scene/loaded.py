@@ -36,6 +36,7 @@ class Loaded:
     moves: Sequence[dict[str, Any]] = ()
     joined: Sequence[dict[str, Any]] = ()  # where each of several joined scenes lies; empty for one scene
     left_out: str | None = None  # the note on files beside the scene that do not belong to it
+    photos_explain: bool = False  # whether the photos that names propose explain what most views show
     own_views: int = 0  # views of the grid that rows without pixels here form by themselves; 0 if they form none
 
     def pixel_scene(self) -> Scene:

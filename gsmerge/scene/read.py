@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from gsmerge.cameras import ESTIMATED, NO_CAMERAS_USED, AlignmentResult, align, check_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import move_views
@@ -19,31 +17,29 @@ from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import GaussianFile, file_notes, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
-from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
+from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
 from gsmerge.photos.assign import Assignment
 from gsmerge.photos.grid_fit import WHOLE_FIT
 from gsmerge.photos.masks import NO_MASKS, Masks, check_masks
 from gsmerge.photos.parts import choose_part, has_bars
 from gsmerge.photos.scene_photos import (
-    SEEN_PLACE,
     UNNAMED,
     Proposal,
     ScenePhotos,
     assign_to_views,
     describe_assignment,
     describe_missing,
-    describe_unused,
+    explain_mismatch,
     fit_to_grid,
+    has_nearer_colors,
     has_other_shape,
     list_guessed,
     name_by_photos,
     photos_inside,
     propose_photos,
     read_photos,
-    refuse_photos,
     select_one_shape,
-    shows_better,
     stored_photos,
     without_photo,
 )
@@ -195,9 +191,7 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
         lacks_named = "images" in files.named and files.images is not None
         if isinstance(alone, Loaded) and not (lacks_named and alone.scene.images is None):
             stored = _answer(partial(read_scene_cameras, ply, files))
-            text = None
-            if isinstance(stored, CameraFile):
-                text = describe_missing(alone.scene.names, stored, is_right=lacks_views)
+            text = describe_missing(alone.scene.names, stored, is_right=lacks_views)
             if text is not None:
                 return replace(alone, notes=(text, *(n for n in alone.notes if not n.startswith(NO_CAMERAS_USED))))
             if isinstance(answer, SceneError):
@@ -212,47 +206,40 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
 
 
 def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Read the views of the first cameras that fit, or fit best, with a note if there are others; or return why not."""
-    best: tuple[float, Loaded | SceneError, Path | None] | None = None
+    """Read the views of the first cameras that fit for certain, or else of the first that can be read; or why of none.
+
+    A note says which cameras are read if there are others.
+    """
+    loads, errors = list[Loaded](), list[SceneError]()
     for choice in files.choices:
         answer = _read_views(ply, choice, hints, photos=photos)
-        rank = _rank_cameras(ply, answer, files)
-        best = (rank, answer, choice.cameras) if best is None or rank > best[0] else best
-        if rank >= 1:
-            break
-    assert best is not None
-    rank, answer, cameras = best
-    if isinstance(answer, SceneError) or (rank < 0 and cameras == files.cameras):
-        return answer
-    return replace(answer, notes=(*files.describe_choice(cameras), *answer.notes))
+        if isinstance(answer, SceneError):
+            errors.append(answer)
+            continue
+        noted = replace(answer, notes=(*files.describe_choice(choice.cameras), *answer.notes))
+        if _fit_for_certain(answer, files):
+            return noted
+        loads.append(answer if choice.cameras == files.cameras else noted)
+    return loads[0] if loads else errors[0]
 
 
-def _rank_cameras(ply: GaussianFile, answer: Loaded | SceneError, files: SceneFiles) -> float:
-    """Rank how well cameras fit: from 0 if photos show it, from 1 beyond doubt; below 0 if nothing shows it.
+def _fit_for_certain(load: Loaded, files: SceneFiles) -> bool:
+    """Return whether cameras fit for certain: rows are their pixels, or the photos explain their views.
 
-    Beyond doubt are pixels, and cameras that fit as they are stored, with colours nearer to those of the photos than to
-    those of random pixels. Cameras in a folder below the scene's are of no use if no photo shows that they fit.
+    Without photos, cameras beside the scene are believed, and those in folders below it are not.
     """
-    if isinstance(answer, SceneError):
-        return -2.0
-    scene, is_below = answer.scene, answer.files.cameras in files.others and files.below
-    if scene.images is None and (files.below or (answer.left_out is not None and not scene.has_own_pixels)):
-        return -2.0 if is_below else -1.0
-    if not files.others or scene.images is None or scene.has_own_pixels:
-        return 1.0
-    from gsmerge.cameras import check_cameras  # few scenes need it
-
-    views, stored = list(scene.photo_views), read_scene_cameras(ply, answer.files)
-    valid, images = np.ones(len(scene.gaussians), bool), photo_array(scene.images)[views]
-    score = check_cameras(scene.gaussians, valid, scene.cameras[views], images).score
-    is_moved = not (stored and answer.cameras and np.array_equal(stored.viewmats, answer.cameras.viewmats))
-    return score if is_moved or score < 0.5 else 1 + score
+    if load.scene.images is None:
+        return not files.below and (load.left_out is None or load.scene.has_own_pixels)
+    return load.scene.has_own_pixels or load.photos_explain or not files.others
 
 
 def _confirm_colors(load: Loaded) -> Loaded:
     """Return a scene whose guessed RGB is read as harmonics if photos show that; the guess stays without photos."""
-    harmonics = read_as_harmonics(load.scene, load.info) if load.info.color_note else None
-    if harmonics is None or not shows_better(harmonics, load.scene, colors=True):
+    units = load.info.color_units if load.info.color_note else None
+    if units is None or load.scene.images is None:
+        return load
+    harmonics = read_as_harmonics(load.scene, units)
+    if not has_nearer_colors(harmonics, load.scene):
         return load
     notes = tuple(text for text in load.notes if text != load.info.color_note)
     return replace(load, scene=harmonics, info=replace(load.info, color_units=None, color_note=""), notes=notes)
@@ -313,9 +300,7 @@ def _align(
             cameras_left, photos_left, left_out = of_one_shape
             answer = _assign(ply, files, cameras_left, photos_left, hints)
             load = answer.with_left_out(left_out) if isinstance(answer, Loaded) else load
-        if isinstance(load, SceneError):
-            return _without_photos(ply, files, camera_file, hints, load, by_names=proposal.by_names)
-        return _prefer_resized(load, ply, files, proposal, camera_file, hints)
+        return _without_photos(ply, files, camera_file, proposal, hints, load) if isinstance(load, SceneError) else load
     pictures = ScenePhotos(() if isinstance(inside, SceneError) else inside)
     load = _answer(partial(_combine, ply, files, camera_file, pictures, hints))
     if isinstance(load, SceneError):
@@ -328,113 +313,80 @@ def _align(
     return replace(load, notes=(*load.notes, *films))
 
 
-def _prefer_resized(
-    load: Loaded, ply: GaussianFile, files: SceneFiles, proposal: Proposal, camera_file: CameraFile, hints: ReadHints
-) -> Loaded:
-    """Return the scene with the photos that WorldMirror resized if they fit its Gaussians better, else ``load``."""
-    folder = proposal.folder.parent / SEEN_PLACE
-    if proposal.folder == folder or files.images is None or not folder.is_dir() or load.scene.images is None:
-        return load
-    files = replace(files, images=folder)
-    other = _answer(partial(propose_photos, files, camera_file))
-    resized = _assign(ply, files, camera_file, other, hints) if isinstance(other, Proposal) else None
-    if not isinstance(resized, Loaded) or resized.scene.images is None or not shows_better(resized.scene, load.scene):
-        return load
-    text = f"photos are read from {SEEN_PLACE}, since they fit the Gaussians better"
-    return replace(resized, notes=(*resized.notes, text))
-
-
 def _assign(
     ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
 ) -> Loaded | SceneError:
     """Combine Gaussians and cameras with the photos that names propose, or with other photos that show the views.
 
-    Notes name photos that cannot be read, and views without a photo. Returns why if photos and cameras do not fit.
+    Notes name photos that cannot be read, and views without a photo. Returns why if no photo shows any view.
     """
+
+    def read(cameras: CameraFile, chosen: Sequence[Assignment | None]) -> Loaded | SceneError:
+        return _answer(lambda: _combine(ply, files, cameras, read_photos(proposal, chosen, cameras), hints))
+
     is_grid = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED  # photos may have any size
     is_odd = not is_grid and has_other_shape(proposal, camera_file)
     bare = partial(_combine, ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
-    if is_odd:  # photos of another shape say nothing against cameras that see the Gaussians
+    if is_odd:
         alone = _answer(bare)
         fitted = choose_part(alone.scene, proposal, camera_file) if isinstance(alone, Loaded) else None
         if fitted is not None:
             return _assign(ply, files, camera_file, fitted, hints)
-    load: Loaded | None = None
-    cause: SceneError | None = None
-    while load is None and cause is None and not is_grid and any(photo is not None for photo in proposal.named):
-        tried = _answer(partial(_combine_chosen, ply, files, camera_file, proposal, proposal.choice, hints))
-        sound = None
-        if isinstance(tried, Loaded):
-            load = tried
-        elif tried.path in map(str, proposal.pool):
-            sound = proposal.without_broken()
+    tried: Loaded | SceneError | None = None
+    if not is_grid and any(proposal.choice):
+        tried = read(camera_file, proposal.choice)
+        sound = proposal.without_broken() if isinstance(tried, SceneError) else None
         if sound is not None:
             proposal = sound
-        elif isinstance(tried, SceneError):
-            cause = tried
-    base = _answer(bare) if load is None else load
+            tried = read(camera_file, proposal.choice)
+    base = tried if isinstance(tried, Loaded) else _answer(bare)
     if isinstance(base, SceneError):
-        return cause or base
+        return base if tried is None else tried
     fit = fit_to_grid(base.scene, proposal) if is_grid and proposal.pool else None
     guessed = list_guessed(base.scene, camera_file)
     proposal = proposal.without_views(guessed)
-    views, is_read = range(len(base.scene)), load is not None
-    chosen, are_alike = assign_to_views(base.scene, views, proposal, read=is_read, guessed=guessed, fit=fit)
+    chosen, are_alike = assign_to_views(base.scene, proposal, read=base is tried, guessed=guessed, fit=fit)
     if proposal.fit == WHOLE_FIT and not is_odd and (not are_alike or has_bars(base.scene)):
         fitted = choose_part(base.scene, proposal, camera_file, fit)
         if fitted is not None:
             return _assign(ply, files, camera_file, fitted, hints)
-    answer: Loaded | SceneError | None = load
-    if is_odd and load is not None and not are_alike:  # a part of the cameras' pictures would have the photos' shape
-        chosen = []
-    if any(chosen) and (load is None or chosen != proposal.choice):
-        named = name_by_photos(camera_file, proposal, chosen, fit)
-        answer = _answer(partial(_combine_chosen, ply, files, named, proposal, chosen, hints))
-    if any(chosen) and isinstance(answer, SceneError) and not is_odd:
+    if not any(chosen) or (is_odd and not are_alike):  # photos of another shape say nothing against cameras
+        is_cause = isinstance(tried, SceneError) and (not is_odd or any(camera_file.lenses))
+        return tried if isinstance(tried, SceneError) and is_cause else explain_mismatch(proposal, camera_file)
+    is_as_named = base is tried and chosen == proposal.choice
+    answer = base if is_as_named else read(name_by_photos(camera_file, proposal, chosen, fit), chosen)
+    if isinstance(answer, SceneError):
         return answer
-    if not any(chosen) or not isinstance(answer, Loaded):
-        refusal = refuse_photos(files, proposal, camera_file, None if is_odd and not camera_file.lenses else cause)
-        if refusal is not None:
-            return refusal
-        alone = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
-        text = describe_unused(proposal, camera_file)
-        return alone.with_left_out([text]) if isinstance(alone, Loaded) else alone
     described, unused = describe_assignment(proposal, chosen, camera_file, are_pixels=base.scene.has_own_pixels)
-    return replace(answer, notes=(*proposal.notes, *answer.notes, *described)).with_left_out(unused)
-
-
-def _combine_chosen(
-    ply: GaussianFile,
-    files: SceneFiles,
-    camera_file: CameraFile,
-    proposal: Proposal,
-    chosen: Sequence[Assignment | None],
-    hints: ReadHints,
-) -> Loaded:
-    """Combine Gaussians and cameras with the chosen photos as :func:`_combine`."""
-    return _combine(ply, files, camera_file, read_photos(proposal, chosen, camera_file), hints)
+    load = replace(answer, notes=(*proposal.notes, *answer.notes, *described), photos_explain=are_alike)
+    return load.with_left_out(unused)
 
 
 def _without_photos(
     ply: GaussianFile,
     files: SceneFiles,
     camera_file: CameraFile,
+    proposal: Proposal,
     hints: ReadHints,
     cause: SceneError,
-    *,
-    by_names: bool,
 ) -> Loaded | SceneError:
     """Leave out photos that show no view, with a note; return why if they were named, or the cameras are in doubt.
 
     ``cause``: why photos and cameras do not fit each other. Without photos, cameras of another scene may see these
-    Gaussians as well, unless rows are their pixels, or the photos were found ``by_names``.
+    Gaussians as well, unless rows are their pixels, the photos are at fault, or they were found by names.
     """
-    bare = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
-    is_of_photos = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(files.images)
-    are_named = "images" in files.named or _is_named(files, cause)
-    if isinstance(bare, SceneError) or are_named or not (bare.scene.has_own_pixels or is_of_photos or by_names):
+    are_named = "images" in files.named
+    if are_named and "cameras" not in files.named and cause.path == camera_file.path:  # the named files are at fault
+        return explain_mismatch(proposal, camera_file)
+    if are_named or _is_named(files, cause):
         return cause
-    return _note_left_out(bare, files, [f"the photos in {files.images or files.ply.parent}"], cause)
+    bare = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
+    are_at_fault = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(proposal.folder)
+    if isinstance(bare, SceneError):
+        return bare if are_at_fault else cause
+    if not (bare.scene.has_own_pixels or are_at_fault or proposal.by_names):
+        return cause
+    return _note_left_out(bare, replace(files, images=proposal.folder), [f"the photos in {proposal.folder}"], cause)
 
 
 def _is_named(files: SceneFiles, cause: SceneError) -> bool:
@@ -471,14 +423,11 @@ def _combine(
     left_out, place = list[str](), (camera_file, photos, size, result.transform, result.cameras)
     found = _answer(lambda: find_larger_and_masks(files, *place))
     if isinstance(found, SceneError):
-        path, is_protect = (
-            Path(found.path),
-            files.protect is not None and Path(found.path).is_relative_to(files.protect),
-        )
-        if "masks" in files.named or path in photos.paths or is_protect:
+        if "masks" in files.named or Path(found.path) in photos.paths or _is_named(files, found):
             raise found
         remedy = found.remedy or f"pass --masks FOLDER, or --masks {NONE}"
-        left_out = [f"the masks in {path.parent} are left out: {found.path}: {found.problem}; {remedy}"]
+        folder = Path(found.path).parent
+        left_out = [f"the masks in {folder} are left out: {found.path}: {found.problem}; {remedy}"]
         found = find_larger_and_masks(replace(files, masks=None, named=files.named | {"masks"}), *place)
     large, masks, mask_notes = found
     load = _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
@@ -487,10 +436,9 @@ def _combine(
 
 def _choose_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
     """Choose the order of the rows: by the hints, by the named exporter, or by the format of the cameras."""
-    exporter = find_exporter(hints.exporter)
+    order = (find_exporter(hints.exporter) or camera_file).order
     if hints.order != "auto":
         return hints.order
-    order = camera_file.order if exporter is None else exporter.order
     return "none" if order == "auto" and RESULT_COMMENT in ply.info.comments else order  # results have no pixels
 
 
@@ -525,12 +473,20 @@ def _make_load(
     masks: Masks = NO_MASKS,
     absent: Sequence[int] = (),
 ) -> Loaded:
-    """Make the scene from rows, their pixels and the views, with notes on how it was read.
+    """Make the scene of the visible Gaussians and all views, with notes on how it was read.
 
-    ``absent``: indices of the cameras without a photo.
+    ``large`` and ``masks`` are those of the views; ``absent``: indices of the cameras without a photo.
     """
     camera_file, recovery = result.camera_file, result.recovery
-    scene, more = _make_scene(ply, files, hints, result, large, masks)
+    gaussians, pixels = take_gaussians(ply, result)
+    num_faint = int(ply.valid.sum()) - len(gaussians)
+    faint = "fainter than 1/255, which nothing draws, set aside"
+    faint_notes = [count_words(num_faint, "Gaussian", faint)] if num_faint else []
+    masks, mask_notes = check_masks(masks, files)
+    photos = result.images if len(result.images) else None
+    names = () if camera_file is None else camera_file.names
+    scene = Scene(gaussians, result.cameras, photos, pixels, names, large, masks.counts, masks.importance)
+    scene = read_rotations(scene, hints.quats)
     if recovery is not None and result.given is not None:
         scene = move_views(scene, result.given)
         result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
@@ -542,7 +498,7 @@ def _make_load(
         files=files,
         cameras=camera_file,
         exporters=choose_exporters(hints.exporter, ply.info, order, source),
-        notes=(*files.notes, *file_notes(ply.info), *notes, *more),
+        notes=(*files.notes, *file_notes(ply.info), *notes, *faint_notes, *mask_notes),
         alignment=None if recovery is None else check_pixels(scene),
         recovery=recovery,
         problem=result.problem,
@@ -551,42 +507,18 @@ def _make_load(
     )
 
 
-def _make_scene(
-    ply: GaussianFile,
-    files: SceneFiles,
-    hints: ReadHints,
-    result: AlignmentResult,
-    large: LargePhotos | None,
-    masks: Masks,
-) -> tuple[Scene, list[str]]:
-    """Make the scene of the visible Gaussians and all views, of which ``large`` and ``masks`` are; return notes too."""
-    gaussians, pixels = take_gaussians(ply, result)
-    num_faint = int(ply.valid.sum()) - len(gaussians)
-    faint = "fainter than 1/255, which nothing draws, set aside"
-    notes = [count_words(num_faint, "Gaussian", faint)] if num_faint else []
-    masks, mask_notes = check_masks(masks, files)
-    photos = result.images if len(result.images) else None
-    names = () if result.camera_file is None else result.camera_file.names
-    scene = Scene(gaussians, result.cameras, photos, pixels, names, large, masks.counts, masks.importance)
-    return read_rotations(scene, hints.quats), [*notes, *mask_notes]
-
-
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
     """Move a file's cameras into the frame of the Gaussians if pixels or colours show that frame; else keep them.
 
     ``photos``: read photos, and raise SceneError if named ones cannot be read; False: leave photos out. SceneError if
     named cameras have no size.
     """
-    chosen = _choose_cameras(ply, files, hints, photos=True) if files.others else None
-    files = replace(chosen.files, others=(), below=False) if isinstance(chosen, Loaded) else files
+    for with_photos in dict.fromkeys((True, photos)):  # photos can show the frame even if they are not kept
+        answer = _choose_cameras(ply, files, hints, photos=with_photos)
+        if isinstance(answer, Loaded):
+            return answer
     camera_file = _answer(partial(read_scene_cameras, ply, files))
-    if camera_file is None:
-        return _without_cameras(ply, files, hints)
     if isinstance(camera_file, CameraFile):
-        for with_photos in [True] if photos else [True, False]:  # photos can show the frame even if they are not kept
-            load = _align(ply, files, camera_file, hints, photos=with_photos)
-            if isinstance(load, Loaded):
-                return load
         kept = _answer(partial(_keep_stored_cameras, ply, files, camera_file, hints, photos=photos))
         if isinstance(kept, Loaded):
             return kept

@@ -9,7 +9,8 @@ import numpy as np
 
 from gsmerge.cameras import AlignmentResult
 from gsmerge.geometry.transforms import camera_depths, sh0_to_rgb
-from gsmerge.io.formats.read import FileInfo, GaussianFile
+from gsmerge.io.formats.color_units import ColorUnits
+from gsmerge.io.formats.read import GaussianFile
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.settings.reading import QuatChoice
 from gsmerge.types import Gaussians, Pixels, Scene
@@ -59,11 +60,8 @@ def _counts_up(ids: np.ndarray) -> bool:
     return all(np.array_equal(block, np.arange(first, first + len(block), dtype=ids.dtype)) for first, block in blocks)
 
 
-def read_as_harmonics(scene: Scene, info: FileInfo) -> Scene | None:
-    """Return a scene with photos whose colours are read as harmonics, not as RGB; None if they are not read as RGB."""
-    units = info.color_units
-    if units is None or scene.images is None:
-        return None
+def read_as_harmonics(scene: Scene, units: ColorUnits) -> Scene:
+    """Return a scene whose colours, which were read as RGB in ``units``, are read as harmonics."""
     stored = units.black + (units.white - units.black) * sh0_to_rgb(scene.gaussians.sh0)
     return replace(scene, gaussians=replace(scene.gaussians, sh0=stored.astype(np.float32)))
 

@@ -155,8 +155,8 @@ def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tupl
     transform, notes = _limit((cameras.width, cameras.height), max_side)
     if transform is not None:
         cameras, smaller = transform.cameras(cameras), transform.photos(images)
-        pictures = np.array([smaller[view] for view in range(len(smaller))], images.dtype)
-        images = pictures.reshape(-1, cameras.height, cameras.width, 3)
+        pictures = [smaller[view] for view in range(len(smaller))]
+        images = np.array(pictures, images.dtype).reshape(-1, cameras.height, cameras.width, 3)
     return cameras, images, notes
 
 

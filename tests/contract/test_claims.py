@@ -171,7 +171,6 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"wider than a {part(holes.LARGE)} of the picture",
         f"cover at least {percent(holes.PART)} of it",
         f"exposures differ by more than {percent(exposure.DIFFERENT)} at random",
-        f"at least a {part(1 - exposure.NEARER)} closer",
         f"A white pixel counts as {word(int(types.PROTECTED))}",
     ),
     STATES: (f"those of at most {ExtendOptions().max_views} views",),

@@ -12,7 +12,7 @@ from typing import Any
 from gsmerge.batch.find import find_scenes, main_file
 from gsmerge.compaction.methods import find_method
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.scene_files import find_scene_files
+from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions
 from gsmerge.research.charts.lines import SIZES
 from gsmerge.research.charts.measure_run import ChartScene, RunRecord, describe
@@ -89,7 +89,7 @@ def find_sources(arguments: Sequence[str], out: Path, targets: str | None = None
         if cameras is not None:
             if not cameras.exists():
                 raise SceneError(cameras, f"expected cameras of held-out views of {scene}, found nothing")
-            read += [cameras, *list_photos(cameras)]
+            read += [cameras, *list_photos(SceneFiles(scene, cameras, None), cameras)]
         sources.append(ChartScene(scene, name, cameras, content_hash(list(dict.fromkeys(read)))))
     return sources
 

@@ -29,7 +29,7 @@ def photos(views: np.ndarray) -> list[np.ndarray]:
 def assign(
     views: np.ndarray, pool: Sequence[np.ndarray], named: Named, *, exact: bool, tags: Sequence[int] | None = None
 ) -> list[Assignment | None]:
-    candidates = Candidates(lambda photo: pool[photo], len(pool), tags or [0] * len(pool))
+    candidates = Candidates(lambda photo: pool[photo], len(pool), (tags or [0] * len(pool)).__getitem__)
     return assign_photos(lambda side: show(views, side), candidates, named, exact=exact)[0]
 
 
@@ -114,7 +114,7 @@ def test_scores_are_kept(views: np.ndarray, photos: list[np.ndarray]) -> None:
         reads.append(photo)
         return photos[photo]
 
-    assigner = Assigner(lambda side: show(views, side), Candidates(read, VIEWS, [0] * VIEWS))
+    assigner = Assigner(lambda side: show(views, side), Candidates(read, VIEWS, lambda _: 0))
     first = assigner.score([0, 2])
     again = assigner.score([2, 0, 0])
     assert sorted(reads) == [0, 2]
@@ -125,7 +125,7 @@ def displaced(photos: list[np.ndarray], pixels: Sequence[int]) -> Assigner:
     """An assigner of photos whose parts lie some pixels beside what is shown."""
     pool = [np.roll(photo, away, 1) for photo, away in zip(photos, pixels, strict=True)]
     views = cut_views(VIEWS)
-    return Assigner(lambda side: show(views, side), Candidates(lambda photo: pool[photo], VIEWS, [0] * VIEWS))
+    return Assigner(lambda side: show(views, side), Candidates(lambda photo: pool[photo], VIEWS, lambda _: 0))
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_a_view_that_shows_nothing_contradicts_no_name(views: np.ndarray, photos
     weights[2] = 0
     pool = [*photos, np.ascontiguousarray(turn_back(photos[2], 1))]
     for photo, expected in ((2, Assignment(2, 0)), (VIEWS, None)):
-        candidates = Candidates(lambda photo: pool[photo], len(pool), [0] * len(pool))
+        candidates = Candidates(lambda photo: pool[photo], len(pool), lambda _: 0)
         named = [0, 1, photo, 3, 4, 5]
         chosen, _ = assign_photos(lambda side: show(views, side, weights), candidates, named, exact=True)
         assert chosen == [Assignment(0, 0), Assignment(1, 0), expected, *(Assignment(view, 0) for view in (3, 4, 5))]

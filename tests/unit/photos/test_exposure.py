@@ -15,7 +15,6 @@ from gsmerge.kernels import elementary
 from gsmerge.photos.exposure import (
     FARTHER,
     FOLLOWS,
-    NEARER,
     NEAREST,
     UNEXPECTED,
     _divide,
@@ -25,7 +24,6 @@ from gsmerge.photos.exposure import (
     equalise_exposure,
     is_metered,
     root_mean_square,
-    share_left,
     share_unexpected,
 )
 
@@ -53,14 +51,6 @@ def brightened(scene: Scene, gains: np.ndarray) -> Scene:
 
 def test_size_of_gains() -> None:
     assert root_mean_square(grey(0.9, 1.1)) == pytest.approx(0.1)
-
-
-def test_gains_bring_the_same_surfaces_nearer(scene: Scene) -> None:
-    gains = grey(0.2, -0.3, 0.1, 0.2, -0.2)
-    pairs = _measure_pairs(brightened(scene, gains), VIEWS)
-    assert share_left(pairs, gains) < 0.2
-    assert share_left(pairs, np.zeros((5, 3))) == 1
-    assert share_left(pairs, -gains) > 1 > NEARER
 
 
 def test_few_views_are_compared_with_all_others_and_many_with_some() -> None:

@@ -156,7 +156,7 @@ def test_photos_of_another_scene_are_not_used(tmp_path: Path) -> None:
     loaded = read_bare(tmp_path, tiny, np.arange(len(tiny.gaussians)))
     assert loaded.scene.has_own_pixels
     assert loaded.scene.images is None
-    assert noted(loaded.notes, "images", "not used", f"3 views of {WIDTH} x {HEIGHT}")
+    assert noted(loaded.notes, "images", "left out", f"3 views of {WIDTH} x {HEIGHT}")
 
 
 @pytest.mark.slow

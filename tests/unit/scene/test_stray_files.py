@@ -112,7 +112,7 @@ def test_cameras_that_are_named_are_refused(tmp_path: Path, kind: str) -> None:
         load_scene(folder, cameras=folder / "transforms.json")
     write_images(folder / "images", another())
     alone = load_scene(folder, cameras="none")
-    assert noted(alone.notes, folder / "images", "not used")
+    assert noted(alone.notes, folder / "images")
     assert not noted(alone.notes, "name them with --cameras")
     assert alone.files.cameras is None
 
@@ -132,7 +132,7 @@ def test_photos_of_something_else_beside_the_right_cameras(tmp_path: Path) -> No
 def test_photos_of_something_else_beside_a_grid(tmp_path: Path) -> None:
     folder = save(tmp_path, "grid")
     write_images(folder / "images", another())
-    assert names(str(load_scene(folder).left_out), "the photos in", folder / "images", "not used")
+    assert names(str(load_scene(folder).left_out), "the photos in", folder / "images", "left out")
 
 
 def test_a_picture_beside_a_grid_that_cannot_be_read(tmp_path: Path) -> None:
