@@ -16,11 +16,12 @@ from gsmerge.fit.outside import outside_cameras, sample_gaussians
 from gsmerge.kernels.pictures import blur
 from gsmerge.photos.views import even_views, resize_cameras
 from gsmerge.raster import render
-from gsmerge.raster.metrics import POOR, decibels
+from gsmerge.raster.metrics import decibels
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.types import Cameras, Gaussians
 
+WRONG = 20.0  # dB, which is a tenth of the range of colours (root mean square); from there on pictures look right
 TWICE = decibels(1 / 4)  # dB between two distances of which one is twice the other
 # Gaussians that represent the input, pixels of the longer side, and standard deviation of a blur, pixels, by which
 # noise of the Gaussians hardly counts. On fifteen captures a result is .2 dB or more nearer to its input than the input
@@ -30,8 +31,8 @@ MOST_PHOTOS, MOST_BETWEEN = 2, 3
 
 
 def is_far(near: float | None, far: float | None) -> bool:
-    """Return whether a PSNR (dB) means twice the error of another, and looks poor; False if one cannot be measured."""
-    return near is not None and far is not None and far < min(near - TWICE, POOR)  # NaN is not less
+    """Return whether a PSNR (dB) means twice the error of another, and looks wrong; False if one cannot be measured."""
+    return near is not None and far is not None and far < min(near - TWICE, WRONG)  # NaN is not less
 
 
 @stage("input")

@@ -51,11 +51,10 @@ PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply"
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # DepthSplat and its relatives write NAME.ply there, with the photos in images/NAME
 IMAGE_PLACES = (
+    "images_resized",  # what WorldMirror saw; tall photos in its images/ are squeezed
     "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
     "keyframes/images",
 )  # fmt: skip
-# WorldMirror's cameras, beside which lies what it saw; tall photos in its images/ are squeezed
-WORLDMIRROR, SEEN_PLACE = "camera_params.json", "images_resized"
 MASK_PLACES = ("masks",)
 _OTHER_PICTURES = {*MASK_PLACES, "targets"}  # folders of pictures that are no photos of the scene's views
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
@@ -258,9 +257,7 @@ def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> 
     """Find the images of a scene: inside its cameras' file, or in a folder; None without."""
     if cameras is not None and (cameras.suffix == STATE_ENDING or (cameras.suffix == ".npz" and holds_images(cameras))):
         return cameras
-    is_of_model = cameras is not None and cameras.name == WORLDMIRROR
-    places = (SEEN_PLACE, *IMAGE_PLACES) if is_of_model else IMAGE_PLACES
-    folders = [f for root in roots for place in places if can_be_listed(f := root / place, "images")]
+    folders = [f for root in roots for place in IMAGE_PLACES if can_be_listed(f := root / place, "images")]
     # If a folder has several scenes, each may have its own folder of images
     names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
     own_folders = [folder / name for folder in folders for name in names]

@@ -14,12 +14,12 @@ from messages import refuses
 
 import gsmerge
 from gsmerge import Gaussians, Scene, compact, pipeline, render
-from gsmerge.compaction.distance import BLUR, SIDE, TWICE, describe_far, is_far
+from gsmerge.compaction.distance import BLUR, SIDE, TWICE, WRONG, describe_far, is_far
 from gsmerge.errors import TargetError
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.photos.views import resize_cameras
-from gsmerge.raster.metrics import POOR, decibels
+from gsmerge.raster.metrics import decibels
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +65,10 @@ def test_the_input_and_usual_results_are_not_far(room: Scene, prepared: Prepared
 
 @pytest.mark.parametrize(
     ("before", "after", "expected"),
-    [(20, 20 - TWICE - 0.1, True), (20, 20 - TWICE + 0.1, False), (60, POOR + 0.1, False), (None, 3, False),
+    [(20, 20 - TWICE - 0.1, True), (20, 20 - TWICE + 0.1, False), (60, WRONG + 0.1, False), (None, 3, False),
      (20, None, False), (float("nan"), 3, False)],
 )  # fmt: skip
-def test_far_is_twice_the_error_and_poor(before: float | None, after: float | None, expected: bool) -> None:
+def test_far_is_twice_the_error_and_wrong(before: float | None, after: float | None, expected: bool) -> None:
     assert is_far(before, after) == expected
 
 
