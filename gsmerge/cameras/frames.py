@@ -68,7 +68,8 @@ def fit_frame(cameras: Cameras, poses: np.ndarray, scale: float | None) -> Simil
     """Fit the similarity that moves cameras to ``poses [c,4,4]``, and describe it in words."""
     frame = fit_similarity(cameras.viewmats, poses, scale or 1.0)
     angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
-    text = f"rotated by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted"
+    shift = ", ".join(f"{value:.4g}" for value in frame.shift)
+    text = f"rotated by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted by {shift}"
     return replace(frame, description=text)
 
 

@@ -205,6 +205,9 @@ def choose_cameras(
         return PlacedGrid(grid, other, "photos' colours"), []
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
+        if check.share_seen > 0.5:  # of the Gaussians: where these lie does not speak against the cameras
+            remedy += "; if the cameras are right, the photos or the colours of the file are wrong: --images none keeps"
+            remedy += " the cameras, and --hint colors=rgb reads f_dc as RGB"
         raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
     if poses is None:
         return unchanged, [note] if note else []

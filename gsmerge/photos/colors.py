@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -25,8 +26,8 @@ LEVELS = 33  # number of quantiles of a tone curve
 STEP = 0.05  # change of middle grey by a third of a stop, the smallest exposure step of cameras
 VISIBLE = 0.01  # root mean square of differences that are just visible on plain surfaces
 RIDGE = 1e-6  # ridge of the least squares, relative to the mean square of colours; keeps maps of grey photos finite
-Fit = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # from colours [n,3] to targets [n,3], weights [n]
-Change = Callable[[np.ndarray, np.ndarray], np.ndarray]  # maps colours [...,3] by what was fitted
+Change = Callable[[np.ndarray], np.ndarray]  # maps colours [...,3]
+Fit = Callable[[np.ndarray, np.ndarray, np.ndarray], Change]  # from colours [n,3] to targets [n,3], weights [n]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
     def fit(group: Sequence[int]) -> None:
         group_pairs = pairs[group]
         shown = group_pairs.shown
-        toned[group] = _cross_fit(group_pairs.photos, shown.pictures, shown.weights, fit_tones, map_tones)
+        toned[group] = _cross_fit(group_pairs.photos, shown.pictures, shown.weights, _tone_change)
 
     parallel_map(fit, groups)
     return cut_blocks(pairs.with_photos(toned))
@@ -122,12 +123,30 @@ def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
 
 def map_blocks(blocks: Blocks) -> Blocks:
     """Return blocks after a linear map of colours; see :func:`_cross_fit`."""
-    weights = blocks.solid.astype(np.float32)
-    mapped = _cross_fit(blocks.photos, blocks.pictures, weights, fit_map, map_colors)
+    mapped = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _map_change)
     return Blocks(mapped, blocks.pictures, blocks.solid)
 
 
-def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: Fit, change: Change) -> np.ndarray:
+def plain_blocks(blocks: Blocks) -> Blocks:
+    """Return blocks of one colour, the mean colour of the Gaussians; see :func:`_cross_fit`."""
+    plain = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _plain_change)
+    return Blocks(plain, blocks.pictures, blocks.solid)
+
+
+def _tone_change(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Change:
+    return partial(map_tones, fit_tones(colors, targets, weights))
+
+
+def _map_change(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Change:
+    return partial(map_colors, fit_map(colors, targets, weights))
+
+
+def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Change:
+    mean = (targets * weights[:, None]).sum(0, dtype=np.float64) / max(float(weights.sum(dtype=np.float64)), 1e-9)
+    return partial(np.full_like, fill_value=mean)
+
+
+def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: Fit) -> np.ndarray:
     """Change photos ``[v,h,w,3]`` by two-fold cross-fitting.
 
     Each half of the blocks is changed by the fit to the other half.
@@ -137,8 +156,8 @@ def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fi
     black_squares = (y[:, None] + x) % 2 == 1  # of the chess board
     for fold in (black_squares, ~black_squares):
         colors, targets = photos[:, ~fold].reshape(-1, 3), pictures[:, ~fold].reshape(-1, 3)
-        fitted = fit(colors, targets, weights[:, ~fold].reshape(-1))
-        out[:, fold] = change(fitted, photos[:, fold])
+        change = fit(colors, targets, weights[:, ~fold].reshape(-1))
+        out[:, fold] = change(photos[:, fold])
     return out
 
 

@@ -27,6 +27,7 @@ from gsmerge.photos.colors import (
     map_blocks,
     map_colors,
     map_tones,
+    plain_blocks,
     tone_blocks,
     vary_in_hue,
 )
@@ -201,7 +202,7 @@ def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) ->
     """Return whether a linear map, but no tone curve, explains the difference between photos and Gaussians.
 
     It may map photos to Gaussians, or Gaussians to photos, which are grey then. Photos of another scene are excluded:
-    they do not show their views even after the map.
+    one colour explains them as well as a map, or they do not show their views even after the map.
     """
     view_pairs = pairs[views]
     if _is_mapped(view_pairs):
@@ -223,12 +224,13 @@ def are_exchanged(pairs: Pairs) -> bool:
 
 
 def _is_mapped(pairs: Pairs) -> bool:
-    """Return whether a linear map of the photos' colours explains the pictures better than tones do."""
+    """Return whether a linear map of the photos' colours explains the pictures better than tones or one colour do."""
     stored = cut_blocks(pairs)
     if not is_visible(stored.errors()):
         return False
-    toned = tone_blocks(pairs, _group(pairs, range(len(pairs)))).errors()
-    return is_visible(toned) and explains(toned, map_blocks(stored).errors())
+    toned, mapped = tone_blocks(pairs, _group(pairs, range(len(pairs)))), map_blocks(stored)
+    simpler = toned, plain_blocks(stored)
+    return is_visible(toned.errors()) and all(explains(blocks.errors(), mapped.errors()) for blocks in simpler)
 
 
 def _leave_out(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence[int]) -> bool:

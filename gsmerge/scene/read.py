@@ -383,7 +383,7 @@ def _without_photos(
     bare = _answer(partial(_combine, ply, files, camera_file, ScenePhotos(), hints))
     are_at_fault = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(proposal.folder)
     if isinstance(bare, SceneError):
-        return bare if are_at_fault else cause
+        return cause
     if not (bare.scene.has_own_pixels or are_at_fault or proposal.by_names):
         return cause
     return _note_left_out(bare, replace(files, images=proposal.folder), [f"the photos in {proposal.folder}"], cause)

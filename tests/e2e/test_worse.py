@@ -137,13 +137,10 @@ def test_a_batch_names_worse_results(
 def test_pages_and_documents_of_comparisons_name_worse_results(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     small = tmp_path / "few.ply"
     run("compact", smallest_scene, "-o", small, *FEW, "-q", code=0)
-    pages = [tmp_path / name for name in ("report.html", "report.json")]
-    said = run(
-        "evaluate", smallest_scene, small, "--lpips", "none", *(part for page in pages for part in ("-o", page)), code=0
-    )
+    report = tmp_path / "report.json"
+    said = run("evaluate", smallest_scene, small, "--lpips", "none", "-o", report, code=0)
     assert "warning: few.ply " in said.err
-    (note,) = [note for note in json.loads(pages[1].read_text())["notes"] if SAID in note]
-    assert note.split("'")[1].removeprefix("s ") in pages[0].read_text()
+    assert [note for note in json.loads(report.read_text())["notes"] if SAID in note]
     page = tmp_path / "view.html"
     said = run("view", smallest_scene, small, "-o", page, "--no-open", code=0)
     assert "warning: few.ply " in said.err
