@@ -23,10 +23,10 @@ from gsmerge.raster.photos import blank_photos, photo_errors
 from gsmerge.runtime.record import choose, note
 from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene
 
-# Share of the Gaussians from which on cameras are placed. Views of fifteen captures in voxels miss at most .001, at
-# their edges; two of four views of a narrow capture miss .02
+# Share of the Gaussians from which on cameras are placed, and of the pixels of a placed camera's picture that have to
+# show mainly such Gaussians. Views of fifteen captures in voxels miss at most .001 of them, at their edges; two
+# of four views of a narrow capture miss .02, and two of five of another .006
 LEAST_OUTSIDE = 0.005
-LEAST_SHOWN = 0.02  # of the pixels of a placed camera's picture, which have to show mainly such Gaussians
 LEAST_ADDED = 0.2  # a further camera is placed if it adds more than this share of what those before it show
 SAMPLE_GAUSSIANS = 40_000  # cameras are chosen by pictures of at most this many Gaussians
 SOURCES, STEPS_BACK = 4, 8  # most views beside which cameras are placed, and cameras for each that step back
@@ -50,7 +50,7 @@ def draw_outside(scene: PicturedScene) -> PicturedScene:
         return np.asarray(image[..., 0] > (1 - transmittance) / 2)
 
     counts = np.stack(photo_errors(scene.gaussians, blank_photos(placed), is_outside, colors=white))
-    useful = np.flatnonzero(counts.mean((1, 2)) > LEAST_SHOWN)
+    useful = np.flatnonzero(counts.mean((1, 2)) > LEAST_OUTSIDE)
     if len(useful) == 0:
         return scene
     placed, counts = placed[useful], counts[useful]
