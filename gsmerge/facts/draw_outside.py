@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.facts.pixels import with_pixels
-from gsmerge.facts.place_cameras import choose_cameras
+from gsmerge.facts.pixels import find_pixels
+from gsmerge.facts.place_cameras import SAMPLE_GAUSSIANS, choose_cameras
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.kernels.elementary import arctan2
@@ -21,14 +21,13 @@ from gsmerge.raster import render
 from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import blank_photos, photo_errors
 from gsmerge.runtime.record import choose, note
-from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene
+from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels, make_scene
 
 # Share of the Gaussians from which on cameras are placed, and of the pixels of a placed camera's picture that have to
 # show mainly such Gaussians. Views of fifteen captures in voxels miss at most .001 of them, at their edges; two
 # of four views of a narrow capture miss .02, and two of five of another .006
 LEAST_OUTSIDE = 0.005
 LEAST_ADDED = 0.2  # a further camera is placed if it adds more than this share of what those before it show
-SAMPLE_GAUSSIANS = 40_000  # cameras are chosen by pictures of at most this many Gaussians
 SOURCES, STEPS_BACK = 4, 8  # most views beside which cameras are placed, and cameras for each that step back
 # Bounds of these: step back as a share of the depth, rotation to the sides, and rotation up or down, degrees
 NEAREST, FARTHEST = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
@@ -93,18 +92,22 @@ def _with_drawings(scene: PicturedScene, cameras: Cameras, counts: np.ndarray) -
     importance, empty, large = scene.importance, scene.empty, scene.large_photos
     if large is not None:
         large = _with_large_drawings(large, scene.gaussians, cameras)
-    drawn = with_pixels(
-        replace(
-            scene, cameras=concat_cameras(scene.cameras, cameras), pixels=None, large_photos=large,
-            names=(*scene.names, *(f"placed {view}" for view in range(len(cameras)))),
-            images=np.concatenate([scene.images, render(scene.gaussians, cameras).images.clip(0, 1)]),
-            masks=np.concatenate([masks, counts]),
-            importance=None if importance is None else np.concatenate([importance, np.ones(counts.shape, np.float32)]),
-            empty=None if empty is None else np.concatenate([empty, np.zeros(counts.shape, empty.dtype)]),
-        )
+    return replace(
+        scene, cameras=concat_cameras(scene.cameras, cameras), pixels=_with_pixels_of(scene, cameras),
+        large_photos=large, names=(*scene.names, *(f"placed {view}" for view in range(len(cameras)))),
+        images=np.concatenate([scene.images, render(scene.gaussians, cameras).images.clip(0, 1)]),
+        masks=np.concatenate([masks, counts]),
+        importance=None if importance is None else np.concatenate([importance, np.ones(counts.shape, np.float32)]),
+        empty=None if empty is None else np.concatenate([empty, np.zeros(counts.shape, empty.dtype)]),
     )  # fmt: skip
-    homes, pixels = scene.get_pixels().homes, drawn.get_pixels()  # a drawing takes no Gaussian from a photo
-    return replace(drawn, pixels=replace(pixels, homes=np.where(homes < 0, pixels.homes, homes)))
+
+
+def _with_pixels_of(scene: PicturedScene, cameras: Cameras) -> Pixels:
+    """Return the pixels of a scene with those of further ``cameras``, which take no Gaussian from its views."""
+    pixels, placed = scene.get_pixels(), find_pixels(make_scene(scene.gaussians, cameras))
+    placed_homes = np.where(placed.homes < 0, -1, placed.homes + len(scene) * scene.pixels_per_view)
+    homes = np.where(pixels.homes < 0, placed_homes, pixels.homes)
+    return Pixels(homes, np.concatenate([pixels.fronts, placed.fronts]), own=False)
 
 
 def _with_large_drawings(large: LargePhotos, gaussians: Gaussians, cameras: Cameras) -> LargePhotos:

@@ -53,16 +53,17 @@ def choose_part(
     if not photos or shapes_differ or any(map(proposal.tag, photos)):
         return None
 
-    def read(photo: int) -> tuple[np.ndarray, np.ndarray]:
+    def read(number: int) -> tuple[np.ndarray, np.ndarray]:
         """Read a photo small, and the shares of its sides that bars have."""
+        size = sizes[number]
         with suppress(SceneError):
-            whole = decode_image(proposal.pool[photo], size := image_size(proposal.pool[photo]))
+            whole = decode_image(proposal.pool[photos[number]], size)
             above, below, left, right = count_bars(whole, _BAR_SPREAD)
             small = resize_to(size, limit_size(size, 4 * SIDE)).photos([whole])[0]
             return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
         return np.zeros((SIDE, SIDE, 3), np.float32), np.zeros(4)
 
-    pictures, bars = zip(*parallel_map(read, photos), strict=True)
+    pictures, bars = zip(*parallel_map(read, range(len(photos))), strict=True)
     left, above, right, below = np.median(bars, 0).tolist()
     inner, shape = (left, above, 1 - right, 1 - below), (scene.cameras.width, scene.cameras.height)
     shape = next(iter(sizes_of(camera_file)), shape)
