@@ -7,7 +7,7 @@ exceptions; the command line prints its message as one line.
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from os import PathLike
 
@@ -62,6 +62,18 @@ class DoubtWarning(UserWarning):
         >>> import warnings
         >>> warnings.simplefilter("error", gsmerge.DoubtWarning)  # raise an error for each doubt
     """
+
+
+class Doubt(str):
+    """A note for the user that the result may be poor or wrong; any other note is a plain text.
+
+    Commands show it as a warning, and fail with ``--strict``; Python gives a :class:`gsmerge.DoubtWarning`.
+    """
+
+
+def list_doubts(notes: Iterable[str]) -> list[str]:
+    """Return those of the notes that make the result doubtful."""
+    return [note for note in notes if isinstance(note, Doubt)]
 
 
 class TargetError(GsmergeError):

@@ -25,8 +25,7 @@ class DoneResult:
 
     key: str  # digest of the scene's files, the settings and the version
     files: list[dict[str, Any]]  # ``path`` in the output folder, ``sha256`` and ``bytes`` of each file
-    worse: str | None = None  # warning that it shows its photos worse than the input does
-    left_out: str | None = None  # note that cameras or photos beside its scene do not belong to the scene
+    doubts: tuple[str, ...] = ()  # notes that make it doubtful
 
     def holds(self, folder: Path, key: str) -> bool:
         """Return whether the result has this key and all its files are unchanged."""
@@ -71,8 +70,7 @@ class RecordIndex:
 def _read_result(line: Mapping[str, Any]) -> DoneResult:
     """Read a record of a result; KeyError, TypeError or AttributeError if it is damaged."""
     files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
-    doubts = line["report"].get("worse"), line["report"].get("input", {}).get("left_out")
-    return DoneResult(_text(line["key"]), files, *(None if doubt is None else _text(doubt) for doubt in doubts))
+    return DoneResult(_text(line["key"]), files, tuple(map(_text, line.get("doubts", ()))))
 
 
 def _text(value: Any) -> str:
@@ -84,7 +82,7 @@ def _text(value: Any) -> str:
 
 def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
     """Make a record of ``facts`` with all keys that a record has."""
-    blank: dict[str, Any] = {"key": None, "files": [], "error": None, "report": None}
+    blank: dict[str, Any] = {"key": None, "files": [], "error": None, "doubts": [], "report": None}
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **facts}
 
 

@@ -160,8 +160,7 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     files = job.find_files()
     key, known = job.call.key(files), read_index(run.folder).read_on().results.get(job.output)
     if known is not None and not run.overwrite and known.holds(run.folder, key):
-        doubts = {"worse": known.worse, "left_out": known.left_out}
-        return record(SKIPPED, job.scene, job.output, key=key, files=known.files, **doubts)
+        return record(SKIPPED, job.scene, job.output, key=key, files=known.files, doubts=known.doubts)
     refused = None if run.overwrite else refusal(job, run.folder, known, key, begun=begun.exists())
     if refused:
         return record(FAILED, job.scene, job.output, key=key, error=refused)
@@ -177,7 +176,7 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
         | {"bytes": path.stat().st_size}
         for path in written
     ]
-    return record(DONE, job.scene, job.output, key=key, files=facts, report=finite(document))
+    return record(DONE, job.scene, job.output, key=key, files=facts, doubts=document["doubts"], report=finite(document))
 
 
 @lru_cache(maxsize=1)

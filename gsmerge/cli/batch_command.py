@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import RunEnd, print_document, say, separate_stdout, terminal_columns, total_progress
-from gsmerge.errors import BatchError, TargetError, UsageError
+from gsmerge.errors import BatchError, Doubt, TargetError, UsageError
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import Setting
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
 
 JOBS = Setting("", kind=int | Literal["auto"], least=1)
-MAX_LISTED = 20  # rows of the table, failures, and results that are worse than their input
+MAX_LISTED = 20  # rows of the table, failures, and doubtful results
 HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
 # Key of a reason -> word before it
-REASONS = {"worse": "worse", "left_out": "note", "lacking": "note", "error": "failed"}
+REASONS = {"doubt": "warning", "lacking": "note", "error": "failed"}
 
 
 @opt.command(
@@ -116,22 +116,16 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     finally:
         if (totals.counts or interrupted) and not args.silent:
             print_document({}, totals.lines(terminal_columns(sys.stdout)), as_json=False)
-    kinds = {
-        "worse": "results show their photos worse than the input",
-        "left_out": "scenes have cameras or photos that do not belong to them",
-    }
-    doubts = [
-        f"{len(reasons)} of {totals.total} {words}{_first_reason(reasons, listed=not args.silent)}"
-        for name, words in kinds.items()
-        if (reasons := totals.reasons[name])
-    ]
-    if totals.reasons["worse"] and not args.strict:
-        say(doubts[0], kind="warning", quiet=args.silent)
+    doubtful = totals.reasons["doubt"]
+    first = _first_reason(doubtful, listed=not args.silent) if doubtful else ""
+    problem = f"{len(doubtful)} of {totals.total} results are doubtful{first}"
+    if doubtful and not args.strict:
+        say(problem, kind="warning", quiet=args.silent)
     check_failures(totals.reasons["error"], len(jobs), "scenes", listed=not args.silent)
     if totals.counts["unmet"]:
         raise TargetError(f"{totals.counts['unmet']} of {totals.total} results miss the target")
-    if doubts and args.strict:
-        raise TargetError("; ".join(doubts))
+    if doubtful and args.strict:
+        raise TargetError(problem)
 
 
 def _run_jobs(
@@ -153,12 +147,9 @@ def _run_jobs(
             num_failed += record["status"] == FAILED
             num_skipped += record["status"] == SKIPPED
             share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
-            report = record["report"] or record  # a result that was done before has a record of its doubts alone
-            worse = report.get("worse")
-            doubts = report.get("doubts", [doubt for doubt in (worse, report.get("left_out")) if doubt])
-            notes = report.get("notes", doubts)
-            end = record["scene"], record["status"], num_ended, failure, num_failed, share, worse, notes, doubts
-            progress(RunEnd(*end))
+            report = record["report"] or {"notes": record["doubts"]}  # a result that was done before has no report
+            notes = [Doubt(note) if note in record["doubts"] else note for note in report["notes"]]
+            progress(RunEnd(record["scene"], record["status"], num_ended, failure, num_failed, share, notes))
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
@@ -180,20 +171,18 @@ class Totals:
     total: int  # scenes
     counts: Counter[str] = field(default_factory=Counter)  # scenes by status; Gaussians in and out; missed targets
     rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results
-    # Scenes and reasons: worse than the input, also of skipped results; files of another scene; lacking files; failed
+    # Scenes and reasons: doubts, also of skipped results; lacking files; failures
     reasons: dict[str, list[tuple[str, str]]] = field(default_factory=lambda: {name: [] for name in REASONS})
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Count the record of one scene."""
         report = record["report"]
-        found: dict[str, Any] = {**record}
-        if report:
-            found |= {"worse": report["worse"], **report["input"]}
-        if report and not found.get("left_out") and not found.get("num_photos", 1):
+        found = {"doubt": "; ".join(record["doubts"]), "lacking": "", "error": record["error"]}
+        if report and not record["doubts"] and not report["input"]["num_photos"]:
             found["lacking"] = _describe_lack(report)
-        for name in REASONS:
-            if found.get(name):
-                self.reasons[name].append((record["scene"], found[name]))
+        for name, reason in found.items():
+            if reason:
+                self.reasons[name].append((record["scene"], reason))
         self.counts[record["status"]] += 1
         if report:
             self.counts["in"] += report["input"]["num_gaussians"]
@@ -224,8 +213,8 @@ class Totals:
             share = human_share(self.counts["out"] / num_input)
             line += f"; {num_input:,} -> {self.counts['out']:,} Gaussians ({share})"
         line += f"; {self.counts['unmet']:,} missed the target" if self.counts["unmet"] else ""
-        num_worse = len(self.reasons["worse"])
-        return [*lines, line + (f"; {num_worse:,} worse than the input" if num_worse else "")]
+        num_doubtful = len(self.reasons["doubt"])
+        return [*lines, line + (f"; {num_doubtful:,} doubtful" if num_doubtful else "")]
 
 
 def _list_reasons(reasons: Sequence[tuple[str, str]]) -> list[str]:
@@ -268,7 +257,7 @@ def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
 def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     """Print which scenes a run would do."""
     from gsmerge.batch.run import choose_concurrency, pending_jobs
-    from gsmerge.measure.documents import document_head
+    from gsmerge.measure.documents import document_head, note_entries
 
     out, pending = args.output, pending_jobs(jobs, args.output, options)
     concurrency = choose_concurrency(jobs, options)
@@ -293,7 +282,7 @@ def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> N
             for job in jobs
         ],
         "options": options.settings.to_dict(),
-        "notes": [],
+        **note_entries([]),
     }
     lines = [f"{job.scene} -> {f'refused: {refusal}' if refusal else out / job.output}" for job, refusal in pending]
     refused = f", {num_refused:,} refused" if num_refused else ""

@@ -158,9 +158,8 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     from gsmerge.compaction.report import result_table
     from gsmerge.io.formats.table import VIEWED
 
-    doubts = [document["worse"], document["input"]["left_out"] if args.strict else None]
-    notes = [note for note in document["notes"] if note not in doubts]
-    say_notes(notes, document["doubts"], quiet=args.silent)
+    said_last = document["doubts"] if args.strict else [document["worse"]]
+    say_notes([note for note in document["notes"] if note not in said_last], quiet=args.silent)
     columns, next_step = terminal_columns(sys.stdout), None
     if columns is not None:
         words = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
@@ -171,7 +170,7 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     unchecked = document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]
     if args.strict and unchecked and not document["worse"]:
         say_notes(["--strict: nothing was checked, since there is no photo to compare with"], quiet=args.silent)
-    problems = [document["unmet"], *(doubts if args.strict else [])]
+    problems = [document["unmet"], *(document["doubts"] if args.strict else [])]
     if document["worse"] and not args.strict:
         psnr = document["psnr_input_views"]
         has_loss = "fidelity" in document["choices"] or (psnr["after"] is not None and psnr["after"] < psnr["before"])

@@ -8,11 +8,13 @@ import shutil
 import sys
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from gsmerge.errors import Doubt, list_doubts
 
 if TYPE_CHECKING:
     from gsmerge.runtime.record import Progress
@@ -89,10 +91,10 @@ def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
         print("\n".join(wrap_line(text, terminal_columns(sys.stderr))), file=sys.stderr, flush=True)
 
 
-def say_notes(notes: Sequence[str], doubts: Collection[str] = (), *, quiet: bool = False) -> None:
-    """Print each note on stderr unless ``quiet``; those that are ``doubts`` become warnings."""
+def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
+    """Print each note on stderr unless ``quiet``; doubts are warnings."""
     for note in notes:
-        say(note, kind="warning" if note in doubts else "note", quiet=quiet)
+        say(note, kind="warning" if isinstance(note, Doubt) else "note", quiet=quiet)
 
 
 def terminal_columns(stream: Any) -> int | None:
@@ -224,15 +226,13 @@ class RunEnd(NamedTuple):
     failure: str  # Empty after a run that succeeded
     num_failed: int  # Runs that have failed
     share: float  # Part of the work done so far, 0 to 1
-    worse: str | None = None  # The note that the result is worse than its input, one of ``notes``
     notes: Sequence[str] = ()  # Printed only as JSON
-    doubts: Collection[str] = ()  # Those of the notes that are warnings
 
     @property
     def text(self) -> str:
         """Description, with the number of failures so far."""
         ending = {"skipped": "skipped, since it was done before"}.get(self.status, self.status)
-        ending += ", worse than the input" if self.worse else ""
+        ending += ", doubtful" if list_doubts(self.notes) else ""
         return f"{self.name} {ending}{f', {self.num_failed} failed' if self.num_failed and not self.failure else ''}"
 
 
@@ -250,11 +250,11 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
         stream.move(0.0)
 
         def print_event(end: RunEnd) -> None:
-            for note in end.notes:
-                say(f"{end.name}: {note}", kind="warning" if note in end.doubts else "note")
+            say_notes([type(note)(f"{end.name}: {note}") for note in end.notes])
             stream.move(end.share)
             event = {"scene": end.name, "status": end.status, "done": end.done, "total": total}
-            stream.print({**event, "failed": end.num_failed, "worse": end.worse, "error": end.failure or None})
+            event |= {"failed": end.num_failed, "doubts": list_doubts(end.notes), "error": end.failure or None}
+            stream.print(event)
 
         yield print_event
         return

@@ -75,7 +75,7 @@ def evaluate(args: opt.Args) -> None:
     write_texts({path: writers[path.suffix](document) for path in outputs})
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
-    say_notes(evaluation.notes, evaluation.doubts, quiet=args.silent)
+    say_notes(evaluation.notes, quiet=args.silent)
 
 
 def _check_files(args: opt.Args, outputs: Sequence[Path], inputs: Sequence[Path]) -> None:

@@ -54,7 +54,7 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
 def _check_files(args: opt.Args) -> None:
     """Print a line for each file; SceneError if ``compact`` refuses one."""
     from gsmerge.inspection.file_checks import FileCheck, check_content
-    from gsmerge.measure.documents import document_head
+    from gsmerge.measure.documents import document_head, note_entries
 
     checks, hints = list[FileCheck](), args.hints()
     with stage_progress(quiet=args.silent) as progress:
@@ -62,13 +62,13 @@ def _check_files(args: opt.Args) -> None:
             progress(f"inspect: {path.name}", len(checks), len(args.paths))
             checks.append(check_content(path, opacity=args.opacity, hints=hints))
     wrong, several = [check for check in checks if check.problems], len(checks) > 1
-    notes = [f"{check.path}: {note}" for check in checks for note in check.notes]
+    notes = [type(note)(f"{check.path}: {note}") for check in checks for note in check.notes]
     say_notes(notes, quiet=args.silent)
     document = {
         **document_head(),
         "files": [asdict(check) for check in checks],
         "num_wrong": len(wrong),
-        "notes": notes,
+        **note_entries(notes),
     }
     lines = [check.line for check in checks if several or not check.problems]
     print_document(document, lines, as_json=args.json, quiet=args.quiet)

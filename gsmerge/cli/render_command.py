@@ -67,7 +67,7 @@ def render(args: opt.Args) -> None:
     kind = _choose_kind(args)
     from gsmerge.measure import drawings
     from gsmerge.measure.camera_path import parse_path
-    from gsmerge.measure.documents import document_head
+    from gsmerge.measure.documents import document_head, note_entries
 
     files = args.files(args.scenes[0])
     framing = drawings.frame_files(files, args.cameras, args.images)
@@ -86,7 +86,7 @@ def render(args: opt.Args) -> None:
         drawings.DrawOptions(files, args.scenes, framing, args.output, args.opacity, hints, **arguments)
     )
     document = {**document_head(), "output": str(args.output), "pictures": [str(path) for path in drawing.paths]}
-    document |= drawing.facts
+    document |= drawing.facts | note_entries(drawing.facts["notes"])
     say_notes(document["notes"], quiet=args.silent)
     with stage_progress(quiet=args.silent) as progress:
         document |= drawings.write_drawing(drawing, overwrite=args.overwrite, progress=progress)

@@ -26,7 +26,7 @@ from gsmerge.cli.paths import check_outputs, check_replaced, input_files, write_
 )  # fmt: skip
 def view(args: opt.Args) -> None:
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D and scores in one file."""
-    from gsmerge.measure.documents import document_head
+    from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.pages.data import collect
     from gsmerge.pages.page import headline, speed, speed_words, view_page
     from gsmerge.pages.view import check_page_name, file_gains
@@ -49,10 +49,16 @@ def view(args: opt.Args) -> None:
         )  # fmt: skip
     page = view_page(data)
     write_texts({output: page})
-    say_notes(data.notes, data.doubts, quiet=args.silent)
+    say_notes(data.notes, quiet=args.silent)
     summary = headline(data) + speed_words(speed(data)).replace("\u00a0", " ")
     notes = [*pair.notes, *data.notes]
-    document = {**document_head(), "output": str(output), "notes": notes, "bytes": len(page), "headline": summary}
+    document = {
+        **document_head(),
+        "output": str(output),
+        **note_entries(notes),
+        "bytes": len(page),
+        "headline": summary,
+    }
     print_document(document, f"{output}: {summary}", as_json=args.json, quiet=args.quiet)
     if args.open and not _open(output):
         say(f"open {output.absolute().as_uri()} in a browser", quiet=args.silent)

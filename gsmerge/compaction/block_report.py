@@ -8,6 +8,7 @@ import numpy as np
 
 from gsmerge.compaction.block_start import BlockStart
 from gsmerge.compaction.report import CompactReport
+from gsmerge.errors import Doubt
 from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.runtime.memory import peak_memory
@@ -41,6 +42,6 @@ def join_reports(
     return CompactReport(
         num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
         psnr_after=after, choices=run.choices | {"scored_views": sum(scored)},
-        notes=[*run.notes, *filter(None, [worse])], doubts=[*run.doubts, *filter(None, [worse])],
+        notes=[*run.notes, *([] if worse is None else [Doubt(worse)])],
         options=options.to_dict(), peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference,
     )  # fmt: skip

@@ -145,8 +145,8 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
     """Yield each value with the choices of its record; add the seconds and notes to the current record."""
     for value, record in outcomes:
         add_seconds(record.seconds)
-        for entry in record.entries:
-            note(entry.text, doubt=entry.doubt)
+        for text in record.notes:
+            note(text)
         if stray := record.choices.get("photos_left_out"):
             choose(photos_left_out=[*current_record().choices.get("photos_left_out", ()), *stray])
         yield value, record.choices

@@ -25,7 +25,7 @@ from gsmerge.compaction.new_views import can_try, try_new_views
 from gsmerge.compaction.report import CompactReport
 from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.compaction.search import CountSearch, add_target, build_left_out, level_counts, search_count
-from gsmerge.errors import DoubtWarning, TargetError
+from gsmerge.errors import Doubt, DoubtWarning, TargetError, list_doubts
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
@@ -115,7 +115,7 @@ def _compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
         if simpler == options:
             continue
         with record_part():
-            note(f"{cause}; so it was made again {words}")
+            note(Doubt(f"{cause}; so it was made again {words}"))
             result = _compact_once(scene, simpler)
         if not result.report.is_far:
             return result
@@ -145,7 +145,7 @@ def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
 
 def _warn_of_doubts(report: CompactReport) -> None:
     """Warn the caller of :func:`compact` of everything that makes the result doubtful."""
-    for text in filter(None, [*report.doubts, report.unmet]):
+    for text in filter(None, [*list_doubts(report.notes), report.unmet]):
         warnings.warn(text, DoubtWarning, stacklevel=4)  # the caller: above this function, compact and its decorator
 
 

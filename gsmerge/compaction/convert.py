@@ -26,7 +26,7 @@ from gsmerge.io.formats.table import Contents, Format
 from gsmerge.io.formats.write import lost_harmonics
 from gsmerge.io.photo_files import read_images
 from gsmerge.io.scene_files import find_scene_files, named_path, result_cameras, scene_title
-from gsmerge.measure.documents import document_head
+from gsmerge.measure.documents import document_head, note_entries
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
@@ -71,7 +71,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         stored, unread = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
         count = len(gaussians)
-        rows, left_out = _clean(gaussians, options, stored)
+        rows, dropped = _clean(gaussians, options, stored)
         gaussians = gaussians[rows]
         if len(gaussians) == 0:
             problem = f"expected Gaussians that are kept, found none of {count:,}"
@@ -90,7 +90,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
     notes += [*unread, *describe_extra_columns(columns, missing, format_, moves=options.placement.moves)]
     if "unseen" in options.clean.drops:
-        notes += _unseen_notes(options, left_out["unseen"], count, None if stored is None else stored.path)
+        notes += _unseen_notes(options, dropped["unseen"], count, None if stored is None else stored.path)
     names = () if stored is None else stored.names
     notes += lost_harmonics(options.output, gaussians.sh_degree) + rounding_notes(options.output, gaussians)
     comments, comment_notes = _join_comments(infos, format_, moves=options.placement.moves)
@@ -108,8 +108,8 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     old = viewer_cameras_path(options.output)
     if camera_path is None and not format_.has_cameras and old.is_file():
         notes.append(f"{old} is of an earlier file of that name, not of this one: delete it")
-    document = document_head() | {"inputs": inputs, "cameras": input_cameras, "left_out": left_out, "output": facts}
-    return document | {"viewer_cameras": camera_path, "notes": notes}
+    document = document_head() | {"inputs": inputs, "cameras": input_cameras, "dropped": dropped, "output": facts}
+    return document | {"viewer_cameras": camera_path, **note_entries(notes)}
 
 
 def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -> tuple[list[str], list[str]]:
@@ -131,8 +131,8 @@ def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -
 def conversion_line(document: dict[str, Any]) -> str:
     """Describe a conversion in one line of text."""
     before, after = sum(entry["num_gaussians"] for entry in document["inputs"]), document["output"]
-    total = "" if after["num_gaussians"] == before and not document["left_out"] else f" of {before:,}"
-    reasons = describe_counts(document["left_out"], placed=document["cameras"] is None)
+    total = "" if after["num_gaussians"] == before and not document["dropped"] else f" of {before:,}"
+    reasons = describe_counts(document["dropped"], placed=document["cameras"] is None)
     left_out = f" (left out: {reasons})" if reasons else ""
     camera_path = document["viewer_cameras"]
     cameras = f"; cameras in {Path(camera_path).name}" if camera_path else ""

@@ -18,7 +18,7 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
-from gsmerge.measure.documents import document_head
+from gsmerge.measure.documents import document_head, note_entries, note_lines
 from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, choose_for_scene, resolve_budget, stands_alone
 from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
 from gsmerge.runtime.record import record_run
@@ -27,6 +27,8 @@ from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
 from gsmerge.values.words import count_words
+
+BESIDE = ("cameras", "images", "masks", "protect")  # files and folders that are read with the Gaussians
 
 
 def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
@@ -127,15 +129,15 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
         if settings.method == OURS and settings.checkpoint != "auto":  # a named checkpoint, which the run may refuse
             load_networks(settings, measure_size(scene))
         run = estimate(scene, settings)
-    paths = {name: path and str(path) for name, path in vars(load.files).items() if name not in ("more", "named")}
+    paths = {name: path and str(path) for name, path in vars(load.files).items() if name in BESIDE}
     return {
         **document_head(),
         "dry_run": True,
-        "input": {**paths, "num_gaussians": scene.num_gaussians, **load.recognised},
+        "input": load.recognised | paths,
         "output": {"path": str(out)},
         "compact": run,
         "options": settings.to_dict(),
-        "notes": [*notes, *record.notes],
+        **note_entries([*notes, *record.notes]),
     }
 
 
@@ -146,8 +148,8 @@ def plan_lines(document: Mapping[str, Any]) -> list[str]:
     inside = find_format(out).levels == "inside"
     levels = f", and {count_words(document['options']['levels'], 'level')} in chunks beside it" if inside else ""
     return [
-        f"would read {scene['ply']}: {f'{number} views of {size}' if number else 'no views'}",
+        f"would read {scene['path']}: {f'{number} views of {size}' if number else 'no views'}",
         f"would write {out}{levels}",
         *estimate_lines(document["compact"]),
-        *(f"note       {note}" for note in document["notes"]),
+        *note_lines(document["notes"]),
     ]

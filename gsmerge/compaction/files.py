@@ -22,15 +22,15 @@ from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.write import lost_harmonics
 from gsmerge.io.scene_files import SceneFiles, result_cameras, scene_title
-from gsmerge.photos.compare import STRAY_PHOTOS
+from gsmerge.measure.documents import file_sha256
 from gsmerge.runtime.memory import release_memory
-from gsmerge.runtime.record import Progress, list_some
+from gsmerge.runtime.record import Progress
+from gsmerge.scene.content_hash import doubt_changed, list_changed, read_stats
 from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene
-from gsmerge.values.words import count_words
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def compact_files(
     format_ = output_format(out, levels=True, cameras=True)
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         temporary = add(out)
-        load = read_input(files, opacity=opacity, hints=hints)
+        load = read_input(files, opacity=opacity, hints=hints, hashed=hashed)
         on_read(load)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
@@ -91,16 +91,13 @@ def compact_files(
         written = format_.write(add, out, temporary, contents)
         if cameras_path is not None:
             add_views(add, cameras_path, cameras, names, overwrite=outputs.overwrite)
-        stray = result.report.choices.get("photos_left_out", ())
-        problem = f"{count_words(len(stray), 'photo')} {STRAY_PHOTOS}: {list_some(stray)}" if stray else None
-        recognised = load.recognised | {"left_out": "; ".join(filter(None, (load.left_out, problem))) or None}
+        notes += doubt_changed(load.stats)
         document = report_document(
-            result.report, input_paths=files.plys, output_path=out,
+            result.report, recognised=load.recognised, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
             seconds_after={"write": perf_counter() - compacted},
             coarser=[(path, level.report) for path, level in zip([*written][1:], result.coarser, strict=True)],
-            recognised=recognised, notes=[*load.notes, *notes], hashed=hashed,
-            written_at=written, cameras_path=cameras_path,
+            notes=[*load.notes, *notes], written_at=written, cameras_path=cameras_path,
         )  # fmt: skip
     format_.finish(out)
     return document
@@ -126,11 +123,20 @@ def _views_once(scene: Scene) -> list[int]:
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
 
 
-def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> Loaded:
-    """Read a scene from its files, with notes on missing or unusual content; SceneError if it cannot be read."""
+def read_input(
+    files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS, hashed: bool = False
+) -> Loaded:
+    """Read a scene from its files, with notes on missing or unusual content; nothing else of them is needed later.
+
+    ``hashed``: also hash the Gaussians. SceneError if it cannot be read, or if a file changes meanwhile.
+    """
+    stats = read_stats(files)
     loaded = load_files(files, opacity=opacity, hints=hints).without_photos()
+    sha256 = file_sha256(*files.all_plys) if hashed else None
+    if changed := list_changed(stats):
+        raise SceneError(changed[0], "changed while it was read", "run this again when the file is complete")
     release_memory()
-    return replace(loaded, notes=(*loaded.notes, *_compact_notes(loaded)))
+    return replace(loaded, stats=stats, sha256=sha256, notes=(*loaded.notes, *_compact_notes(loaded)))
 
 
 def _compact_notes(loaded: Loaded) -> list[str]:

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.compaction.new_views import NewViews
-from gsmerge.measure.documents import document_head, file_sha256, seconds_document, seconds_line, text_table, wrap_line
+from gsmerge.errors import Doubt, list_doubts
+from gsmerge.measure.documents import document_head, note_entries, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.raster.metrics import psnr_words
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.values.words import count_words
@@ -72,7 +73,6 @@ class CompactReport:
             ``fidelity`` has the ``psnr`` (dB) against renders of the input and the number of ``views`` for it; these
             are ``held_out`` if they were placed because the scene has no cameras.
         notes: Warnings about the input and adaptations to it, one sentence each.
-        doubts: Those of the notes that make the result doubtful.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how near the result came; None if it is met.
@@ -109,15 +109,19 @@ class CompactReport:
     new_views: NewViews | None = None
     photo_files: PhotoFiles | None = None
     protected: Covered | None = None
-    doubts: Sequence[str] = ()
     is_far: bool = False
 
     def __repr__(self) -> str:
         return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"
 
+    @property
+    def doubts(self) -> list[str]:
+        """Those of the notes that make the result doubtful."""
+        return list_doubts(self.notes)
+
     def to_dict(self) -> dict[str, Any]:
-        """Return the report as plain JSON types, by the names of its fields."""
-        return asdict(self)
+        """Return the report as plain JSON types, by the names of its fields, with ``doubts``."""
+        return asdict(self) | {"doubts": self.doubts}
 
     def _facts(self) -> list[tuple[str, str]]:
         """List the main facts, each with its name."""
@@ -135,27 +139,24 @@ class CompactReport:
 def report_document(
     report: CompactReport,
     *,
-    input_paths: Sequence[Path],
+    recognised: Mapping[str, Any],
     output_path: Path,
     seconds_before: Mapping[str, float],
     seconds_after: Mapping[str, float],
     coarser: Sequence[tuple[Path, CompactReport]] = (),
-    recognised: Mapping[str, Any] | None = None,
     notes: Sequence[str] = (),
-    hashed: bool = True,
     written_at: Mapping[Path, Sequence[Path]] | None = None,
     cameras_path: Path | None = None,
 ) -> dict[str, Any]:
     """Return the report of one ``compact`` run as plain JSON types.
 
-    ``seconds_before`` and ``seconds_after``: wall time by name before the report's stages (imports, reading) and after
-    them (writing). ``coarser``: file and report of each coarser level of detail. ``recognised``: facts about the input
-    in addition to path, bytes and count. ``notes``: notes of the reader, which come before those of the report.
-    ``hashed``: also hash the input, which takes time on large files. ``written_at``: the temporary files of each
-    output, before they are renamed. ``cameras_path``: the file of the views for viewers, if any.
+    ``recognised``: facts about the input. ``seconds_before`` and ``seconds_after``: wall time by name before the
+    report's stages (imports, reading) and after them (writing). ``coarser``: file and report of each coarser level of
+    detail. ``notes``: notes of the reader, which come before those of the report. ``written_at``: the temporary files
+    of each output, before they are renamed. ``cameras_path``: the file of the views for viewers, if any.
 
     Returns:
-        ``schema_version`` 1; within a version keys are only added. ``unmet``: why a target is not met, or null.
+        ``schema_version``; within a version keys are only added. ``unmet``: why a target is not met, or null.
         ``new_views``: the expected PSNR of new views ``before`` and ``after``, estimated on so many ``views`` that a
         short fit left out; null with fewer than four photos, or if it was not asked for. ``psnr_reference``: what
         ``psnr_input_views`` are measured against: "photos", or other pictures. ``psnr_covered``: ``share``,
@@ -168,13 +169,7 @@ def report_document(
     numbers, at = asdict(report), written_at or {}
     return {
         **document_head(),
-        "input": {
-            "path": os.fspath(input_paths[0]),
-            "sha256": file_sha256(*input_paths) if hashed else None,
-            "bytes": sum(path.stat().st_size for path in input_paths),
-            "num_gaussians": numbers["num_input"],
-            **(recognised or {}),
-        },
+        "input": {**recognised, "num_gaussians": numbers["num_input"]},
         "output": _file_facts(output_path, report, at),
         "levels": [
             {
@@ -185,7 +180,7 @@ def report_document(
                 "psnr_protected": level.protected and asdict(level.protected),
                 "seconds": round(sum(level.seconds.values()), 4),
                 "choices": level.choices,
-                "notes": level.notes,
+                **note_entries(level.notes),
             }
             for path, level in coarser
         ],
@@ -202,8 +197,7 @@ def report_document(
         "psnr_photo_files": numbers["photo_files"],
         "psnr_protected": numbers["protected"],
         "peak_memory_bytes": numbers["peak_memory_bytes"],
-        "notes": [*notes, *numbers["notes"]],
-        "doubts": list(report.doubts),
+        **note_entries([*notes, *report.notes, *(Doubt(level.worse) for _, level in coarser if level.worse)]),
         "unmet": numbers["unmet"],
         "worse": next((entry.worse for entry in (report, *(level for _, level in coarser)) if entry.worse), None),
     }

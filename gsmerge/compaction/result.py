@@ -16,6 +16,7 @@ from gsmerge.compaction.outputs import write_result
 from gsmerge.compaction.report import CompactReport, compared_psnr
 from gsmerge.compaction.scores import PartScores, measure_parts, score_input
 from gsmerge.compaction.search import SearchFacts
+from gsmerge.errors import Doubt
 from gsmerge.facts.prepare import Prepared
 from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.plan import Plan
@@ -151,7 +152,7 @@ def make_result(
     main = main if worse is None else with_worse(main, worse)
     main = replace(
         main, choices=run.choices | main.choices | search.choices, notes=[*run.notes, *search.notes, *main.notes],
-        doubts=[*run.doubts, *main.doubts], unmet=search.unmet, new_views=new_views,
+        unmet=search.unmet, new_views=new_views,
     )  # fmt: skip
     coarser = tuple(
         CompactResult(
@@ -180,7 +181,7 @@ def _report(
     report = CompactReport(
         prepared.input_scene.num_gaussians, len(candidate.gaussians), dict(seconds), before, after, record.choices,
         record.notes, plan.settings, peak_memory(), psnr_reference=None if before is None else reference.name,
-        doubts=record.doubts, **vars(parts),
+        **vars(parts),
     )  # fmt: skip
     if prepared.doubt is not None:  # no score says anything, so the report has none
         choices = {key: value for key, value in record.choices.items() if key != "fidelity"}
@@ -200,7 +201,7 @@ def _report(
 
 def with_worse(report: CompactReport, worse: str) -> CompactReport:
     """Add the doubt that a result is worse than its input."""
-    return replace(report, notes=[*report.notes, worse], doubts=[*report.doubts, worse], worse=worse)
+    return replace(report, notes=[*report.notes, Doubt(worse)], worse=worse)
 
 
 def _expect_new_views(

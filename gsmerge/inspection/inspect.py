@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge.cameras import check_cameras
 from gsmerge.compaction.estimate import estimate, estimate_lines
-from gsmerge.errors import SceneError
+from gsmerge.errors import Doubt, SceneError
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.pixels import raise_sizes, with_pixels
 from gsmerge.facts.place_cameras import add_scored_views
@@ -27,7 +27,7 @@ from gsmerge.io.formats.read import degree_notes
 from gsmerge.io.photo_files import photo_array
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.measure.coverage import coverage, extents
-from gsmerge.measure.documents import finite
+from gsmerge.measure.documents import finite, note_entries, note_lines
 from gsmerge.photos.compare import compare_photos
 from gsmerge.plan import describe_share
 from gsmerge.raster.photos import LEAST_OPACITY
@@ -114,7 +114,7 @@ def inspect(
         described = _describe_file(ply) | {"batches": list_batches(files.ply) if files.is_state else []}
         report_progress("inspect: views", 2, 3)
         document: dict[str, Any] = finite(described | _describe_views(ply, files, read_hints))
-        document["notes"] = [*document["notes"], *degree_notes(ply.info)]
+        document |= note_entries([*document["notes"], *degree_notes(ply.info)])
     return document
 
 
@@ -159,7 +159,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         "cameras": files.cameras and str(files.cameras),
         "images": files.images and str(files.images),
         "exporter": _OWN if is_result else "not known before the cameras fit",
-        "notes": file_notes(ply.info),
+        **note_entries(file_notes(ply.info)),
         **dict.fromkeys(("num_views", "width", "height", "num_missing", "num_sky_views"), 0),
         **dict.fromkeys(_UNKNOWN_KEYS),
         "coverage": [],
@@ -199,7 +199,7 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     agreement = confirm_depths(canonical)
     doubts = [unlike_captures(canonical.gaussians), None if agreement is None else agreement.doubt]
     facts: dict[str, Any] = {
-        "notes": [*load.notes, *views_notes(scene), *notes, *filter(None, doubts)],
+        **note_entries([*load.notes, *views_notes(scene), *notes, *map(Doubt, filter(None, doubts))]),
         "num_views": len(load.scene),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),
@@ -260,7 +260,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         lines += [f"auto       --budget auto takes {share}: {auto['why']}"]
     repeated = () if scene["alignment_problem"] is None and scene["rows"] is None else _REPEATED
     notes = [note for note in scene["notes"] if not note.startswith(repeated)]
-    return [line for line in lines if line] + [f"note       {note}" for note in notes]
+    return [line for line in lines if line] + note_lines(notes)
 
 
 def _batch_lines(batches: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -105,6 +105,11 @@ class SceneFiles:
         return self.parts or (self.ply,)
 
     @property
+    def all_plys(self) -> tuple[Path, ...]:
+        """Paths of the Gaussians of all scenes of the same place, in the order of their rows."""
+        return tuple(ply for files in (self, *self.more) for ply in files.plys)
+
+    @property
     def paths(self) -> tuple[Path, ...]:
         """Paths of all files and folders that the scene is read from: Gaussians, cameras and pictures."""
         beside = (self.cameras, self.images, self.masks, self.protect, *self.others)

@@ -11,9 +11,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gsmerge.errors import Doubt, list_doubts
 from gsmerge.version import __version__
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MAX_WIDTH = 10_000  # columns of a table that is not printed on a terminal
 MIN_NAME = 12  # least width of a table's first column in a narrow terminal
 
@@ -31,6 +32,17 @@ def file_sha256(*paths: Path) -> str:
 def document_head() -> dict[str, Any]:
     """Return the first entries of every JSON document."""
     return {"schema_version": SCHEMA_VERSION, "tool": {"name": "gsmerge", "version": __version__}}
+
+
+def note_entries(notes: Iterable[str]) -> dict[str, Any]:
+    """Return the entries of a document for notes: all ``notes``, and the ``doubts`` among them."""
+    notes = list(notes)
+    return {"notes": notes, "doubts": list_doubts(notes)}
+
+
+def note_lines(notes: Iterable[str]) -> list[str]:
+    """Return a line for each note; doubts are warnings, as in all commands."""
+    return [f"{'warning' if isinstance(note, Doubt) else 'note':11}{note}" for note in notes]
 
 
 def to_json(document: Mapping[str, Any]) -> str:

@@ -10,7 +10,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.errors import UsageError
+from gsmerge.errors import Doubt, UsageError, list_doubts
 from gsmerge.facts.prepare import scored_pictures
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
@@ -21,7 +21,7 @@ from gsmerge.photos.views import pick_views
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
 from gsmerge.raster.photos import COVERED, NEAR_PLANE, WHOLE
-from gsmerge.runtime.record import Note, Progress
+from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.input import check_scene
 from gsmerge.settings.evaluate import EvaluateOptions
@@ -115,7 +115,6 @@ class Evaluation(ArrayFields):
         notes: Warnings, one sentence each.
         options: Settings of the evaluation.
         pictures: ``[v,h,w,3]`` of the input views: photos, or the model's own pixels; None: renders of the input.
-        doubts: Those of the notes that say that a result is worse than the input, or that the figures mean little.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -131,7 +130,11 @@ class Evaluation(ArrayFields):
     notes: tuple[str, ...]
     options: EvaluateOptions = EvaluateOptions()
     pictures: np.ndarray | None = None
-    doubts: tuple[str, ...] = ()
+
+    @property
+    def doubts(self) -> list[str]:
+        """Those of the notes that say that a result is worse than the input, or that the figures mean little."""
+        return list_doubts(self.notes)
 
     def __repr__(self) -> str:
         scores = ", ".join(f"{row[0]} {row[2]} dB" if len(row) > 2 else row[0] for row in self._rows()[1:])
@@ -262,9 +265,8 @@ def evaluate(
         for name, gaussians in scored.items()
     ]
     counts = {name: len(split.scored) for name, split in splits.items()}
-    found = list(_notes(splits, scores, mended=mended))
-    notes, doubts = (*lpips_notes, *(one.text for one in found)), tuple(one.text for one in found if one.doubt)
-    return Evaluation(tuple(scores), _name_reference(splits), counts, notes, options, scene.images, doubts)
+    notes = (*lpips_notes, *_notes(splits, scores, mended=mended))
+    return Evaluation(tuple(scores), _name_reference(splits), counts, notes, options, scene.images)
 
 
 def _without_missing(options: EvaluateOptions) -> tuple[EvaluateOptions, tuple[str, ...]]:
@@ -287,21 +289,21 @@ def near_plane(scene: Scene) -> float:
     return NEAR_PLANE * scene_frame(scene).unit
 
 
-def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mended: bool) -> Iterator[Note]:
+def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mended: bool) -> Iterator[str]:
     """Yield notes on results that are clearly worse than the input, and on figures that may mislead."""
     photos = "context" in splits and splits["context"].reference == PHOTOS
     psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
     if photos and INPUT in psnrs and not mended:
         losses = (describe_loss(name, psnrs[INPUT], psnr, OWN_PHOTOS) for name, psnr in psnrs.items())
-        yield from (Note(loss, doubt=True) for loss in losses if loss is not None)
-    yield from map(Note, filter(None, (describe_fog(score.name, score.fog[ALL]) for score in scores if score.fog)))
+        yield from (Doubt(loss) for loss in losses if loss is not None)
+    yield from filter(None, (describe_fog(score.name, score.fog[ALL]) for score in scores if score.fog))
     if "target" not in splits:
-        yield Note("no held-out views were given; on input views, fitted results score better than on new views")
+        yield "no held-out views were given; on input views, fitted results score better than on new views"
     elif (share := splits["target"].visible.mean()) < MIN_SEEN_SHARE:
         seen = f"the input views have seen only {100 * share:.0f} % of the held-out views"
-        yield Note(f"{seen}, which may be of another scene or in another world", doubt=True)
+        yield Doubt(f"{seen}, which may be of another scene or in another world")
     if photos and mended:
-        yield Note(MENDED)
+        yield MENDED
 
 
 def _splits(

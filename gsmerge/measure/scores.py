@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
-from gsmerge.measure.documents import csv_text, document_head, text_table, wrap_line
+from gsmerge.measure.documents import csv_text, document_head, note_entries, text_table, wrap_line
 from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.raster.photos import WHOLE
@@ -51,8 +51,7 @@ def evaluation_document(
         **({"lpips_views": evaluation.options.lpips_views} if _some_lpips(evaluation) else {}),
         "num_views": dict(evaluation.num_views),
         "results": [_result(result, evaluation, facts.get(result.name, {})) for result in evaluation.results],
-        "notes": [*notes, *evaluation.notes],
-        "doubts": list(evaluation.doubts),
+        **note_entries([*notes, *evaluation.notes]),
     }
 
 

@@ -78,7 +78,6 @@ class ViewData:
     notes: tuple[str, ...]  # warnings and limits, one sentence each
     lacks_pixels: bool = False  # if True, the scene itself does not cover all pixels of the input views
     agreement: Agreement | None = None  # share of the depth that other views confirm; None: not known
-    doubts: tuple[str, ...] = ()  # those of the notes that are warnings
 
     @property
     def shown(self) -> tuple[PageView, ...]:
@@ -177,7 +176,7 @@ def _collect(
     agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
     return ViewData(
         title, tuple(sides), shown, outside, len(views), evaluation.reference, notes,
-        lacks_pixels, agreement, doubts=evaluation.doubts,
+        lacks_pixels, agreement,
     )  # fmt: skip
 
 

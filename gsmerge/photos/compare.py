@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.errors import Doubt
 from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels.pictures import convolve
 from gsmerge.photos.assign import Assigner, Candidates
@@ -76,7 +77,8 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
         if is_exchanged := are_exchanged(pairs[matching or photo_views]):
             problem = "red and blue are exchanged between Gaussians and photos: either f_dc_0 and f_dc_2 of the file or"
             problem += " the photos are in the order blue, green, red; the scene keeps its own colours"
-        note(f"{problem}; --set look=photos gives it the look of the photos", doubt=is_exchanged)
+        text = f"{problem}; --set look=photos gives it the look of the photos"
+        note(Doubt(text) if is_exchanged else text)
         return scene, ()
     stray = [view for view in photo_views if view not in matching]
     if stray and not _leave_out(scene, stray, photo_views):
@@ -241,7 +243,7 @@ def _leave_out(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence
     result = f" and are not used: {listed}"
     if not are_few:
         result = f", so no photo is used: {listed}; check their names and order"
-    note(f"{len(stray)} of {len(photo_views)} photos {STRAY_PHOTOS}{result}")
+    note(Doubt(f"{len(stray)} of {len(photo_views)} photos {STRAY_PHOTOS}{result}"))
     return are_few
 
 

@@ -17,7 +17,7 @@ from pathlib import Path, PurePath
 import numpy as np
 
 from gsmerge.cameras import ESTIMATED
-from gsmerge.errors import SceneError
+from gsmerge.errors import Doubt, SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, sizes_of
 from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import read_cameras
@@ -273,7 +273,7 @@ def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_
 def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:
     """Leave out photos that do not have the aspect ratio of most photos, and their views if the cameras have neither.
 
-    Returns the cameras and the photos of all other views, and a note on the views that are left out. None if that is
+    Returns the cameras and the photos of all other views, and a doubt if views are left out. None if that is
     not possible, because there are no photos, all have one aspect ratio, or a single view would remain.
     """
     paths = proposal.paths
@@ -293,9 +293,9 @@ def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[Camer
     if len(used) < 2 or (len(used) == len(paths) and not others):
         return None
     unused = [camera_file.names[view] for view in range(len(paths)) if view not in used]
-    note = f"{len(unused)} of {len(paths)} views are left out, since they do not have {shape}: {list_some(unused)}"
+    doubt = f"{len(unused)} of {len(paths)} views are left out, since they do not have {shape}: {list_some(unused)}"
     fewer = proposal.without_files({path: f"{size}, not {shape}" for path, size in others.items()})
-    return select_views(camera_file, used), fewer.select_views(used), [note] if unused else []
+    return select_views(camera_file, used), fewer.select_views(used), [Doubt(doubt)] if unused else []
 
 
 def _turned_size(path: Path, turn: int) -> Size:
@@ -408,8 +408,8 @@ def _inside(path: Path, proposal: Proposal) -> str:
 
 def describe_assignment(
     proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile, *, are_pixels: bool
-) -> tuple[list[str], list[str]]:
-    """Describe where the assignment of photos differs from their names; return notes, and notes on missing photos.
+) -> list[str]:
+    """Describe where the assignment of photos differs from their names, and doubt views whose photos are left out.
 
     ``are_pixels``: the rows are pixels of the views, so no view lacks its camera.
     """
@@ -435,9 +435,9 @@ def describe_assignment(
     notes += _describe_spare(proposal, chosen, are_pixels=are_pixels)
     missing = [view for view, assignment in enumerate(chosen) if assignment is None]
     if not missing:
-        return notes, []
+        return notes
     reasons = [_explain(proposal, view, camera_file.names[view]) for view in missing]
-    return notes, [f"photos of {len(missing)} of {count} views are left out: {list_some(reasons, '; ')}"]
+    return [*notes, Doubt(f"photos of {len(missing)} of {count} views are left out: {list_some(reasons, '; ')}")]
 
 
 def _explain(proposal: Proposal, view: int, name: str) -> str:

@@ -28,14 +28,6 @@ MAX_NAMED = 4  # largest number of items that a note lists
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
 
-@dataclass(frozen=True)
-class Note:
-    """A sentence for the user about a run."""
-
-    text: str
-    doubt: bool = False  # The result may be poor or wrong: commands show a warning, and Python raises a DoubtWarning
-
-
 class Part(NamedTuple):
     """A part of a run: the seconds of its fits and of all other stages, of which only the ratios count here."""
 
@@ -94,19 +86,9 @@ class Record:
     progress: Progress | None = None  # Called with (stage, done, total)
     seconds: dict[str, float] = field(default_factory=dict)  # Wall time of each stage
     choices: dict[str, Any] = field(default_factory=dict)  # Decisions of the stages
-    entries: list[Note] = field(default_factory=list)  # Warnings and adaptations, each once
+    notes: list[str] = field(default_factory=list)  # Warnings and adaptations, each once
     running: str | None = None  # The stage that is being timed
     forecast: Forecast = field(default_factory=Forecast)  # Of the whole run; parts of the run share it
-
-    @property
-    def notes(self) -> list[str]:
-        """The texts of all notes."""
-        return [entry.text for entry in self.entries]
-
-    @property
-    def doubts(self) -> list[str]:
-        """The texts of the notes that make the result doubtful."""
-        return [entry.text for entry in self.entries if entry.doubt]
 
 
 _current: ContextVar[Record | None] = ContextVar("record", default=None)
@@ -178,11 +160,11 @@ def list_some(items: Sequence[str], separator: str = ", ") -> str:
     return separator.join(items[:MAX_NAMED]) + rest
 
 
-def note(text: str, *, doubt: bool = False) -> None:
-    """Add a :class:`Note` to the current record, unless it has it already, and its text to the package's log."""
+def note(text: str) -> None:
+    """Add a note or a :class:`Doubt` to the current record, unless it has it already, and to the package's log."""
     record = current_record()
     if text not in record.notes:
-        record.entries.append(Note(text, doubt))
+        record.notes.append(text)
         logging.getLogger("gsmerge").info(text)
 
 
@@ -202,7 +184,7 @@ def adopt(part: Record) -> None:
     """Copy choices and notes of a part's record into the current record."""
     record = current_record()
     record.choices |= part.choices
-    record.entries += [entry for entry in part.entries if entry.text not in record.notes]
+    record.notes += [text for text in part.notes if text not in record.notes]
 
 
 def expect_parts(parts: Iterable[Part]) -> None:

@@ -1,14 +1,15 @@
-"""Hash all files that a scene is read from, and fill the names of scenes into paths."""
+"""Hash all files that a scene is read from, see whether they change, and fill the names of scenes into paths."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import Doubt, SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES, read_cameras
 from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.dataparser import DATAPARSER
@@ -16,6 +17,7 @@ from gsmerge.io.cameras.foreign import INTRINSICS
 from gsmerge.io.cameras.long_lrm import FRAMES_FILE
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.photos.scene_photos import propose_photos
+from gsmerge.values.words import count_words
 
 EXTRA_FILES = (DATAPARSER, INTRINSICS, FRAMES_FILE)  # read with some camera files
 
@@ -30,14 +32,44 @@ def content_hash(files: Sequence[Path]) -> str:
     """Compute one SHA-256 over the names and contents of files and of everything in folders."""
     state = hashlib.sha256()
     for root in files:
-        paths = sorted(path for path in walk_files(root) if path.is_file()) if root.is_dir() else [root]
-        for path in paths:
+        for path in _walk(root):
             name = path.relative_to(root).as_posix() if root.is_dir() else path.name
             with read_errors(path), path.open("rb") as file:
                 state.update(f"{len(name)}:{name}:{path.stat().st_size}:".encode())
                 while block := file.read(1 << 20):
                     state.update(block)
     return state.hexdigest()
+
+
+def _walk(root: Path) -> list[Path]:
+    """List a file, or all files in a folder, sorted."""
+    return sorted(path for path in walk_files(root) if path.is_file()) if root.is_dir() else [root]
+
+
+def read_stats(files: SceneFiles) -> dict[Path, tuple[int, ...]]:
+    """Return size, time of change and inode of each file of a scene, for :func:`list_changed`."""
+    roots = [root for scene in (files, *files.more) for root in scene.paths]
+    return {path: stat for root in roots for path in _walk(root) if (stat := _read_stat(path)) is not None}
+
+
+def list_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
+    """List the files whose content has changed since their ``stats`` were read, but not those that are gone."""
+    return [str(path) for path, stat in stats.items() if _read_stat(path) not in (None, stat)]
+
+
+def doubt_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
+    """Doubt a result, in at most one note, if files of its scene have changed since they were read."""
+    changed = list_changed(stats)
+    more = f" and {count_words(len(changed) - 1, 'other file')}" if len(changed) > 1 else ""
+    text = "changed during the run; the result is of what was read before"
+    return [Doubt(f"{changed[0]}{more} {text}")] if changed else []
+
+
+def _read_stat(path: Path) -> tuple[int, ...] | None:
+    with suppress(OSError):
+        stat = path.stat()
+        return stat.st_size, stat.st_mtime_ns, stat.st_ino
+    return None
 
 
 def list_files(files: SceneFiles) -> list[Path]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from gsmerge.cameras import Alignment, Recovery
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, list_doubts
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.arrays import FLAT_COMMENT
 from gsmerge.io.formats.read import FileInfo, kept_comments
@@ -27,7 +27,7 @@ class Loaded:
     # the cameras as stored in their file, in the order of the views; None without cameras, or if they do not fit
     cameras: CameraFile | None
     exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
-    notes: tuple[str, ...]  # adapted or unusual content, one sentence each, without a full stop
+    notes: tuple[str, ...]  # adapted or unusual content and doubts, one sentence each, without a full stop
     # how well every view's Gaussians project into their own pixels; None if rows have no pixels
     alignment: Alignment | None = None
     recovery: Recovery | None = None  # the layout of rows that fits best, and by how much; None without pixels
@@ -35,8 +35,9 @@ class Loaded:
     # how far each camera was moved to its Gaussians; empty if none was moved
     moves: Sequence[dict[str, Any]] = ()
     joined: Sequence[dict[str, Any]] = ()  # where each of several joined scenes lies; empty for one scene
-    left_out: str | None = None  # the note on files beside the scene that do not belong to it
     photos_explain: bool = False  # whether the photos that names propose explain what most views show
+    stats: Mapping[Path, tuple[int, ...]] = field(default_factory=dict)  # of the files before they were read
+    sha256: str | None = None  # of the files of Gaussians, one after the other; None if it was not asked for
     own_views: int = 0  # views of the grid that rows without pixels here form by themselves; 0 if they form none
 
     def pixel_scene(self) -> Scene:
@@ -45,14 +46,14 @@ class Loaded:
             return self.scene
         raise SceneError(self.info.path, self.problem or "expected one Gaussian per pixel")
 
+    @property
+    def doubts(self) -> list[str]:
+        """Those of the notes that make results doubtful, as on cameras and photos that are left out."""
+        return list_doubts(self.notes)
+
     def without_photos(self) -> Loaded:
         """Return a copy without the photos inside the camera file, which frees memory; the scene keeps its own."""
         return replace(self, cameras=None if self.cameras is None else replace(self.cameras, images=()))
-
-    def with_left_out(self, notes: Sequence[str]) -> Loaded:
-        """Return a copy with notes on files that were found beside the scene and are not used."""
-        left_out = "; ".join(filter(None, (self.left_out, *notes))) or None
-        return replace(self, notes=(*self.notes, *notes), left_out=left_out) if notes else self
 
     @property
     def comments(self) -> tuple[str, ...]:
@@ -63,14 +64,15 @@ class Loaded:
     def recognised(self) -> dict[str, Any]:
         """Facts about the input for a report."""
         cameras, recovery, info = self.scene.cameras, self.recovery, self.info
-        facts: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+        facts: dict[str, Any] = {"path": str(self.files.ply), "sha256": self.sha256, "bytes": info.file_bytes}
+        facts |= {"num_gaussians": self.scene.num_gaussians}
+        facts |= {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
         facts |= {"num_photos": len(self.scene.photo_views)}
         facts |= {"exporters": [entry.name for entry in self.exporters], "rows": recovery and recovery.description}
-        facts |= {"moved_cameras": list(self.moves), "bytes": info.file_bytes}
+        facts |= {"moved_cameras": list(self.moves)}
         if self.files.parts:
             facts["parts"] = [str(path) for path in self.files.parts]
         if self.joined:
-            num_bytes = sum(os.stat(file["path"]).st_size for file in self.joined if file["joined"])
-            facts |= {"files": list(self.joined), "bytes": num_bytes}
+            facts["files"] = list(self.joined)
         facts |= {"layout": info.layout, "sh_degree": info.sh_degree, "opacity_encoding": info.opacity_encoding}
-        return facts | {"num_nonfinite": info.num_nonfinite, "left_out": self.left_out}
+        return facts | {"num_nonfinite": info.num_nonfinite}

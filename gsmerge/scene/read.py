@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gsmerge.cameras import ESTIMATED, NO_CAMERAS_USED, AlignmentResult, align, check_pixels
-from gsmerge.errors import SceneError
+from gsmerge.errors import Doubt, DoubtWarning, SceneError
 from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
@@ -61,6 +61,7 @@ from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
 T = TypeVar("T")
+SUMS = ("file_bytes", "num_nonfinite")  # facts about the files of several scenes that are added
 
 
 @check_arguments
@@ -107,8 +108,8 @@ def read_scene(
     load = load_scene(
         path, *more, cameras=cameras, images=images, masks=masks, protect=protect, opacity=opacity, **hints
     )
-    if load.left_out is not None:
-        warnings.warn(load.left_out, stacklevel=2)
+    for doubt in load.doubts:
+        warnings.warn(doubt, DoubtWarning, stacklevel=3)  # the caller: above this function and its decorator
     return load.scene
 
 
@@ -146,18 +147,18 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
 
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
     scene, used = joined.scene, [loads[i] for i in joined.used]
-    notes = [f"{name}: {text}" for name, load in zip(joined.names, loads, strict=True) for text in load.notes]
+    named = zip(joined.names, loads, strict=True)
+    notes = [type(text)(f"{name}: {text}") for name, load in named for text in load.notes]
     return replace(
         used[0],
         scene=scene,
-        info=replace(used[0].info, num_nonfinite=sum(load.info.num_nonfinite for load in used)),
+        info=replace(used[0].info, **{name: sum(getattr(load.info, name) for load in used) for name in SUMS}),
         files=files,
         exporters=tuple(dict.fromkeys(exporter for load in used for exporter in load.exporters)),
         notes=(*notes, *joined.notes),
         alignment=check_pixels(scene),
         moves=[move for load in used for move in load.moves],
         joined=joined.facts,
-        left_out="; ".join(load.left_out for load in loads if load.left_out is not None) or None,
     )
 
 
@@ -229,7 +230,7 @@ def _fit_for_certain(load: Loaded, files: SceneFiles) -> bool:
     Without photos, cameras beside the scene are believed, and those in folders below it are not.
     """
     if load.scene.images is None:
-        return not files.below and (load.left_out is None or load.scene.has_own_pixels)
+        return not files.below and (load.scene.has_own_pixels or not load.doubts)
     return load.scene.has_own_pixels or load.photos_explain or not files.others
 
 
@@ -263,8 +264,8 @@ def _note_left_out(load: Loaded, files: SceneFiles, names: list[str], cause: Sce
     option, value = ("cameras", "FILE") if names[0] == str(files.cameras) else ("images", "FOLDER")
     remedy = cause.remedy or f"pass --{option} {value}, or --{option} {NONE}"
     verb = "is" if names == [str(files.cameras)] else "are"
-    note = " ".join(f"{' and '.join(names)} {verb} left out: {where}{cause.problem}; {remedy}".split())
-    return replace(load, notes=(note, *(text for text in load.notes if text not in repeated)), left_out=note)
+    doubt = Doubt(" ".join(f"{' and '.join(names)} {verb} left out: {where}{cause.problem}; {remedy}".split()))
+    return replace(load, notes=(doubt, *(text for text in load.notes if text not in repeated)))
 
 
 def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
@@ -297,9 +298,9 @@ def _align(
         load = _assign(ply, files, camera_file, proposal, hints)
         of_one_shape = select_one_shape(camera_file, proposal) if isinstance(load, SceneError) else None
         if of_one_shape is not None:
-            cameras_left, photos_left, left_out = of_one_shape
+            cameras_left, photos_left, doubts = of_one_shape
             answer = _assign(ply, files, cameras_left, photos_left, hints)
-            load = answer.with_left_out(left_out) if isinstance(answer, Loaded) else load
+            load = replace(answer, notes=(*answer.notes, *doubts)) if isinstance(answer, Loaded) else load
         return _without_photos(ply, files, camera_file, proposal, hints, load) if isinstance(load, SceneError) else load
     pictures = ScenePhotos(() if isinstance(inside, SceneError) else inside)
     load = _answer(partial(_combine, ply, files, camera_file, pictures, hints))
@@ -357,9 +358,8 @@ def _assign(
     answer = base if is_as_named else read(name_by_photos(camera_file, proposal, chosen, fit), chosen)
     if isinstance(answer, SceneError):
         return answer
-    described, unused = describe_assignment(proposal, chosen, camera_file, are_pixels=base.scene.has_own_pixels)
-    load = replace(answer, notes=(*proposal.notes, *answer.notes, *described), photos_explain=are_alike)
-    return load.with_left_out(unused)
+    described = describe_assignment(proposal, chosen, camera_file, are_pixels=base.scene.has_own_pixels)
+    return replace(answer, notes=(*proposal.notes, *answer.notes, *described), photos_explain=are_alike)
 
 
 def _without_photos(
@@ -417,21 +417,20 @@ def _combine(
         result = replace(result, cameras=cameras, images=images)
         notes += size_notes
     size = photo_size(limited)
-    unused = [f"--{name}" for name in ("masks", "protect") if getattr(files, name) is not None]
+    unused = [f"--{name}" for name in ("masks", "protect") if name in files.named and getattr(files, name) is not None]
     if unused and not size:
-        notes.append(f"the pictures of {' and '.join(unused)} are not used, since there are no photos")
-    left_out, place = list[str](), (camera_file, photos, size, result.transform, result.cameras)
+        notes.append(Doubt(f"the pictures of {' and '.join(unused)} are not used, since there are no photos"))
+    place = camera_file, photos, size, result.transform, result.cameras
     found = _answer(lambda: find_larger_and_masks(files, *place))
     if isinstance(found, SceneError):
         if "masks" in files.named or Path(found.path) in photos.paths or _is_named(files, found):
             raise found
         remedy = found.remedy or f"pass --masks FOLDER, or --masks {NONE}"
         folder = Path(found.path).parent
-        left_out = [f"the masks in {folder} are left out: {found.path}: {found.problem}; {remedy}"]
+        notes.append(Doubt(f"the masks in {folder} are left out: {found.path}: {found.problem}; {remedy}"))
         found = find_larger_and_masks(replace(files, masks=None, named=files.named | {"masks"}), *place)
     large, masks, mask_notes = found
-    load = _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
-    return load.with_left_out(left_out)
+    return _make_load(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
 
 
 def _choose_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
@@ -538,6 +537,6 @@ def _keep_stored_cameras(
     cameras = to_cameras(camera_file, photo_size(pictures))
     if "cameras" not in files.named and not check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
         return None
-    note = "the cameras do not fit the Gaussians; they stay as stored in their file"
+    note = Doubt("the cameras do not fit the Gaussians; they stay as stored in their file")
     as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
     return replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)

@@ -19,10 +19,10 @@ from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.write import lost_harmonics
 from gsmerge.io.locks import lock_file
 from gsmerge.io.scene_files import SceneFiles, scene_title
-from gsmerge.measure.documents import document_head, seconds_document, seconds_line
+from gsmerge.measure.documents import document_head, note_entries, seconds_document, seconds_line
 from gsmerge.runtime.memory import human_bytes, human_share, peak_memory
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.content_hash import content_hash, digest, list_files
+from gsmerge.scene.content_hash import content_hash, digest, doubt_changed, list_files
 from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.reading import OpacityChoice
@@ -60,21 +60,21 @@ def extend_file(
         raise UsageError(str(error)) from error
     with nullcontext() if dry_run else lock_state(path):
         start = perf_counter()
-        state, sha256 = tried or (load_state(path) if os.path.exists(path) else None), content_hash(list_files(files))
-        document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}, "dry_run": dry_run}
+        state, content = tried or (load_state(path) if os.path.exists(path) else None), content_hash(list_files(files))
+        document = {**document_head(), "input": {"path": str(files.ply)}, "dry_run": dry_run}
         hashes = [] if state is None else [batch.get("sha256") for batch in state.about["batches"]]
-        if state is not None and sha256 in hashes:
-            number = hashes.index(sha256) + 1
+        if state is not None and content in hashes:
+            number = hashes.index(content) + 1
             note = f"{files.ply}: left out, since the same files are batch {number} of {path.name} already"
-            return document | {"left_out": True, "state": _describe_file(path, state), "notes": [note]}, state
+            return document | {"repeated": True, "state": _describe_file(path, state), **note_entries([note])}, state
         load_end = perf_counter()
-        load = read_input(files, opacity=opacity, hints=hints)
+        load = read_input(files, opacity=opacity, hints=hints, hashed=True)
         read_end = perf_counter()
         try:
             state, report = extend_state(state, load.scene, settings, progress=progress)
         except SceneError as error:
             raise (SceneError(files.ply, error.problem, error.remedy) if error.path == BATCH else error) from error
-        state = _note_source(state, sha256, load.comments)
+        state = _note_source(state, content, load.comments)
         extend_end = perf_counter()
         if not dry_run:
             save_state(path, state, overwrite=True)
@@ -84,12 +84,12 @@ def extend_file(
         document["input"] |= load.recognised
         document |= {
             **facts,
-            "left_out": False,
+            "repeated": False,
             "state": _describe_file(path, state),
             "options": dict(report.options),
             **seconds_document(seconds | {"write": perf_counter() - extend_end}),
             "peak_memory_bytes": peak_memory(),
-            "notes": [*load.notes, *report.notes],
+            **note_entries([*load.notes, *report.notes, *doubt_changed(load.stats)]),
         }
         return document, state
 
@@ -102,10 +102,10 @@ def lock_state(path: Path) -> AbstractContextManager[bool]:
     return lock_file(path.with_name(f".gsmerge-{digest({'name': path.name})[:16]}.lock"))
 
 
-def _note_source(state: State, sha256: str, comments: Sequence[str]) -> State:
+def _note_source(state: State, content: str, comments: Sequence[str]) -> State:
     """Return a state that records the hash of its last batch's files, and the comments that results copy."""
     *earlier, last = state.about["batches"]
-    last = last | {"sha256": sha256}
+    last = last | {"sha256": content}  # of all files, those of cameras and photos as well
     all_comments = list(dict.fromkeys([*state.about.get("comments", []), *comments]))
     return replace(state, about={**state.about, "batches": [*earlier, last], "comments": all_comments})
 
@@ -119,7 +119,7 @@ def _describe_file(path: Path, state: State) -> dict[str, Any]:
 def batch_line(document: Mapping[str, Any]) -> str:
     """Describe the report of a batch in one line."""
     state, would = document["state"], "would be " * document["dry_run"]
-    if document["left_out"]:
+    if document["repeated"]:
         return f"{state['path']}: {would}unchanged, {count_words(state['num_batches'], 'batch')}"
     size = f", {human_bytes(state['bytes'])}; {seconds_line(document)}"
     world = f"; world: {document['choices']['world']}" if state["num_batches"] > 1 else ""
@@ -156,7 +156,7 @@ def decode_file(
     if dry_run:
         max_count = options.max_k * len(features)
         output = {"path": str(out), "num_gaussians_at_most": max_count}
-        return document | {"dry_run": True, "output": output, "notes": []}
+        return document | {"dry_run": True, "output": output, **note_entries([])}
     read_end = perf_counter()
     gaussians, decode_end = decode_features(features, options), perf_counter()
     if len(gaussians) == 0:
@@ -171,7 +171,7 @@ def decode_file(
         "output": {"path": str(out), "bytes": num_bytes, "num_gaussians": len(gaussians)},
         "ratio": len(gaussians) / max(num_input, 1),
         **seconds_document(seconds),
-        "notes": notes,
+        **note_entries(notes),
     }
 
 

@@ -20,8 +20,8 @@ from gsmerge.cli.batch_command import Totals
 from .conftest import Outcome, Run, listing
 
 REPORT: dict[str, Any] = {
-    "input": {"num_gaussians": 100}, "output": {"num_gaussians": 4}, "ratio": 0.04, "total_seconds": 1.5,
-    "psnr_input_views": {"before": 20.0, "after": None}, "unmet": None, "worse": None, "new_views": None,
+    "input": {"num_gaussians": 100, "num_photos": 1}, "output": {"num_gaussians": 4}, "ratio": 0.04,
+    "total_seconds": 1.5, "psnr_input_views": {"before": 20.0, "after": None}, "unmet": None, "worse": None, "new_views": None,
     "choices": {}, "notes": ["of no weight"],
 }  # fmt: skip
 
@@ -72,7 +72,7 @@ def test_one_bad_scene_stops_no_other(first: tuple[int, Path], rooms: Path, run:
     lines = {record["output"]: record for record in records(out)}
     assert "truncated" in lines["bad.ply"]["error"]
     for line in lines.values():
-        assert (line["schema_version"], line["tool"]["version"]) == (1, gsmerge.__version__)
+        assert (line["schema_version"], line["tool"]["version"]) == (2, gsmerge.__version__)
     report = lines["room1.ply"]["report"]
     assert (report["input"]["num_gaussians"], report["options"]["threads"]) == (3 * 24 * 16, 1)
     assert report["output"]["bytes"] == lines["room1.ply"]["files"][0]["bytes"]
@@ -149,8 +149,9 @@ def test_what_a_scene_lacks_is_said(rooms: Path, tmp_path: Path, run: Run) -> No
         outcome = run("batch", *options, *FAST, code=0)
         return [line.removeprefix("note: ") for line in outcome.out.splitlines() if line.startswith("note: ")]
 
-    (other,) = notes(top, "--output", tmp_path / "out")
-    assert names(other, f"{top / 'room1'}: the photos in {top / 'images'} are left out")
+    outcome = run("batch", top, "--output", tmp_path / "out", *FAST, code=0)
+    (other,) = (line for line in outcome.out.splitlines() if line.startswith("warning: "))
+    assert names(other, f"warning: {top / 'room1'}: the photos in {top / 'images'} are left out")
     one = top / "room1"
     lacking = f"{one}: no photos found beside it or in the named folder; its numbers are of the model's own pixels"
     lacking += "; name them with --images"

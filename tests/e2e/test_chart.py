@@ -136,7 +136,7 @@ def test_drawing_alone(copied: Path, run: Run) -> None:
     outcome = run("lab", "chart", "--output", copied / "out", "--json")
     assert (outcome.code, outcome.err) == (0, "")
     document = json.loads(outcome.out)
-    assert document["schema_version"] == 1
+    assert document["schema_version"] == 2
     assert (document["num_runs"], document["num_done"], document["num_failed"]) == (3, 0, 0)
     assert {Path(path).name for path in document["charts"]} == drawn
     assert "3 runs on 1 scene: room" in Path(document["page"]).read_text()

@@ -39,7 +39,7 @@ def test_json_report(smallest_copy: Path, run: Run) -> None:
     assert outcome.err == ""
     document = json.loads(outcome.out)
     ply = smallest_copy / "scene.ply"
-    assert document["schema_version"] == 1
+    assert document["schema_version"] == 2
     assert document["tool"] == {"name": "gsmerge", "version": gsmerge.__version__}
     assert document["input"]["sha256"] == hashlib.sha256(ply.read_bytes()).hexdigest()
     assert document["input"]["bytes"] == ply.stat().st_size

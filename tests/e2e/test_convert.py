@@ -164,7 +164,7 @@ def test_parts_are_kept_or_left_out(result: Path, tmp_path: Path) -> None:
     box = "box:" + ",".join(f"{value:.6f}" for value in (*low, *high))
     inside = ((whole.means >= low) & (whole.means <= high)).all(1).sum()
     document = convert_files(ConvertOptions([result], tmp_path / "a.ply", clean=CleanOptions(crop=box)))
-    assert document["left_out"] == {"cropped": 400 - len(read(tmp_path / "a.ply"))}
+    assert document["dropped"] == {"cropped": 400 - len(read(tmp_path / "a.ply"))}
     assert abs(len(read(tmp_path / "a.ply")) - inside) <= 2
     turned = convert_files(ConvertOptions([result], tmp_path / "b.ply", clean=CleanOptions(crop=f"{box},0,0,180")))
     assert turned["output"]["num_gaussians"] == document["output"]["num_gaussians"]
@@ -172,8 +172,8 @@ def test_parts_are_kept_or_left_out(result: Path, tmp_path: Path) -> None:
     gsmerge.write_ply(tmp_path / "faint.ply", faint)
     clean = CleanOptions(drop="transparent,floaters")
     document = convert_files(ConvertOptions([tmp_path / "faint.ply"], tmp_path / "c.ply", clean=clean))
-    assert document["left_out"]["transparent"] >= 30
-    assert sum(document["left_out"].values()) == 400 - len(read(tmp_path / "c.ply"))
+    assert document["dropped"]["transparent"] >= 30
+    assert sum(document["dropped"].values()) == 400 - len(read(tmp_path / "c.ply"))
     with refuses(SceneError, "in.ply", "400", "inspect"):
         convert_files(ConvertOptions([result], tmp_path / "d.ply", clean=CleanOptions(crop="sphere:99,99,99,0.1")))
     with refuses(UsageError, "--drop sky", "images"):
@@ -188,10 +188,10 @@ def test_what_no_view_shows_is_left_out(result: Path, tmp_path: Path) -> None:
     gsmerge.write_ply(tmp_path / "both.ply", gsmerge.Gaussians.concat([whole, behind]))
     cameras = viewer_cameras_path(result)
     document = convert_files(ConvertOptions([tmp_path / "both.ply"], tmp_path / "a.ply", cameras=cameras, clean=clean))
-    assert document["left_out"]["unseen"] >= 400
+    assert document["dropped"]["unseen"] >= 400
     assert noted(document["notes"], "in.cameras.json", "those of this scene")  # more than half
     bare = convert_files(ConvertOptions([result], tmp_path / "b.ply", cameras="none", clean=clean))
-    assert bare["output"]["num_gaussians"] == 400 - bare["left_out"]["unseen"] > 200
+    assert bare["output"]["num_gaussians"] == 400 - bare["dropped"]["unseen"] > 200
     assert any("placed" in note for note in bare["notes"])
     again = convert_files(ConvertOptions([result], tmp_path / "a.ply", cameras="none", overwrite=True))
     assert noted(again["notes"], "a.cameras.json", "of an earlier file")

@@ -84,7 +84,7 @@ def test_json_is_all_there_is_on_stdout_and_names_the_pictures(command: str, sma
     outcome = run(*call(command, small_copy), "--json")
     assert (outcome.code, outcome.err) == (0, "")
     document = json.loads(outcome.out)
-    assert document["schema_version"] == 1
+    assert document["schema_version"] == 2
     assert document["tool"]["version"] == gsmerge.__version__
     assert document["notes"] == []
     if command in PICTURES:

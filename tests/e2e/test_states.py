@@ -93,7 +93,7 @@ def test_json_is_all_there_is_on_stdout(walks: list[Path], tmp_path: Path, run: 
     assert [one["state"]["num_batches"] for one in batches] == [1, 2]
     assert batches[1]["state"]["bytes"] == state.stat().st_size
     for one, walk, num_views in zip(batches, walks, (3, 4), strict=True):
-        assert one["schema_version"] == 1
+        assert one["schema_version"] == 2
         assert one["tool"]["version"] == gsmerge.__version__
         assert Path(one["input"]["path"]) == walk / "scene.ply"
         assert one["num_input"] == num_views * 24 * 16

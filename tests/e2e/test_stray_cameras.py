@@ -37,7 +37,7 @@ def stray(tmp_path: Path, smallest_scene: Path) -> Path:
 def test_a_note_and_with_strict_a_doubt(stray: Path, run: Run) -> None:
     words = ("compact", stray, "-o", stray / "small.ply", "--overwrite", *FEW)
     document = json.loads(run(*words, "--json", code=0).out)
-    note = document["input"]["left_out"]
+    (note,) = document["doubts"]
     assert names(note, stray / "transforms.json", "left out")
     assert document["notes"].count(note) == 1
     outcome = run(*words, "--strict", code=4)
@@ -54,7 +54,7 @@ def test_a_batch_says_so_again_where_it_is_done(stray: Path, run: Run) -> None:
         outcome = run(*words, code=0)
         assert outcome.out.count("left out") == 1
     outcome = run(*words, "--strict", code=4)
-    assert outcome.err.endswith(f"{ERROR}1 of 1 scenes have cameras or photos that do not belong to them\n")
+    assert outcome.err.endswith(f"{ERROR}1 of 1 results are doubtful\n")
     assert "left out" not in run(*words, "--cameras", "none", "--strict").out
 
 
@@ -64,14 +64,13 @@ def test_photos_that_do_not_show_the_scene_are_a_doubt_too(smallest_copy: Path, 
     words = ("compact", smallest_copy, "-o", smallest_copy / "small.ply", *FEW)
     outcome = run(*words, "--strict", "--json", code=4)
     document = json.loads(outcome.out)
-    note = document["input"]["left_out"]
+    (note,) = document["doubts"]
     assert names(note, "1 of 3", "view_001")
     assert document["notes"].count(note) == 1
     assert outcome.err == f"{ERROR}{note}\n"
     words = ("batch", smallest_copy, "-o", smallest_copy.parent / "out", *FEW[:2], "--set", "fit=none", *FEW[4:])
     assert note in run(*words, code=0).out
-    expected = "1 of 1 scenes have cameras or photos that do not belong to them\n"
-    assert run(*words, "--strict", code=4).err.endswith(expected)
+    assert run(*words, "--strict", code=4).err.endswith("1 of 1 results are doubtful\n")
 
 
 @pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")], ids=str)

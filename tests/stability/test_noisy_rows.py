@@ -35,7 +35,7 @@ def test_every_photo_stays_as_it_is(make_scene: Callable[..., Path], tmp_path: P
     shuffle_rows(folder / "scene.ply")
     for order in ("auto", "none"):
         load = load_scene(folder, order=order)
-        assert load.left_out is None
+        assert not load.doubts
         assert list(load.scene.photo_views) == list(range(VIEWS))
         with record_run() as record:
             assert prepare(load.scene).reference.score_views == tuple(range(VIEWS))

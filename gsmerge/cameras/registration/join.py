@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.cameras.registration.register import register
-from gsmerge.errors import SceneError
+from gsmerge.errors import Doubt, SceneError
 from gsmerge.geometry.transforms import Similarity, rotmat_to_quat
 from gsmerge.kernels.elementary import arccos
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Pixels, Scene
@@ -52,9 +52,9 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     joined = f"{len(used)} of {len(scenes)} files are joined in the frame of {names[used[0]]}"
     notes = [f"{joined}, by {min(counts)} to {max(counts)} keypoints each"]
     left_out = "is left out: its photo shares too few keypoints with the others"
-    notes += [f"{name} {left_out}" for i, name in enumerate(names) if i not in used]
+    notes += [Doubt(f"{name} {left_out}") for i, name in enumerate(names) if i not in used]
     if len({scene.images is None for scene in moved}) > 1:
-        notes.append("some files have no photos, so none are used; name the folder of all with --images")
+        notes.append(Doubt("some files have no photos, so none are used; name the folder of all with --images"))
     facts = [_facts(*entry) for entry in zip(paths, registration.similarities, registration.matches, strict=True)]
     return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import Doubt, SceneError
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
@@ -95,7 +95,7 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
     raw = ("opacities lie in [0, 1] and are read as such; if they are logits, use --hint opacity=logit",)
     color_notes = (info.color_note,) if info.color_note else ()
     raw_notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
-    scale_notes = (info.odd_scales,) if info.odd_scales else ()
+    scale_notes = (Doubt(info.odd_scales),) if info.odd_scales else ()
     count_notes = (count_words(count, noun, rest) for (noun, rest), count in counted.items() if count)
     return (*info.adapted, *color_notes, *raw_notes, *scale_notes, *count_notes)
 
@@ -563,4 +563,4 @@ def _describe_incomplete(valid: np.ndarray) -> tuple[str, ...]:
         which, remedy = f"{num_invalid:,}", "export the file again unless a mask emptied them"
     else:
         return ()
-    return (f"{which} of {len(valid):,} rows are no Gaussians; {remedy}",)
+    return (Doubt(f"{which} of {len(valid):,} rows are no Gaussians; {remedy}"),)

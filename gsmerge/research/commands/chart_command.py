@@ -15,6 +15,7 @@ from gsmerge.cli.before_after import lpips_networks
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import write_texts
 from gsmerge.errors import UsageError
+from gsmerge.measure.documents import note_entries
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS
 from gsmerge.settings.setting import Settings, flat_settings, setting
@@ -70,7 +71,7 @@ def chart(args: opt.Args) -> None:
     if args.dry_run:
         labels = [f"{source.path} -> {out}: {record.label}" for source, record, _ in pending]
         line = f"{out}: {len(pending)} of {len(runs)} runs"
-        document = {"runs": labels, "num_runs": len(runs), "notes": notes}
+        document = {"runs": labels, "num_runs": len(runs), **note_entries(notes)}
         print_document(document, [*labels, line], as_json=args.json, quiet=args.quiet)
         return
     say_notes(notes, quiet=args.silent)
@@ -113,7 +114,7 @@ def _run_all(args: opt.Args, runs: Sequence[Run], measured: EvaluateOptions) -> 
 
 def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     """Draw charts, page and table of all runs in the folder, and print a summary; ``notes`` were printed before."""
-    from gsmerge.measure.documents import document_head
+    from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.research.charts.chart_page import list_held_out_notes, make_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures
     from gsmerge.research.charts.lines import Results
@@ -141,7 +142,7 @@ def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
         "num_done": num_done,
         "num_failed": failed,
         "runs": [asdict(record) for record in records],
-        "notes": list(notes),
+        **note_entries(notes),
     }
     line = f"{out / PAGE}: {len(records)} runs ({num_done} new{f', {failed} failed' if failed else ''}),"
     print_document(document, f"{line} {len(figures)} charts", as_json=args.json, quiet=args.quiet)

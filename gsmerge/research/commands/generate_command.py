@@ -35,7 +35,7 @@ class SeriesOptions(Settings):
 )  # fmt: skip
 def generate(args: opt.Args) -> None:
     """Make synthetic scenes to train and test with, as a feed-forward network would export them."""
-    from gsmerge.measure.documents import document_head
+    from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.research.generate import GenerateOptions
     from gsmerge.research.generate import generate as generate_scenes
 
@@ -45,7 +45,7 @@ def generate(args: opt.Args) -> None:
         raise SceneError(out, "expected a folder to write scenes to, found a file", "name another")
     with stage_progress(quiet=args.silent) as progress:
         scenes = generate_scenes(out, args.scenes, options, seed=series.seed, progress=partial(progress, "generate"))
-    document = {**document_head(), "options": options.to_dict(), "seed": series.seed, "notes": []}
+    document = {**document_head(), "options": options.to_dict(), "seed": series.seed, **note_entries([])}
     document["scenes"] = [{"folder": str(scene.folder), "kept": scene.kept} for scene in scenes]
     kept = sum(scene.kept for scene in scenes)
     line = f"{out}: {count_words(len(scenes) - kept, 'scene')}"

@@ -35,7 +35,7 @@ class StressFiles(Settings):
 )
 def stress(args: opt.Args) -> None:
     """Compact a scene under bad conditions, and report for each if the required property holds."""
-    from gsmerge.measure.documents import document_head
+    from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.research.stress import stress as stress_scene
 
     settings, places = args.make(CompactOptions, StressFiles)
@@ -57,7 +57,7 @@ def stress(args: opt.Args) -> None:
         "cases": [asdict(outcome) for outcome in outcomes],
         "held": sum(outcome.held is True for outcome in outcomes),
         "failed": sum(outcome.held is False for outcome in outcomes),
-        "notes": notes,
+        **note_entries(notes),
     }
     print_document(document, _lines(outcomes), as_json=args.json, quiet=args.quiet)
     failed = [outcome.case for outcome in outcomes if outcome.held is False]

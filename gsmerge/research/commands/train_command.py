@@ -34,7 +34,7 @@ OPTIONS = LazyFunction("gsmerge.research.training", "TrainOptions")
 )  # fmt: skip
 def train(args: opt.Args) -> None:
     """Train networks on scenes and their photos; after an interruption the same call resumes the run."""
-    from gsmerge.measure.documents import document_head
+    from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.research.training import TrainOptions, prepare_shards, preset_options
     from gsmerge.research.training import train as train_networks
     from gsmerge.runtime.threads import use_threads
@@ -54,7 +54,7 @@ def train(args: opt.Args) -> None:
             progress(f"train: loss {loss:.4f}", step, steps)
 
         done = train_networks(shards, validation, out, options, progress=move)
-    document: dict[str, Any] = {**document_head(), "options": options.to_dict(), "notes": notes}
+    document: dict[str, Any] = {**document_head(), "options": options.to_dict(), **note_entries(notes)}
     document |= {name: str(value) if isinstance(value, Path) else value for name, value in asdict(done).items()}
     line = f"{done.best}: {done.step} steps, PSNR {done.psnr_learned:.2f} dB ({done.psnr_analytic:.2f} without)"
     print_document(document, line, as_json=args.json, quiet=args.quiet)

@@ -116,9 +116,7 @@ def test_without_photos_no_shift_is_found(tmp_path: Path) -> None:
     folder = save_export(tmp_path, shifted(SMOOTH, OFFSET), voxels())
     for photo in (folder / "images").rglob("*.png"):
         photo.unlink()
-    left_out = load_scene(folder).left_out
-    assert left_out is not None
-    assert names(left_out, "transforms.json", "0 %", "offset.txt")
+    assert names(str(load_scene(folder).doubts), "transforms.json", "0 %", "offset.txt")
 
 
 def test_voxels_turned_to_y_up(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from contextlib import redirect_stderr
 import pytest
 
 from gsmerge.cli.console import RunEnd, json_progress, plain_warnings, say, stage_progress, total_progress
+from gsmerge.errors import Doubt
 from gsmerge.runtime.record import Part, begin_part, expect_parts, record_run, report_progress
 
 
@@ -74,19 +75,19 @@ def test_runs_as_events_have_their_names_whole(capsys: pytest.CaptureFixture[str
     assert events[1]["seconds_left"] == 0
 
 
-def test_a_run_that_is_worse_than_its_input_is_marked(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_doubtful_run_is_marked(capsys: pytest.CaptureFixture[str]) -> None:
     """Lines of JSON have all notes, and a warning even if the command is quiet."""
     worse = "the result shows its own photos worse than the input does: 20.00 dB, 30.00 dB before"
-    run = "room", "done", 1, "", 0, 1.0, worse, ["no masks", worse], [worse]
+    run = "room", "done", 1, "", 0, 1.0, ["no masks", Doubt(worse)]
     with total_progress(1, quiet=False) as progress:
         progress(RunEnd(*run))
-    assert capsys.readouterr().err == "1/1 room done, worse than the input\n"
+    assert capsys.readouterr().err == "1/1 room done, doubtful\n"
     with json_progress(), total_progress(1, quiet=True) as progress:
         progress(RunEnd(*run))
         say("1 of 1 results", kind="warning", quiet=True)
     events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
-    said = [(kind, event[kind]) for event in events for kind in ("note", "warning", "worse") if kind in event]
-    warned = ("warning", f"room: {worse}"), ("worse", worse), ("warning", "1 of 1 results")
+    said = [(kind, event[kind]) for event in events for kind in ("note", "warning", "doubts") if kind in event]
+    warned = ("warning", f"room: {worse}"), ("doubts", [worse]), ("warning", "1 of 1 results")
     assert said == [("note", "room: no masks"), *warned]
 
 

@@ -102,7 +102,7 @@ def test_held_out_views_of_another_scene_are_a_warning(scene: Scene, capsys: pyt
     views = held_out()
     away = replace(views.cameras, viewmats=np.diag([-1.0, 1, -1, 1]) @ views.cameras.viewmats)  # turned about
     evaluation = evaluate(scene, {}, replace(views, cameras=away), PLAIN)
-    say_notes(evaluation.notes, evaluation.doubts)
+    say_notes(evaluation.notes)
     assert capsys.readouterr().err.startswith("gsmerge: warning: the input views have seen only 0 %")
 
 

@@ -54,7 +54,7 @@ def test_all_views_have_poses_and_photos(
     scene, missing = loaded.pixel_scene(), [name for view, name in enumerate(SMOOTH.names) if view not in views]
     assert np.allclose(scene.cameras.centres, SMOOTH.c2w[:, :3, 3], atol=0.03)
     assert len(scene.photo_views) == 3
-    assert loaded.left_out is None
+    assert not loaded.doubts
     (note,) = [note for note in loaded.notes if "camera" in note]
     assert names(note, f"{len(missing)} of 3", str(tmp_path), *missing)
 
@@ -72,7 +72,7 @@ def test_cameras_of_another_scene_are_left_out(tmp_path: Path) -> None:
     other = registered([0])
     other.c2w[:, :3, 3] += 50
     loaded = read_with(tmp_path, other, write_transforms, None, ALL)
-    assert names(loaded.left_out or "", "transforms.json", "left out")
+    assert names(str(loaded.doubts), "transforms.json", "left out")
     assert len(loaded.pixel_scene()) == 3
 
 

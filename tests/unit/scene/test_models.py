@@ -91,7 +91,7 @@ def test_cameras_of_a_grid_without_photos(tmp_path: Path, name: str) -> None:
 def test_poses_without_a_focal_length_ask_for_it(tmp_path: Path) -> None:
     """As VicaSplat writes them; beside the file they are left out, and named they are refused."""
     export = MODELS["VicaSplat"](tmp_path / "out")
-    assert names(str(load_scene(export.path).left_out), "transforms.json", "fx, fy, cx, cy", "add them")
+    assert names(str(load_scene(export.path).doubts), "transforms.json", "fx, fy, cx, cy", "add them")
     with refuses(SceneError, "transforms.json", "fx, fy, cx, cy", "add them"):
         load_scene(export.path, cameras=export.path / "transforms.json")
 

@@ -129,9 +129,7 @@ def test_a_photo_of_something_else_has_a_camera(folder: Path) -> None:
 def test_a_photo_in_a_format_that_is_not_read(folder: Path) -> None:
     path = photos_in(folder)[1]
     path.rename(path.with_suffix(".HEIC"))
-    left_out = load_scene(folder).left_out
-    assert left_out is not None
-    assert names(left_out, path.name, path.with_suffix(".HEIC").name, "convert")
+    assert names(str(load_scene(folder).doubts), path.name, path.with_suffix(".HEIC").name, "convert")
 
 
 @pytest.mark.parametrize(
@@ -146,9 +144,7 @@ def test_a_photo_whose_content_is_in_a_format_that_is_not_read(folder: Path, sta
     """Whatever its ending says; the note says how to go on."""
     path = photos_in(folder)[1]
     path.write_bytes(start.ljust(4096, b"\x80"))
-    left_out = load_scene(folder).left_out
-    assert left_out is not None
-    assert names(left_out, path.name, name, "convert it to .jpg or .png")
+    assert names(str(load_scene(folder).doubts), path.name, name, "convert it to .jpg or .png")
 
 
 @pytest.mark.parametrize("sizes", ["apart", "of all"])
@@ -173,8 +169,8 @@ def test_one_photo_of_another_shape(folder: Path, truth: np.ndarray, sizes: str)
     assert len(loaded.scene.photo_views) == 3
     photos = np.asarray(loaded.scene.images)[:3]
     assert np.abs(photos - truth[:3]).mean((1, 2, 3)).max() < 0.02
-    assert loaded.left_out is not None
-    assert names(loaded.left_out, "1 of 4 views", path.name)
+    assert loaded.doubts
+    assert names(str(loaded.doubts), "1 of 4 views", path.name)
     assert not any("no camera" in note for note in loaded.notes)
 
 
@@ -186,8 +182,8 @@ def test_a_photo_of_another_shape_than_its_camera(folder: Path, truth: np.ndarra
     assert absent(loaded) == [1]
     assert loaded.scene.has_own_pixels
     assert [right for view, right in enumerate(right_ones(loaded, truth)) if view != 1] == [True] * 3
-    assert loaded.left_out is not None
-    assert names(loaded.left_out, "photos of 1 of 4 views", path.name, "100 x 100", "192 x 144")
+    assert loaded.doubts
+    assert names(str(loaded.doubts), "photos of 1 of 4 views", path.name, "100 x 100", "192 x 144")
 
 
 def test_photos_that_no_camera_names_beside_rows_of_nothing(folder: Path) -> None:
@@ -238,8 +234,8 @@ def test_one_photo_that_is_not_there(folder: Path, truth: np.ndarray, spoil: Cal
     loaded = load_scene(folder)
     assert absent(loaded) == [1]
     assert [right for view, right in enumerate(right_ones(loaded, truth)) if view != 1] == [True] * 3
-    assert loaded.left_out is not None
-    assert names(loaded.left_out, "photos of 1 of 4 views are left out", path.name)
+    assert loaded.doubts
+    assert names(str(loaded.doubts), "photos of 1 of 4 views are left out", path.name)
 
 
 def test_names_that_were_given_to_other_photos(folder: Path, truth: np.ndarray) -> None:

@@ -96,12 +96,10 @@ def test_what_belongs_to_something_else_is_left_out(
     with pytest.warns(UserWarning, match="left out"):
         actual = read_once(monkeypatch, folder)
     assert same(actual, alone[kind])
-    assert actual.left_out is not None
     assert actual.files.cameras is None
-    assert actual.notes[0] == actual.left_out  # the others follow from it
+    assert actual.doubts[0] == actual.notes[0]  # the others follow from it
     others = list(actual.notes[1:])
     assert [note for note in others if "photos" not in note or kind == "voxels"] == list(alone[kind].notes)
-    assert actual.recognised["left_out"] == actual.left_out
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -122,7 +120,7 @@ def test_photos_of_something_else_beside_the_right_cameras(tmp_path: Path) -> No
     write_transforms(folder / "transforms.json", SMOOTH)
     write_images(folder / "images", another())
     actual = load_scene(folder)
-    assert names(str(actual.left_out), "the photos in", folder / "images", "left out", "3 views")
+    assert names(str(actual.doubts), "the photos in", folder / "images", "left out", "3 views")
     assert np.allclose(actual.scene.cameras.viewmats, SMOOTH.w2c)
     assert actual.scene.images is None
     with refuses(SceneError, "images", "3 views", "--images none"):
@@ -132,14 +130,14 @@ def test_photos_of_something_else_beside_the_right_cameras(tmp_path: Path) -> No
 def test_photos_of_something_else_beside_a_grid(tmp_path: Path) -> None:
     folder = save(tmp_path, "grid")
     write_images(folder / "images", another())
-    assert names(str(load_scene(folder).left_out), "the photos in", folder / "images", "left out")
+    assert names(str(load_scene(folder).doubts), "the photos in", folder / "images", "left out")
 
 
 def test_a_picture_beside_a_grid_that_cannot_be_read(tmp_path: Path) -> None:
     folder = save(tmp_path, "grid")
     for number in range(3):
         (folder / f"{number}.png").write_bytes(b"\x89PNG nothing")
-    assert names(str(load_scene(folder).left_out), "the photos in", folder, "0.png")
+    assert names(str(load_scene(folder).doubts), "the photos in", folder, "0.png")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -152,7 +150,7 @@ def test_none(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> Non
     assert load_scene(folder, masks="none").files.masks is None
     alone = load_scene(folder, cameras="none", images="none")
     assert len(alone.scene) == (3 if kind == "grid" else 0)
-    assert alone.left_out is None
+    assert not alone.doubts
     (folder / "none").mkdir()
     (folder / "transforms.json").rename(folder / "none" / "transforms.json")
     monkeypatch.chdir(folder)
@@ -169,7 +167,7 @@ def test_masks_that_nothing_names(tmp_path: Path) -> None:
         load_scene(folder, masks=folder / "masks")
     (folder / "masks" / SMOOTH.names[1]).write_bytes(b"\x89PNG nothing")
     actual = load_scene(folder)
-    assert names(str(actual.left_out), "the masks in", SMOOTH.names[1])
+    assert names(str(actual.doubts), "the masks in", SMOOTH.names[1])
     assert actual.scene.images is not None
 
 
