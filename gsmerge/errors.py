@@ -56,7 +56,7 @@ class SceneError(GsmergeError):
 
 
 class DoubtWarning(UserWarning):
-    """Warning of a doubtful result: worse than its input, below its target, or made of views that contradict others.
+    """Warning of a doubtful result: worse than its input, below its target, or of files that do not fit each other.
 
     Example:
         >>> import warnings

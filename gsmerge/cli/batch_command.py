@@ -177,8 +177,8 @@ class Totals:
     def add(self, record: Mapping[str, Any]) -> None:
         """Count the record of one scene."""
         report = record["report"]
-        found = {"doubt": "; ".join(record["doubts"]), "lacking": "", "error": record["error"]}
-        if report and not record["doubts"] and not report["input"]["num_photos"]:
+        found = {"doubt": "; also ".join(record["doubts"]), "lacking": "", "error": record["error"]}
+        if report and not report["input"]["num_photos"] and {*record["doubts"]} <= {report["worse"]}:
             found["lacking"] = _describe_lack(report)
         for name, reason in found.items():
             if reason:

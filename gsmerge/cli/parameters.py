@@ -435,8 +435,8 @@ _TABLE = (
         setting_option("translate", metavar="X,Y,Z"),
         option("output", Path, "", "--output", "-o"),
         switch("overwrite", "Replace the output if it exists."),
-        switch("strict", "Exit with code 4, after writing everything, if a result shows the scene's photos more "
-               "than 0.5 dB worse than the input does, or if cameras or photos do not fit."),
+        switch("strict", "Exit with code 4, after writing everything, if a result is doubtful: if a warning says that "
+               "it is worse than the input, or that a file is incomplete, does not fit or is left out."),
         switch("dry_run", "Print what would be done, and write nothing."),
         option("open", bool, "Open the page in the browser.", "--open/--no-open", default=True),
         switch("json", "Print JSON on stdout."),

@@ -69,7 +69,7 @@ class Agreement:
         return FEWEST + (MOST - FEWEST) * min(1.0, max(0.0, soundness))
 
     @property
-    def doubt(self) -> str | None:
+    def advice(self) -> str | None:
         """Why a result will be poor and what would help, in one sentence; None if depth is sound."""
         if self.from_one_point:
             return (

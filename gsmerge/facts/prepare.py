@@ -8,7 +8,6 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from gsmerge.errors import Doubt
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.draw_outside import draw_outside
 from gsmerge.facts.holes import fill_holes
@@ -147,8 +146,8 @@ def prepare(
     agreement = confirm_depths(prepared.scene)
     if agreement is not None:
         choose(agreement=agreement.to_dict())
-        if agreement.doubt:
-            note(Doubt(agreement.doubt))
+        if agreement.advice:
+            note(agreement.advice)
         prepared = replace(prepared, agreement=agreement)
     prepared = _without_holes(prepared, options) if fill and prepared.reference.of_views else prepared
     if not outside or scene.has_own_pixels or len(input_scene) == 0:

@@ -197,9 +197,9 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     distinct = without_repeats(scene)[0]  # each view once, as in a run
     canonical, notes = _prepare_quietly(distinct)
     agreement = confirm_depths(canonical)
-    doubts = [unlike_captures(canonical.gaussians), None if agreement is None else agreement.doubt]
+    doubt, depth = unlike_captures(canonical.gaussians), None if agreement is None else agreement.advice
     facts: dict[str, Any] = {
-        **note_entries([*load.notes, *views_notes(scene), *notes, *map(Doubt, filter(None, doubts))]),
+        **note_entries([*load.notes, *views_notes(scene), *notes, *filter(None, [doubt and Doubt(doubt), depth])]),
         "num_views": len(load.scene),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),

@@ -145,7 +145,7 @@ def agreement_words(data: ViewData) -> str:
     """Describe the share of depth that other views confirm, or what would help if it is small."""
     if data.agreement is None:
         return ""
-    return data.agreement.doubt or f"{100 * data.agreement.confirmed:.0f} % of the depth is confirmed by other views"
+    return data.agreement.advice or f"{100 * data.agreement.confirmed:.0f} % of the depth is confirmed by other views"
 
 
 def speed(data: ViewData, place: int = 1) -> float | None:

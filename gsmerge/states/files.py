@@ -61,10 +61,11 @@ def extend_file(
     with nullcontext() if dry_run else lock_state(path):
         start = perf_counter()
         state, content = tried or (load_state(path) if os.path.exists(path) else None), content_hash(list_files(files))
-        document = {**document_head(), "input": {"path": str(files.ply)}, "dry_run": dry_run}
-        hashes = [] if state is None else [batch.get("sha256") for batch in state.about["batches"]]
-        if state is not None and content in hashes:
-            number = hashes.index(content) + 1
+        document = {**document_head(), "input": {"path": str(files.ply), "content": content}, "dry_run": dry_run}
+        batches = [] if state is None else state.about["batches"]
+        contents = [batch.get("content", batch.get("sha256")) for batch in batches]  # sha256: of versions before 0.6
+        if state is not None and content in contents:
+            number = contents.index(content) + 1
             note = f"{files.ply}: left out, since the same files are batch {number} of {path.name} already"
             return document | {"repeated": True, "state": _describe_file(path, state), **note_entries([note])}, state
         load_end = perf_counter()
@@ -105,7 +106,7 @@ def lock_state(path: Path) -> AbstractContextManager[bool]:
 def _note_source(state: State, content: str, comments: Sequence[str]) -> State:
     """Return a state that records the hash of its last batch's files, and the comments that results copy."""
     *earlier, last = state.about["batches"]
-    last = last | {"sha256": content}  # of all files, those of cameras and photos as well
+    last = last | {"content": content}
     all_comments = list(dict.fromkeys([*state.about.get("comments", []), *comments]))
     return replace(state, about={**state.about, "batches": [*earlier, last], "comments": all_comments})
 

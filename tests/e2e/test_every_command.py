@@ -86,7 +86,7 @@ def test_json_is_all_there_is_on_stdout_and_names_the_pictures(command: str, sma
     document = json.loads(outcome.out)
     assert document["schema_version"] == 2
     assert document["tool"]["version"] == gsmerge.__version__
-    assert document["notes"] == []
+    assert document["notes"] == document["doubts"] == []
     if command in PICTURES:
         written = sorted(str(small_copy / name) for name in set(listing(small_copy)) - set(before))
         assert sorted(document["pictures"]) == written

@@ -103,7 +103,7 @@ def test_json_is_all_there_is_on_stdout(walks: list[Path], tmp_path: Path, run: 
     assert "import" in batches[0]["seconds"]
     assert "import" not in batches[1]["seconds"]
     kept = load_state(state).about["batches"]
-    assert kept == [{name: one[name] for name in kept[0] if name != "sha256"} | {"sha256": one["input"]["sha256"]}
+    assert kept == [{name: one[name] for name in kept[0] if name != "content"} | {"content": one["input"]["content"]}
                     for one in batches]  # fmt: skip
 
 

@@ -75,7 +75,7 @@ def test_a_wall_that_all_views_see_is_confirmed(wall: Scene) -> None:
     agreement = confirm_depths(wall)
     assert agreement.confirmed > 0.97
     assert agreement.contradicted < 0.01
-    assert agreement.doubt is None
+    assert agreement.advice is None
     assert agreement.share == MOST
 
 
@@ -122,7 +122,7 @@ def test_the_worst_part_is_named(wall: Scene) -> None:
     assert (agreement.contradicted_part, agreement.alone_part) == (f"right third of 2 of {VIEWS} views", "")
     assert confirm_depths(turned_away(wall, 2)).alone_part == ""
     assert confirm_depths(wall).contradicted_part == ""
-    wrong = replace(agreement, confirmed=0.4).doubt
+    wrong = replace(agreement, confirmed=0.4).advice
     assert wrong is not None
     assert "the depth is wrong (right third of 2 of 4 views)" in wrong
 
@@ -135,8 +135,8 @@ def test_what_a_scene_bears_falls_with_the_share() -> None:
 
 
 def test_a_poor_scene_says_why() -> None:
-    assert Agreement(0.5, 0.5, 0.0).doubt is None
-    lonely, wrong = Agreement(0.24, 0.14, 0.34).doubt, Agreement(0.34, 0.41, 0.07).doubt
+    assert Agreement(0.5, 0.5, 0.0).advice is None
+    lonely, wrong = Agreement(0.24, 0.14, 0.34).advice, Agreement(0.34, 0.41, 0.07).advice
     assert lonely is not None
     assert all(word in lonely for word in ("24 %", "34 %", "too few or too far apart"))
     assert wrong is not None
@@ -152,8 +152,8 @@ def test_photos_from_one_point_are_said_to_be_pieces_of_a_panorama(wall: Scene) 
     agreement = confirm_depths(replace(wall, cameras=replace(cameras, viewmats=turned)))
     assert agreement is not None
     assert agreement.from_one_point
-    assert agreement.doubt is not None
-    assert "panorama" in agreement.doubt
+    assert agreement.advice is not None
+    assert "panorama" in agreement.advice
     whole = confirm_depths(wall)
     assert whole is not None
     assert not whole.from_one_point
@@ -170,5 +170,5 @@ def test_what_lies_beyond_a_crop_contradicts_nothing(wall: Scene) -> None:
         agreement = confirm_depths(cropped)
         assert agreement is not None
         assert agreement.confirmed > whole.confirmed - 0.1
-        assert agreement.doubt is None
-    assert Agreement(0.1, 0.1, 0.0, num_pixels=8).doubt is None
+        assert agreement.advice is None
+    assert Agreement(0.1, 0.1, 0.0, num_pixels=8).advice is None

@@ -1,0 +1,76 @@
+"""An input is read once: it may be moved or replaced after that, and the report is of what was read."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from messages import names
+
+import gsmerge.compaction.files as stage
+from gsmerge.compaction.files import Outputs, compact_files
+from gsmerge.errors import SceneError
+from gsmerge.io.scene_files import find_scene_files
+from gsmerge.measure.documents import file_sha256
+from gsmerge.settings.compact import CompactOptions
+
+from .conftest import Run
+
+PLAIN = CompactOptions().with_settings({"superpixels": "20%", "fit": "none", "threads": 1})
+FAST = ("--effort", "draft", "--set", "fit=none", "--set", "superpixels=20%")
+
+
+def move(folder: Path) -> None:
+    folder.rename(folder.with_name("moved"))
+
+
+def replace(folder: Path) -> None:
+    (folder / "new.ply").write_bytes((folder / "scene.ply").read_bytes()[:-4] + b"abcd")
+    os.replace(folder / "new.ply", folder / "scene.ply")
+
+
+@pytest.mark.parametrize(("act", "is_doubt"), [(move, False), (replace, True)], ids=["moved", "replaced"])
+def test_nothing_is_read_after_the_start(act: Callable[[Path], None], is_doubt: bool, smallest_copy: Path) -> None:
+    sha256, out = file_sha256(smallest_copy / "scene.ply"), smallest_copy.parent / "o.ply"
+    files, num_bytes = find_scene_files(smallest_copy), (smallest_copy / "scene.ply").stat().st_size
+    document = compact_files(files, PLAIN, Outputs(out), hashed=True, on_read=lambda _: act(smallest_copy))
+    assert out.is_file()
+    assert (document["input"]["sha256"], document["input"]["bytes"]) == (sha256, num_bytes)
+    assert [names(doubt, "scene.ply changed during the run") for doubt in document["doubts"]] == [True] * is_doubt
+    assert set(document["doubts"]) <= set(document["notes"])
+
+
+def test_a_file_that_changes_while_it_is_read_is_refused(smallest_copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = stage.load_files
+
+    def read_and_replace(*arguments: Any, **options: Any) -> Any:
+        loaded = read(*arguments, **options)
+        replace(smallest_copy)
+        return loaded
+
+    monkeypatch.setattr(stage, "load_files", read_and_replace)
+    out = smallest_copy.parent / "o.ply"
+    with pytest.raises(SceneError, match=r"scene\.ply: changed while it was read; run this again"):
+        compact_files(find_scene_files(smallest_copy), PLAIN, Outputs(out))
+    assert not out.exists()
+
+
+def test_a_file_that_broke_off_is_a_doubt_everywhere(smallest_copy: Path, run: Run) -> None:
+    """The last 60 % of it are zeros."""
+    ply, out = smallest_copy / "scene.ply", smallest_copy.parent / "out"
+    content = np.frombuffer(ply.read_bytes(), np.uint8).copy()
+    content[len(content) * 2 // 5 :] = 0
+    ply.write_bytes(content.tobytes())
+    (doubt,) = json.loads(run("inspect", smallest_copy, "--json", code=0).out)["doubts"]
+    assert names(doubt, "rows are no Gaussians", "interrupted")
+    assert doubt in run("compact", smallest_copy, "-o", out.with_suffix(".ply"), *FAST, "--strict", code=4).err
+    for options, code in ((), 0), (("--strict",), 4):  # done, then skipped
+        outcome = run("batch", smallest_copy, "-o", out, *FAST, *options, code=code)
+        assert outcome.out.count(doubt) == 1
+    (line,) = (json.loads(line) for line in run("batch", smallest_copy, "-o", out, *FAST, "--json").out.splitlines())
+    assert line["doubts"] == [doubt]
