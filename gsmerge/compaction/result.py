@@ -194,7 +194,7 @@ def _report(
         name, pictures = f"level {level}" if level else "the result", reference.name
         compared = compared_psnr(parts.covered, before, after)
         worse = describe_loss(name, *compared, OWN_PHOTOS if pictures == PHOTOS else pictures)
-        far = describe_far(candidate.fitted.gaussians, prepared) if worse is None and level == 0 else None
+        far = describe_far(candidate.fitted.gaussians, prepared) if level == 0 else None
         worse, report = worse or far, replace(report, is_far=far is not None or is_far(*compared))
     return report if worse is None else with_worse(report, worse)
 

@@ -49,7 +49,7 @@ _SATURATED = 1e-6  # float32 changes the logit of an opacity that is nearer to 0
 _OWN = "gsmerge"  # name of the exporter of files that gsmerge wrote
 _FILE_KEYS = (
     "path", "layout", "format", "count", "bytes_by_attribute", "extra_columns", "extra_elements", "sh_degree",
-    "opacity_encoding", "num_nonfinite", "num_empty", "num_clipped_scales", "num_zero_quats",
+    "opacity_encoding", "num_nonfinite", "num_empty", "num_zero_quats",
 )  # fmt: skip
 _UNKNOWN_KEYS = (
     "camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement", "num_unseen",
@@ -85,7 +85,7 @@ def inspect(
         Plain JSON types, None for unknown values. About the file: ``path``, ``bytes``, ``bytes_by_attribute``,
         ``layout``, ``format``, ``exporter``, ``extra_columns``, ``extra_elements``, ``sh_degree``,
         ``opacity_encoding``, ``batches`` (of a state: ``num_views``, ``num_input``, ``num_new``, and the names of its
-        ``views``). About the rows: ``count``, ``num_nonfinite``, ``num_empty``, ``num_clipped_scales``,
+        ``views``). About the rows: ``count``, ``num_nonfinite``, ``num_empty``,
         ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255), ``num_saturated``
         (within 1e-6 of 0 or 1), ``extents``. About the views: ``cameras``, ``camera_format``, ``images``,
         ``num_views``, ``width``, ``height``, ``num_missing`` (pixels without a Gaussian), ``rows``

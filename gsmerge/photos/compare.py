@@ -74,11 +74,10 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     matching = find_matching_views(scene, photo_views, list(scene.images), pairs.shown)
     if _has_other_look(scene, pairs, matching or photo_views):
         problem = "the scene has another look than its photos, so it keeps its own colours"
-        if is_exchanged := are_exchanged(pairs[matching or photo_views]):
+        if are_exchanged(pairs[matching or photo_views]):
             problem = "red and blue are exchanged between Gaussians and photos: either f_dc_0 and f_dc_2 of the file or"
             problem += " the photos are in the order blue, green, red; the scene keeps its own colours"
-        text = f"{problem}; --set look=photos gives it the look of the photos"
-        note(Doubt(text) if is_exchanged else text)
+        note(Doubt(f"{problem}; --set look=photos gives it the look of the photos"))
         return scene, ()
     stray = [view for view in photo_views if view not in matching]
     if stray and not _leave_out(scene, stray, photo_views):

@@ -27,7 +27,7 @@ from gsmerge.values.words import count_words
 
 MIN_PADDING = 16  # number of equal rows at the origin that are padding; fewer may be Gaussians
 MIN_FINITE = 0.002  # least share of finite rows; a file with fewer is refused
-MAX_HARMONIC = 1e6  # larger harmonics are clipped, so that float32 can square and sum the rendered values
+MAX_HARMONIC = 1e6  # no scene has larger harmonics; float32 can square and sum rendered values below
 FREED_ROWS = 1 << 17  # rows after which the memory of large columns is freed
 _MIN_JUDGED = 100  # least number of values for a judgement of encodings
 
@@ -52,9 +52,8 @@ class FileInfo:
     sh_degree: int  # 0 to 4
     opacity_encoding: str  # "logit", or "raw" if the file holds opacities in [0, 1]
     opacity_guessed: bool  # True: the encoding was guessed from the values; False: the caller or the file states it
-    num_nonfinite: int  # rows with NaN or inf, which are set aside
+    num_nonfinite: int  # rows with NaN, inf, a log scale above 30 or a harmonic beyond +-1e6, which are set aside
     num_empty: int  # rows that only pad the file, which are set aside
-    num_clipped_scales: int  # Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, which is clipped
     num_zero_quats: int  # Gaussians with a zero quaternion, read as the identity
     # why the scales are likely wrong, one sentence without a full stop; empty if they are plausible
     odd_scales: str = ""
@@ -87,9 +86,8 @@ def kept_comments(info: FileInfo) -> tuple[str, ...]:
 def file_notes(info: FileInfo) -> tuple[str, ...]:
     """Describe adapted or unusual content of a file: one sentence each, without a full stop."""
     counted = {
-        ("row", "with NaN or inf, set aside"): info.num_nonfinite,
+        ("row", "with NaN, inf or numbers that no scene has, set aside"): info.num_nonfinite,
         ("empty row", "at the origin, set aside"): info.num_empty,
-        ("Gaussian", "with extreme scales or colours, clipped"): info.num_clipped_scales,
         ("Gaussian", "with a zero quaternion, read as the identity"): info.num_zero_quats,
     }
     raw = ("opacities lie in [0, 1] and are read as such; if they are logits, use --hint opacity=logit",)
@@ -207,6 +205,9 @@ def convert_files(
     if judgement.linear:
         parts = [_with_linear_scales(part) for part in parts]
         num_clipped, num_zero_quats = _fill_arrays(paths, parts, out)
+    if num_clipped:
+        out["valid"] &= (out["scales"] < exp(np.float32(arrays.MAX_LOG_SCALE))).all(1)
+        out["valid"] &= (np.abs(np.concatenate([out["sh0"], out["shN"]], 1)) < MAX_HARMONIC).all((1, 2))
     empty = find_empty(path, out)
     units, color_note = _choose_colors(parts[0], out, colors)
     if units is not None:
@@ -236,7 +237,6 @@ def convert_files(
         opacity_guessed=is_guess,
         num_nonfinite=num_nonfinite,
         num_empty=len(empty),
-        num_clipped_scales=num_clipped,
         num_zero_quats=max(0, num_zero_quats - len(empty)),  # empty rows usually have zero quaternions
         odd_scales="" if judgement.linear else judgement.why,
         color_units=units,

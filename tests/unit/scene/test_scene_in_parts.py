@@ -116,7 +116,7 @@ def test_a_state_is_of_all_parts(tmp_path: Path, tiny: Tiny) -> None:
     folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
     assert main(["extend", str(folder / "scene.gsm"), str(folder), "--set", "superpixels=20%", "-q"]) == 0
     (batch,) = load_state(folder / "scene.gsm").about["batches"]
-    assert batch["sha256"] == content_hash(list_files(find_scene_files(folder)))
+    assert batch["content"] == content_hash(list_files(find_scene_files(folder)))
     assert batch["num_input"] == len(tiny.gaussians)
 
 

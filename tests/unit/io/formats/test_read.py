@@ -252,19 +252,14 @@ def test_infinite_positions_are_set_aside_and_the_first_row_too(tmp_path: Path) 
     assert actual.gaussians.means[0].tolist() == actual.gaussians.means[1].tolist()
 
 
-def test_numbers_too_large_to_add_are_still_finite(tmp_path: Path) -> None:
-    rows = columns(2)
-    rows["f_dc_0"], rows["f_dc_1"] = 3e38, 3e38
-    assert read_ply(save(tmp_path / "a.ply", rows)).valid.all()
-
-
-def test_extreme_scales_are_clipped_and_counted(tmp_path: Path) -> None:
-    rows = columns(5)
-    rows["scale_0"] = (40, -40, 1, -np.inf, 1)
+def test_rows_with_numbers_that_no_scene_has_are_set_aside(tmp_path: Path) -> None:
+    rows = columns(6)
+    rows["scale_0"] = (40, -40, 1, -np.inf, 1, 1)
     rows["scale_1"][0] = 50
+    rows["f_dc_0"][4] = rows["f_dc_1"][4] = 3e38  # as float32, their sum is infinite
     actual = read_ply(save(tmp_path / "a.ply", rows))
-    assert actual.info.num_clipped_scales == 3
-    assert actual.info.num_nonfinite == 0
+    assert actual.valid.tolist() == [False, True, True, True, False, True]
+    assert actual.info.num_nonfinite == 2
     assert np.isfinite(actual.gaussians.scales).all()
     assert (actual.gaussians.scales**2 > 0).all()
     assert actual.gaussians.scales[1, 0].item() == pytest.approx(np.exp(-30.0), rel=1e-5)
