@@ -15,6 +15,7 @@ from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.color_units import RGB_NOTE
 from gsmerge.io.formats.read import GaussianFile, file_notes, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
@@ -53,7 +54,7 @@ from gsmerge.scene.exporters import (
     make_hints,
 )
 from gsmerge.scene.loaded import Loaded
-from gsmerge.scene.rows import read_as_harmonics, read_rotations, take_gaussians
+from gsmerge.scene.rows import read_as_harmonics, read_as_rgb, read_rotations, take_gaussians
 from gsmerge.scene.views import find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, LargePhotos, Scene, StrPath
@@ -235,15 +236,19 @@ def _fit_for_certain(load: Loaded, files: SceneFiles) -> bool:
 
 
 def _confirm_colors(load: Loaded) -> Loaded:
-    """Return a scene whose guessed RGB is read as harmonics if photos show that; the guess stays without photos."""
-    units = load.info.color_units if load.info.color_note else None
+    """Return a scene whose colours are read as RGB or as harmonics, as photos show it, if the file leaves that open."""
+    info, units = load.info, load.info.open_units
     if units is None or load.scene.images is None:
         return load
-    harmonics = read_as_harmonics(load.scene, units)
-    if not has_nearer_colors(harmonics, load.scene):
+    is_rgb = info.color_units is None  # which the photos are asked for
+    other = (read_as_rgb if is_rgb else read_as_harmonics)(load.scene, units)
+    if not has_nearer_colors(other, load.scene):
         return load
-    notes = tuple(text for text in load.notes if text != load.info.color_note)
-    return replace(load, scene=harmonics, info=replace(load.info, color_units=None, color_note=""), notes=notes)
+    note = RGB_NOTE.format(units.name, "photos show it") if is_rgb else ""
+    notes = (*([note] if note else []), *(text for text in load.notes if text != info.color_note))
+    return replace(
+        load, scene=other, info=replace(info, color_units=units if is_rgb else None, color_note=note), notes=notes
+    )
 
 
 def _answer(read: Callable[[], T]) -> T | SceneError:

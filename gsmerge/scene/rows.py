@@ -8,7 +8,7 @@ from math import prod
 import numpy as np
 
 from gsmerge.cameras import AlignmentResult
-from gsmerge.geometry.transforms import camera_depths, sh0_to_rgb
+from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0, sh0_to_rgb
 from gsmerge.io.formats.color_units import ColorUnits
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.raster.photos import LEAST_OPACITY
@@ -64,6 +64,12 @@ def read_as_harmonics(scene: Scene, units: ColorUnits) -> Scene:
     """Return a scene whose colours, which were read as RGB in ``units``, are read as harmonics."""
     stored = units.black + (units.white - units.black) * sh0_to_rgb(scene.gaussians.sh0)
     return replace(scene, gaussians=replace(scene.gaussians, sh0=stored.astype(np.float32)))
+
+
+def read_as_rgb(scene: Scene, units: ColorUnits) -> Scene:
+    """Return a scene whose colours, which were read as harmonics, are read as RGB in ``units``."""
+    sh0 = rgb_to_sh0(units.rgb(scene.gaussians.sh0))
+    return replace(scene, gaussians=replace(scene.gaussians, sh0=sh0.astype(np.float32)))
 
 
 def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:

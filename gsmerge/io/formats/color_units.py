@@ -49,6 +49,12 @@ def judge_colors(stored: np.ndarray, plain: np.ndarray | None) -> tuple[ColorUni
     return None
 
 
+def find_units(stored: np.ndarray) -> ColorUnits | None:
+    """Return the units in which colours ``[n,3]`` may be RGB, if hardly any value lies outside; None for harmonics."""
+    shares = ((units, np.abs(units.rgb(stored) - 0.5) <= 0.5) for units in _UNITS)
+    return next((units for units, is_inside in shares if is_inside.mean() > 1 - arrays.MAX_STRAY), None)
+
+
 def state_colors(stored: np.ndarray) -> ColorUnits:
     """Return the units of colours ``[n,3]`` that the caller calls RGB."""
     return next((units for units in _UNITS if arrays.are_shares(units.rgb(stored))), _UNITS[0])

@@ -13,7 +13,7 @@ from gsmerge.errors import Doubt, SceneError
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits, judge_colors, state_colors
+from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits, find_units, judge_colors, state_colors
 from gsmerge.io.formats.scale_units import LINEAR_NOTE, SAMPLES, ScaleJudgement, judge_scales, log_of_scales
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
 from gsmerge.kernels.elementary import exp, log
@@ -59,6 +59,7 @@ class FileInfo:
     odd_scales: str = ""
     color_units: ColorUnits | None = None  # in which the file has RGB in the columns of harmonics; None if it has not
     color_note: str = ""  # that these units were guessed, one sentence without a full stop
+    open_units: ColorUnits | None = None  # in which the columns may hold RGB, if photos show that; None: they do not
     adapted: tuple[str, ...] = ()  # how the content was adapted, one sentence each without a full stop
 
 
@@ -209,7 +210,7 @@ def convert_files(
         out["valid"] &= (out["scales"] < exp(np.float32(arrays.MAX_LOG_SCALE))).all(1)
         out["valid"] &= (np.abs(np.concatenate([out["sh0"], out["shN"]], 1)) < MAX_HARMONIC).all((1, 2))
     empty = find_empty(path, out)
-    units, color_note = _choose_colors(parts[0], out, colors)
+    units, color_note, open_units = _choose_colors(parts[0], out, colors)
     if units is not None:
         out["sh0"][:] = rgb_to_sh0(units.rgb(out["sh0"]))
     encoding, is_guess = _choose_encoding(paths, parts, out["opacities"], empty, opacity)
@@ -241,6 +242,7 @@ def convert_files(
         odd_scales="" if judgement.linear else judgement.why,
         color_units=units,
         color_note=color_note,
+        open_units=open_units,
         adapted=(*scale_notes, *stored.notes, *_describe_incomplete(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
@@ -293,8 +295,10 @@ def _judge_scales(
     return judgement
 
 
-def _choose_colors(part: StoredRows, out: dict[str, np.ndarray], choice: ColorChoice) -> tuple[ColorUnits | None, str]:
-    """Choose the units of stored colours, None for harmonics; return them and a note.
+def _choose_colors(
+    part: StoredRows, out: dict[str, np.ndarray], choice: ColorChoice
+) -> tuple[ColorUnits | None, str, ColorUnits | None]:
+    """Choose the units of stored colours, None for harmonics; return them, a note, and units that photos may confirm.
 
     Only rows of a PLY file may hold RGB in place of harmonics. Unless the caller states it, files that gsmerge wrote do
     not.
@@ -302,17 +306,19 @@ def _choose_colors(part: StoredRows, out: dict[str, np.ndarray], choice: ColorCh
     names = part.rows.dtype.names or ()
     is_stated = choice == "sh" or (choice == "auto" and part.encoding is not None)
     if is_stated or not isinstance(part.rows, np.ndarray) or arrays.color_columns(names) != arrays.SH0:
-        return None, ""
+        return None, "", None
     rows = np.flatnonzero(out["valid"])
     rows = rows[:: max(1, len(rows) // SAMPLES)]
     stored = out["sh0"][rows, 0]
     if choice == "rgb":
-        return state_colors(stored), ""
+        return state_colors(stored), "", None
     has_plain = all(name in names and part.rows.dtype[name] == np.uint8 for name in arrays.PLAIN_COLORS[0])
     first = rows[rows < len(part.rows)]
     plain = np.stack([part.rows[name][first] for name in arrays.PLAIN_COLORS[0]], 1) if has_plain else None
     judged = judge_colors(stored[: len(first)], plain)
-    return (None, "") if judged is None else (judged[0], RGB_NOTE.format(judged[0].name, judged[1]))
+    if judged is None:
+        return None, "", find_units(stored)
+    return judged[0], RGB_NOTE.format(judged[0].name, judged[1]), judged[0]
 
 
 def _with_linear_scales(part: StoredRows) -> StoredRows:

@@ -65,11 +65,12 @@ def test_photos_of_which_no_part_fits_are_left_out(tmp_path: Path) -> None:
     assert noted(loaded.notes, tmp_path / "images", "96 x 36", "no part")
 
 
+@pytest.mark.parametrize("least", [0, 0.6], ids=["from black to white", "bright"])
 @pytest.mark.parametrize("as_rgb", [False, True])
-def test_photos_decide_whether_colors_are_rgb(tmp_path: Path, as_rgb: bool) -> None:
+def test_photos_decide_whether_colors_are_rgb(tmp_path: Path, as_rgb: bool, least: float) -> None:
     """All values lie in [0, 1]; photos are bright and faint if these are harmonics."""
     rgb = np.clip(sh0_to_rgb(SMOOTH.gaussians.sh0), 0, 1)
-    values = (rgb - rgb.min()) / np.ptp(rgb)
+    values = least + (1 - least) * (rgb - rgb.min()) / np.ptp(rgb)
     photos = np.round(255 * (values if as_rgb else sh0_to_rgb(values))).reshape(SMOOTH.images.shape).astype(np.uint8)
     scene = replace(SMOOTH, images=photos, gaussians=replace(SMOOTH.gaussians, sh0=values.astype(np.float32)))
     scene.save(tmp_path)
