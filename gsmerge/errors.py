@@ -76,6 +76,11 @@ def list_doubts(notes: Iterable[str]) -> list[str]:
     return [note for note in notes if isinstance(note, Doubt)]
 
 
+def name_notes(name: object, notes: Iterable[str]) -> list[str]:
+    """Return notes that begin with the name of what they are about; doubts stay doubts."""
+    return [type(note)(f"{name}: {note}") for note in notes]
+
+
 class TargetError(GsmergeError):
     """A requested quality or size could not be reached."""
 

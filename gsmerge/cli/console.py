@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from gsmerge.errors import Doubt, list_doubts
+from gsmerge.errors import Doubt, list_doubts, name_notes
 
 if TYPE_CHECKING:
     from gsmerge.runtime.record import Progress
@@ -250,7 +250,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
         stream.move(0.0)
 
         def print_event(end: RunEnd) -> None:
-            say_notes([type(note)(f"{end.name}: {note}") for note in end.notes])
+            say_notes(name_notes(end.name, end.notes))
             stream.move(end.share)
             event = {"scene": end.name, "status": end.status, "done": end.done, "total": total}
             event |= {"failed": end.num_failed, "doubts": list_doubts(end.notes), "error": end.failure or None}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError, UsageError, name_notes
 
 
 @opt.command(
@@ -62,7 +62,7 @@ def _check_files(args: opt.Args) -> None:
             progress(f"inspect: {path.name}", len(checks), len(args.paths))
             checks.append(check_content(path, opacity=args.opacity, hints=hints))
     wrong, several = [check for check in checks if check.problems], len(checks) > 1
-    notes = [type(note)(f"{check.path}: {note}") for check in checks for note in check.notes]
+    notes = [note for check in checks for note in name_notes(check.path, check.notes)]
     say_notes(notes, quiet=args.silent)
     document = {
         **document_head(),

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsmerge.compaction.outputs import write_contents
 from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import Doubt, SceneError, UsageError, name_notes
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.io import GaussianFile, file_notes, output_format, read_cameras, read_gaussians
@@ -86,8 +86,8 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     infos = [file.info for file in files]
     columns, missing = join_extra_columns([read_extra_columns(file.info)[file.valid] for file in files])
     columns = columns[rows]
-    named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
-    notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
+    of_files = [*zip(options.inputs, map(file_notes, infos), strict=True)]
+    notes = [*of_files[0][1]] if len(files) == 1 else [n for path, ns in of_files for n in name_notes(path.name, ns)]
     notes += [*unread, *describe_extra_columns(columns, missing, format_, moves=options.placement.moves)]
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, dropped["unseen"], count, None if stored is None else stored.path)
@@ -170,7 +170,8 @@ def _read_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]
     except SceneError as error:
         if named is not None or path == first_input:
             raise
-        return None, [f"{path} is left out: {error.problem}; name other cameras with --cameras, or pass none"]
+        text = f"{path} is left out: {error.problem}; name other cameras with --cameras, or pass none"
+        return None, [Doubt(text)]
 
 
 def _clean(

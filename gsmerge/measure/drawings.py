@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError, UsageError, name_notes
 from gsmerge.facts.place_cameras import NO_VIEWS, add_views
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs
@@ -275,7 +275,7 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     load = _with_views(framing_load, inside=photos)
     scenes = [load.scene.file_gaussians if same_file else first_ply.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first_ply.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
-    notes_with_paths = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
+    notes_with_paths = [note for path, texts in zip(paths, notes, strict=True) for note in name_notes(path, texts)]
     sizes = [file.info.file_bytes for file in (first_ply, *plys)]
     return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, notes_with_paths if plys else list(notes[0]), load)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gsmerge.cameras import ESTIMATED, NO_CAMERAS_USED, AlignmentResult, align, check_pixels
-from gsmerge.errors import Doubt, DoubtWarning, SceneError
+from gsmerge.errors import Doubt, DoubtWarning, SceneError, name_notes
 from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
@@ -148,8 +148,7 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
 
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
     scene, used = joined.scene, [loads[i] for i in joined.used]
-    named = zip(joined.names, loads, strict=True)
-    notes = [type(text)(f"{name}: {text}") for name, load in named for text in load.notes]
+    notes = [text for name, load in zip(joined.names, loads, strict=True) for text in name_notes(name, load.notes)]
     return replace(
         used[0],
         scene=scene,
