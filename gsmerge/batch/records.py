@@ -25,6 +25,7 @@ class DoneResult:
 
     key: str  # digest of the scene's files, the settings and the version
     files: list[dict[str, Any]]  # ``path`` in the output folder, ``sha256`` and ``bytes`` of each file
+    scene: str  # its path, as it was given
     worse: str | None = None  # warning that it shows its photos worse than the input does
     left_out: str | None = None  # note that cameras or photos beside its scene do not belong to the scene
 
@@ -72,7 +73,9 @@ def _read_result(line: Mapping[str, Any]) -> DoneResult:
     """Read a record of a result; KeyError, TypeError or AttributeError if it is damaged."""
     files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
     doubts = line["report"].get("worse"), line["report"].get("input", {}).get("left_out")
-    return DoneResult(_text(line["key"]), files, *(None if doubt is None else _text(doubt) for doubt in doubts))
+    return DoneResult(
+        _text(line["key"]), files, _text(line["scene"]), *(None if doubt is None else _text(doubt) for doubt in doubts)
+    )
 
 
 def _text(value: Any) -> str:
@@ -98,7 +101,8 @@ def check_folder(folder: Path) -> None:
             raise SceneError(records, problem, "remove it, or name another folder with --output")
         if records.exists():
             check_file(records)  # not a pipe, which would wait for its reader
-        records.touch()
+        if os.access(folder, os.W_OK) or not records.exists():  # results that are done are skipped in any folder
+            records.touch()
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"
         raise SceneError(folder, problem, "name another folder with --output") from error

@@ -12,6 +12,6 @@ from gsmerge.runtime.work import Call
 
 
 def test_a_call_that_fails_leaves_no_process() -> None:
-    with closing(ProcessPool(1, 1)) as pool, pytest.raises(ValueError, match="invalid literal"):
+    with closing(ProcessPool(1, 1, 0)) as pool, pytest.raises(ValueError, match="invalid literal"):
         list(pool.run(int, [Call("number", ("none",), 0)]))
     assert multiprocessing.active_children() == []
