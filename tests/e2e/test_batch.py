@@ -127,6 +127,16 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path,
     assert not (out.parent / "new").exists()
 
 
+def test_scenes_of_one_name_fail_and_no_other(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:
+    """The night after: one whose result is there, one of the same name, and a new one."""
+    for name in ("room1", "hall"):
+        shutil.copytree(rooms / "room0", tmp_path / "later" / name)
+    before = results(out)
+    outcome = run("batch", rooms / "room1", tmp_path / "later", "--output", out, *FAST, code=5)
+    assert names(outcome.out, tmp_path / "later/room1", out / "room1.ply", "1 done, 1 skipped, 1 failed")
+    assert results(out) == before | {"hall.ply": before["room0.ply"]}
+
+
 def test_the_table_at_the_end_has_the_first_results() -> None:
     totals, report = Totals(1000), REPORT
     for number in range(300):
