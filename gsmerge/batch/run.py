@@ -187,7 +187,9 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
         return record(FAILED, job.scene, job.output, key=key, error=refused)
     out, cameras = run.folder / job.output, viewer_cameras_path(run.folder / job.output)
     is_own = known is not None and any(run.folder / file["path"] == cameras for file in known.files)
-    is_free = is_own or run.overwrite or not os.path.lexists(cameras)  # results in other formats share them
+    is_free = os.path.realpath(cameras) not in map(os.path.realpath, files.paths) and (
+        is_own or run.overwrite or not os.path.lexists(cameras)  # results in other formats share them
+    )
     with atomic_output(begun, overwrite=True) as temporary:  # on the disk before the result
         temporary.write_text(f"{os.getpid()}\n")
     with warnings.catch_warnings(record=True) as caught_warnings:

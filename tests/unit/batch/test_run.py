@@ -244,6 +244,9 @@ def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> N
     (out / "room.cameras.json").write_bytes(b"mine")  # or those of a result in another format
     assert [file["path"] for file in run(scene, out)["files"]] == ["room.ply"]
     assert (out / "room.cameras.json").read_bytes() == b"mine"
+    mine = Path(shutil.copy(scene / "transforms.json", out / "room.cameras.json"))
+    run(scene, out, replace(QUICK, overwrite=True, cameras=str(mine)))
+    assert mine.read_bytes() == (scene / "transforms.json").read_bytes()
     assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
 
 
